@@ -16,7 +16,8 @@ POLICY_FILES = {
     "MODEL_CARD.md",
     "training_data.json",
     *(
-        f"training/{name}"
+        f"training/{part}{name}"
+        for part in ("", "pretraining/")
         for name in ("config.yaml", "metrics.jsonl", "sessions_log.jsonl", "timings_log.jsonl")
     ),
 }

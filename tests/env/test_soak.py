@@ -5,9 +5,10 @@ import re
 
 import pytest
 
-from openvima.env import TabletopEnv, tabletop
+from openvima.env import TabletopEnv
 from openvima.errors import ReachError
 from openvima.scene import Pose
+from openvima.sim.world import World
 from openvima.tasks import list_tasks
 from soak import LIMIT_TICKS, observation_problems, scene_problems, soak
 
@@ -63,5 +64,5 @@ def test_an_error_and_too_many_ticks_are_found(monkeypatch: pytest.MonkeyPatch) 
     def fail(*args: object, **options: object) -> None:
         raise ReachError("too far")
 
-    monkeypatch.setattr(tabletop.World, "execute", fail)
+    monkeypatch.setattr(World, "execute", fail)
     assert "ReachError: too far" in soak("rotate", 1).problems[0]

@@ -37,7 +37,11 @@ def rows(envs: VectorEnv, observations: dict) -> list[dict]:
 
 def info_of(infos: dict, index: int) -> dict:
     """The info of one sub-environment, as a single one gives it."""
-    return {key: values[index] for key, values in infos.items() if infos.get(f"_{key}", [False] * 9)[index]}
+    return {
+        key: info_of(values, index) if isinstance(values, dict) else values[index]
+        for key, values in infos.items()
+        if infos.get(f"_{key}", [False] * 9)[index]
+    }
 
 
 def prompt_bytes(prompts: tuple) -> object:

@@ -58,7 +58,7 @@ def test_an_edited_detector_plays_its_batches_again_and_no_others(tmp_path, monk
         played.append(job.batch.ablation)
         return play_batch(job, count)
 
-    def interrupted(*arguments):
+    def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(runner, "play_batch", noting)

@@ -18,6 +18,9 @@ from openvima.scene import RenderedPrompt
 class Env:
     """An environment that ends as its script says: for each step what it changes in the info."""
 
+    control = "primitives"
+    oracle_max_steps = 1
+
     def __init__(self, *script, end_effector="suction"):
         self.script = list(script)
         self.end_effector = end_effector
@@ -25,7 +28,7 @@ class Env:
         self.actions = []
         goals = (SimpleNamespace(object_id=5), SimpleNamespace(object_id=6))
         problem = SimpleNamespace(goals=goals, prerequisites=(), num_required=None)
-        self.episode = SimpleNamespace(num_redraws=2, oracle_max_steps=1, problem=problem)
+        self.episode = SimpleNamespace(num_redraws=2, problem=problem)
         self.progress = SimpleNamespace(open_goals=(1,))
 
     def reset(self, seed):

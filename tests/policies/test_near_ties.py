@@ -38,6 +38,8 @@ def test_classes_that_score_alike_are_a_near_tie(name, last_layer, starts):
     with torch.no_grad():
         for parameter in network.head.get_submodule(last_layer).parameters():
             parameter.zero_()
+    if name == "small":
+        network.head.rotation_copy = None  # rotations that the prompt shows would decide
     policy.act([observations[0], None, observations[2]])
     assert policy.near_ties == [True, False, True]
 

@@ -25,7 +25,7 @@ def trained(monkeypatch) -> list[TrainingConfig]:
     """What the command line would train."""
     configs: list[TrainingConfig] = []
 
-    def train(config, report, rollout) -> Path:
+    def train(config, report, rollout, animate) -> Path:
         configs.append(config)
         return config.out
 
