@@ -68,7 +68,7 @@ class Page:
         label_in_row = self.raw.get_by_text(label, exact=True).first
         field = label_in_row.locator("xpath=../../..").locator("input")
         field.fill(text)
-        field.press("Enter")
+        self.raw.keyboard.press("Enter")  # the field has the focus, or is gone where its text was enough
 
     def check(self, label: str) -> None:
         """Switch a checkbox."""

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from openvima.data import GenerateConfig, generate
+from user_shapes import restored_assets
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^```python(.*?)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -53,8 +54,9 @@ def test_the_code_of_a_page_runs(
     for name, scene in re.findall(r"^```yaml\n# (\S+)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
         Path(name).write_text(scene, encoding="utf-8")
     names: dict[str, object] = {"__name__": "page"}
-    for code in blocks(page):
-        exec(compile(code, str(page), "exec"), names)
+    with restored_assets():
+        for code in blocks(page):
+            exec(compile(code, str(page), "exec"), names)
 
 
 def test_blocks_that_do_not_run_are_few_and_begin_like_python() -> None:
