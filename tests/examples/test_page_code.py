@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from openvima.data import GenerateConfig, generate
+from openvima.tasks import registry
 from user_shapes import restored_assets
 
 ROOT = Path(__file__).parents[2]
@@ -53,6 +54,7 @@ def test_the_code_of_a_page_runs(
     Image.new("RGB", (48, 48), (200, 30, 30)).save("photo.png")
     for name, scene in re.findall(r"^```yaml\n# (\S+)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
         Path(name).write_text(scene, encoding="utf-8")
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))  # pages register tasks
     names: dict[str, object] = {"__name__": "page"}
     with restored_assets():
         for code in blocks(page):
