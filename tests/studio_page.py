@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
 TIMEOUT_MS = 120_000  # for waiting: software rendering on a busy machine
@@ -24,6 +26,15 @@ def launched_browser() -> Iterator[Any]:  # Any: playwright may be missing
         launched = playwright.chromium.launch(executable_path=find_browser(), args=[*SOFTWARE_WEBGL])
         yield launched
         launched.close()
+
+
+def browser_or_skip() -> Iterator[Any]:  # Any: as above
+    """Yield the system's browser for a fixture; skip where there is none."""
+    pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
+    if find_browser() is None:
+        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is installed")
+    with launched_browser() as launched:
+        yield launched
 
 
 class Page:

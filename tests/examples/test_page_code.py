@@ -13,9 +13,8 @@ from user_shapes import restored_assets
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^```python(.*?)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = {file.read_text(encoding="utf-8") for file in ROOT.glob("examples/*.py")}
-ELSEWHERE = {  # pages whose blocks run in tests of their own, which also check what they give
-    *("format", "midas", "policies", "reinforcement_learning", "studies"),
-}
+# Pages whose blocks run in tests of their own, which also check what they give.
+ELSEWHERE = {"format", "midas", "policies", "reinforcement_learning", "studies"}
 PAGES = [ROOT / "README.md", ROOT / "docs/site/index.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 

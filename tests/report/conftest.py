@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from made_up_results import clip, prompt, results
-from studio_page import BROWSERS, find_browser, launched_browser
+from studio_page import browser_or_skip
 
 __all__ = ["clip", "prompt", "results"]
 
@@ -14,8 +14,4 @@ __all__ = ["clip", "prompt", "results"]
 @pytest.fixture
 def browser() -> Iterator[Any]:  # Any: playwright may be missing
     """The system's Chromium."""
-    pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
-    if find_browser() is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is installed")
-    with launched_browser() as launched:
-        yield launched
+    yield from browser_or_skip()

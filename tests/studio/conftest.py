@@ -5,17 +5,13 @@ from typing import Any
 
 import pytest
 
-from studio_page import BROWSERS, Page, find_browser, launched_browser
+from studio_page import Page, browser_or_skip
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:  # Any: playwright may be missing
     """The system's Chromium, with software WebGL."""
-    pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
-    if find_browser() is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is installed")
-    with launched_browser() as launched:
-        yield launched
+    yield from browser_or_skip()
 
 
 @pytest.fixture(scope="module")

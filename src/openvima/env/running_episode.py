@@ -9,7 +9,7 @@ import numpy as np
 from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
 from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
-from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand, steps_per_primitive
+from openvima.scene.command import END_EFFECTOR, PRIMITIVES, STAY, ToolCommand, steps_per_primitive
 from openvima.sim.tool_path import PathFollower
 from openvima.sim.tool_world import ToolWorld
 from openvima.sim.world import World
@@ -18,7 +18,6 @@ from openvima.tasks.goals import Progress
 from openvima.tasks.seeding import make_rng
 
 FRAMES_PER_SECOND = 30
-_STAY = ToolCommand(0.0, 0.0, 0.0, 0.0, False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,7 +196,7 @@ class ToolRun(PrimitiveRun):
             tool = self.episode.problem.scene.end_effector
             self.follower = PathFollower(decide(), tool, compat=self.compat)
             command = self.follower.next_command(world)
-        return command or _STAY
+        return command or STAY
 
     def observed_tool(self) -> dict[str, np.ndarray]:
         """Position of the tip and heading of the tool, and whether it holds."""

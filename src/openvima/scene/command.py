@@ -101,3 +101,6 @@ class ToolCommand:
     def to_array(self) -> np.ndarray:
         """Return the five numbers, float32."""
         return np.array([self.dx, self.dy, self.dz, self.dyaw, self.tool], dtype=np.float32)
+
+
+STAY = ToolCommand(0.0, 0.0, 0.0, 0.0, False)

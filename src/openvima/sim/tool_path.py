@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from openvima.scene import Action, EndEffector
-from openvima.scene.command import MAX_MOVE_M, MAX_TURN_RAD, ToolCommand, ToolPose
+from openvima.scene.command import MAX_MOVE_M, MAX_TURN_RAD, STAY, ToolCommand, ToolPose
 from openvima.sim import end_effectors as tools
 from openvima.sim.primitives import sweep_plan
 from openvima.sim.tool_world import ToolWorld
@@ -84,7 +84,7 @@ class PathFollower:
             if done.take_hold and not world.holds:
                 self._waypoints.clear()  # a failed pick
         if not self._waypoints:
-            return ToolCommand(0.0, 0.0, 0.0, 0.0, False) if world.is_moving else None
+            return STAY if world.is_moving else None
         waypoint, self._last = self._waypoints[0], world.pose
         return _towards(waypoint, world.pose)
 
