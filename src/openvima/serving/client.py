@@ -5,16 +5,16 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
-
 from openvima.errors import MessageError, PolicyError, ServerError
 from openvima.policies.base import Policy
 from openvima.scene import RenderedPrompt
+from openvima.scene.command import PRIMITIVES
 from openvima.serving.connection import Connection
 from openvima.serving.packing import pack, require_extra
 from openvima.serving.protocol import (
     PROTOCOL,
     TOKEN_VARIABLE,
+    check_control,
     check_modalities,
     check_token,
     decode_action,
@@ -59,6 +59,7 @@ class RemotePolicy(Policy):
         self.metadata = self._connection.metadata
         try:
             self.modalities = check_modalities(self.metadata.get("modalities", ("rgb", "segm")), "the policy")
+            self.control = check_control(self.metadata.get("control", PRIMITIVES), "the policy")
         except MessageError as error:
             raise self._connection.broken(str(error)) from error
 
@@ -96,7 +97,7 @@ class RemotePolicy(Policy):
         connection.ask(request, "reset")
         self._num_episodes = len(prompts)
 
-    def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
+    def act(self, observations: Sequence[Mapping | None]) -> list[Any]:  # Any: of its control
         """Ask the server for the next action of every episode.
 
         Raises:
@@ -115,7 +116,10 @@ class RemotePolicy(Policy):
         answer = self._connection.ask(request, "act")
         try:
             listed = read_list(answer, "act", "actions", count, optional=("near_ties",))
-            actions = [decode_action(action, f"action {number}") for number, action in enumerate(listed)]
+            actions = [
+                decode_action(action, f"action {number}", control=self.control)
+                for number, action in enumerate(listed)
+            ]
             near_ties = answer.get("near_ties", [])
             if len(actions) != count or not isinstance(near_ties, list) or len(near_ties) not in (0, count):
                 raise MessageError(f"actions, and near_ties if any, must be {count}, as the observations")

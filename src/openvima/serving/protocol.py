@@ -10,6 +10,7 @@ import numpy as np
 from openvima.errors import ConfigError, MessageError, echo
 from openvima.render.camera import VIEWS
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
+from openvima.scene.command import COMMAND_NAMES, CONTROLS, END_EFFECTOR, PRIMITIVES
 
 # The number counts versions that do not understand each other: whatever is added, removed or changes its
 # meaning makes a new one, as both sides refuse what they do not know.
@@ -20,6 +21,7 @@ MODALITIES = ("rgb", "segm", "joints")  # that observations may hold besides `ee
 MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
 
 _KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")
+_LENGTHS = {"joints": 6, "tool": len(COMMAND_NAMES)}  # of what observations hold as numbers
 _RECORD_TYPES: dict[str, type] = {"object_id": int, "object": str, "texture": str}
 
 
@@ -85,60 +87,95 @@ def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
 
 
 def encode_observation(observation: Mapping | None) -> dict[str, Any] | None:  # Any: see `encode_prompt`
-    """Turn an observation (`rgb`, `segm`, `joints`, `ee`) into plain values and arrays; None stays None."""
+    """Turn an observation (`rgb`, `segm`, `joints`, `tool`, `ee`) into plain values; None stays None."""
     if observation is None:
         return None
     parts = {part: dict(observation[part]) for part in ("rgb", "segm") if part in observation}
-    if "joints" in observation:
-        parts["joints"] = observation["joints"]
+    parts |= {part: observation[part] for part in _LENGTHS if part in observation}
     return {**parts, "ee": int(observation["ee"])}
 
 
-def decode_observation(message: object, where: str = "observation") -> dict[str, Any] | None:
+def decode_observation(
+    message: object, where: str = "observation", *, control: str = PRIMITIVES
+) -> dict[str, Any] | None:
     """Read an observation out of a message; None stands for an episode that has ended.
 
     Args:
         message: What was sent.
         where: How to name it in errors.
+        control: That of the policy; with "end_effector" the observation holds `tool`.
 
     Raises:
         MessageError: It is no observation; the message says what is wrong.
     """
     if message is None:
         return None
-    fields = _map(message, where, required=("rgb", "ee"), optional=("segm", "joints"))
+    required = ("rgb", "ee", "tool") if control == END_EFFECTOR else ("rgb", "ee")
+    fields = _map(message, where, required=required, optional=("segm", "joints"))
     _check_views(fields, where)
-    if "joints" in fields:
-        joints = _typed(fields["joints"], np.ndarray, f"{where}: joints")
-        if joints.shape != (6,) or joints.dtype != np.float32 or not np.isfinite(joints).all():
+    for part in (part for part in _LENGTHS if part in fields):
+        numbers = _typed(fields[part], np.ndarray, f"{where}: {part}")
+        shape = (_LENGTHS[part],)
+        if numbers.shape != shape or numbers.dtype != np.float32 or not np.isfinite(numbers).all():
             raise MessageError(
-                f"{where}: joints is {joints.dtype} {joints.shape}; it must be float32 (6,), all finite."
+                f"{where}: {part} is {numbers.dtype} {numbers.shape}; it must be float32 {shape}, all finite."
             )
     if type(fields["ee"]) is not int:  # a bool is no number of a tool
         raise MessageError(f"{where}: ee is {_shown(fields['ee'])}; it must be a whole number.")
     return fields
 
 
-def encode_action(action: Mapping | None) -> dict[str, np.ndarray] | None:
-    """Turn an action into arrays; None stays None."""
-    return None if action is None else {str(key): np.asarray(value) for key, value in action.items()}
+def encode_action(action: Any, control: str = PRIMITIVES) -> Any:  # Any: see `decode_action`
+    """Turn an action of a policy into arrays; None stays None.
+
+    Raises:
+        MessageError: It is not of the form of the control.
+    """
+    if action is None:
+        return None
+    if control == END_EFFECTOR:
+        return decode_action(action if isinstance(action, Mapping) else np.asarray(action), control=control)
+    if not isinstance(action, Mapping):
+        raise MessageError(f"action is {_shown(action)}; it must be a map.")
+    return {str(key): np.asarray(value) for key, value in action.items()}
 
 
-def decode_action(message: object, where: str = "action") -> dict[str, np.ndarray] | None:
+def decode_action(message: object, where: str = "action", *, control: str = PRIMITIVES) -> Any:
     """Read an action out of a message. Whether it is one that can be done, the environment says.
 
     Args:
         message: What was sent.
         where: How to name it in errors.
+        control: That of the policy.
+
+    Returns:
+        A map of arrays, or with control "end_effector" one array; None for None.
 
     Raises:
-        MessageError: It is no map of arrays.
+        MessageError: It is something else.
     """
     if message is None:
         return None
+    if control == END_EFFECTOR:
+        return _typed(message, np.ndarray, where)
     for key, value in _typed(message, dict, where).items():
         _typed(value, np.ndarray, f"{where}: {_shown(key)}")
-    return message  # type: ignore[return-value]  # checked
+    return message
+
+
+def check_control(control: object, whose: str) -> str:
+    """Return the control that a policy declares.
+
+    Args:
+        control: What it declares.
+        whose: How to name the policy in the error.
+
+    Raises:
+        MessageError: There is no such control.
+    """
+    if not isinstance(control, str) or control not in CONTROLS:
+        raise MessageError(f"{whose} has control {_shown(control)}; allowed: {', '.join(CONTROLS)}.")
+    return control
 
 
 def check_modalities(names: object, whose: str) -> tuple[str, ...]:

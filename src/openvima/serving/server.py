@@ -17,9 +17,10 @@ from openvima.errors import ConfigError, echo
 from openvima.policies.base import Policy
 from openvima.policies.own_code import checked_policy
 from openvima.policies.prompt_limits import PromptLimits
+from openvima.scene.command import PRIMITIVES
 from openvima.serving.config import ServerConfig, server_config
 from openvima.serving.packing import pack, require_extra
-from openvima.serving.protocol import PROTOCOL, check_modalities
+from openvima.serving.protocol import PROTOCOL, check_control, check_modalities
 from openvima.serving.session import Session
 
 if TYPE_CHECKING:
@@ -138,14 +139,13 @@ class _PolicyServer:
         self._num_connections = 0
         limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
         prompt_limits = {f"prompt_{name}": number for name, number in asdict(limits).items()}
-        asked = getattr(policy, "modalities", None)
-        modalities = {} if asked is None else {"modalities": check_modalities(asked, "the policy")}
         self._metadata = pack(
             {
                 "protocol": PROTOCOL,
                 "versions": {"openvima": __version__},
                 **about,
-                **modalities,
+                "modalities": check_modalities(getattr(policy, "modalities", ("rgb", "segm")), "the policy"),
+                "control": check_control(getattr(policy, "control", PRIMITIVES), "the policy"),
                 "limits": {
                     "message_bytes": config.max_message_bytes,
                     "episodes": config.max_episodes,

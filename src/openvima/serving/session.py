@@ -12,6 +12,7 @@ from openvima.errors import MessageError, OpenVimaError, echo
 from openvima.policies.base import Policy
 from openvima.policies.prompt_limits import PromptLimits
 from openvima.scene import RenderedPrompt
+from openvima.scene.command import PRIMITIVES
 from openvima.serving.packing import pack, unpack
 from openvima.serving.protocol import (
     PROTOCOL,
@@ -49,6 +50,7 @@ class Session:
     def __init__(self, policy: Policy, max_episodes: int, prompts: str = MULTIMODAL) -> None:
         self._policy = policy
         self._limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
+        self._control: str = getattr(policy, "control", PRIMITIVES)
         self._max_episodes = max_episodes
         self._prompts = prompts
         self._num_episodes = 0
@@ -84,14 +86,19 @@ class Session:
             return partial(self._begin, self._decoded(prompts))
         if kind == "act":
             seen = read_list(message, "act", "observations", self._max_episodes)
-            observations = [decode_observation(one, f"observation {n}") for n, one in enumerate(seen)]
+            observations = [
+                decode_observation(one, f"observation {n}", control=self._control)
+                for n, one in enumerate(seen)
+            ]
             num_ids = sum(_num_ids(one["segm"]) for one in observations if one and "segm" in one)
             self._check_objects(num_ids, MAX_IN_VIEW)
             return partial(self._act, observations)
         if isinstance(message, dict) and "type" not in message:
             prompt = message.pop("prompt", None)
             sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
-            return partial(self._infer, decode_observation(message), self._decoded(sent))
+            return partial(
+                self._infer, decode_observation(message, control=self._control), self._decoded(sent)
+            )
         raise MessageError(
             f"a request must be a map with type 'reset' or 'act', or an observation ({PROTOCOL})."
         )
@@ -129,8 +136,8 @@ class Session:
         extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
         return {"type": "act", "actions": actions, **extra}
 
-    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> list[dict[str, Any] | None]:
-        """Ask the policy; Any: plain values and arrays."""
+    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> list[Any]:  # Any: values and arrays
+        """Ask the policy."""
         if not self._num_episodes:
             raise MessageError("there are no episodes yet; send a reset with their prompts first.")
         if len(observations) != self._num_episodes:
@@ -138,16 +145,14 @@ class Session:
                 f"act has {len(observations)} observations for {self._num_episodes} prompts; send one for "
                 "each, and nil for episodes that have ended."
             )
-        actions = [encode_action(action) for action in self._policy.act(observations)]
+        actions = [encode_action(action, self._control) for action in self._policy.act(observations)]
         if len(actions) != len(observations):
             raise MessageError(
                 f"the policy gave {len(actions)} actions for {len(observations)} observations."
             )
         return actions
 
-    def _infer(
-        self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]
-    ) -> dict[str, Any] | None:
+    def _infer(self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]) -> Any:
         """Act in a single episode, which an observation with a prompt begins."""
         if prompts:
             self._reset(prompts)
