@@ -10,8 +10,11 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_env_openvima.env import OpenVimaEnv
-from openvima.data.lerobot.features import ACTION_NAMES, IMAGE_PREFIX, MAX_PROMPT_IMAGES, FrameLayout
+from openvima.data.lerobot.dense import frame_layout
+from openvima.data.lerobot.features import IMAGE_PREFIX, MAX_PROMPT_IMAGES, FrameLayout
 from openvima.env.tabletop import IMAGE_SHAPE
+from openvima.errors import ConfigError
+from openvima.scene.command import CONTROL_HZ, END_EFFECTOR, PRIMITIVES, check_control
 
 
 @EnvConfig.register_subclass("openvima")
@@ -25,23 +28,33 @@ class OpenVimaEnvConfig(EnvConfig):
         prompts: Form of the prompts, as `openvima.make` takes it: "multimodal", "text" or "mixed".
         num_prompt_images: Prompt images of an observation; those that a prompt lacks are black.
         joints: Whether `observation.state` begins with the arm's joints, as that of generated demonstrations.
-        fps: Frames a second of videos and recordings; a frame is a step.
+        control: "primitives"; or "end_effector", with commands of the tool, ten a second.
+        fps: Frames a second of videos and recordings; a frame is a step. By default 10 with control
+            "end_effector", the true rate, else 1.
+
+    Raises:
+        ConfigError: There is no such control, or it is "end_effector" without joints.
     """
 
     task: str | None = "rotate"
-    fps: int = 1
+    fps: int = 0
     level: str = "L1"
     prompts: str = "multimodal"
     num_prompt_images: int = MAX_PROMPT_IMAGES
     joints: bool = True
+    control: str = PRIMITIVES
 
     def __post_init__(self) -> None:
+        check_control(self.control)
+        if self.control == END_EFFECTOR and not self.joints:
+            raise ConfigError("joints is False; with control 'end_effector' observations always hold them.")
+        self.fps = self.fps or (CONTROL_HZ if self.control == END_EFFECTOR else 1)
         images = [key.removeprefix(IMAGE_PREFIX) for key in self.layout.video_keys]
         image = PolicyFeature(FeatureType.VISUAL, (*IMAGE_SHAPE, 3))
         self.features = {
             **{f"pixels/{name}": image for name in images},
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(self.layout.state_names),)),
-            ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),)),
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(self.layout.action_names),)),
         }
         self.features_map = {
             **{f"pixels/{name}": f"{IMAGE_PREFIX}{name}" for name in images},
@@ -52,12 +65,13 @@ class OpenVimaEnvConfig(EnvConfig):
     @property
     def layout(self) -> FrameLayout:
         """What observations hold."""
-        return FrameLayout(self.num_prompt_images, self.joints)
+        return frame_layout(self.control, self.num_prompt_images, self.joints)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of every environment besides its task."""
-        return {"level": self.level, "prompts": self.prompts, "layout": self.layout, "fps": self.fps}
+        settings = {"level": self.level, "prompts": self.prompts, "control": self.control}
+        return {**settings, "layout": self.layout, "fps": self.fps}
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False

@@ -7,9 +7,10 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from openvima.data.lerobot.features import ACTION_NAMES, FrameLayout, action_from_row
+from openvima.data.lerobot.features import FrameLayout
 from openvima.env.tabletop import IMAGE_SHAPE, TabletopEnv
 from openvima.errors import ActionError
+from openvima.scene.command import steps_per_primitive
 
 
 class OpenVimaEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
@@ -19,11 +20,14 @@ class OpenVimaEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         task: Name of the task.
         level: As for `openvima.make`.
         prompts: As for `openvima.make`.
-        layout: What observations hold.
+        control: As for `openvima.make`.
+        layout: What observations and actions hold; that of the control.
         fps: Frames a second of videos.
     """
 
-    def __init__(self, task: str, *, level: str, prompts: str, layout: FrameLayout, fps: int) -> None:
+    def __init__(
+        self, task: str, *, level: str, prompts: str, control: str, layout: FrameLayout, fps: int
+    ) -> None:
         self.task = task
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": fps}
         self.render_mode = "rgb_array"
@@ -33,6 +37,7 @@ class OpenVimaEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             level=level,
             domain="eval",
             prompts=prompts,
+            control=control,
             modalities=("rgb", "joints"),
             render_mode=self.render_mode,
         )
@@ -43,7 +48,7 @@ class OpenVimaEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.observation_space = spaces.Dict(
             {"pixels": spaces.Dict(dict.fromkeys(names, image)), "agent_pos": state}
         )
-        self.action_space = spaces.Box(-1, 1, (len(ACTION_NAMES),), np.float32)
+        self.action_space = spaces.Box(-1, 1, (len(layout.action_names),), np.float32)
 
     @property
     def task_description(self) -> str:
@@ -52,7 +57,7 @@ class OpenVimaEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     @property
     def _max_episode_steps(self) -> int:  # LeRobot's name; the same for all episodes of a task
-        return self._env.episode.max_steps
+        return self._env.episode.max_steps * steps_per_primitive(self._env.control)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -64,7 +69,7 @@ class OpenVimaEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Execute a row of `action`. An invalid one ends the episode as a failure, as in our evaluation."""
         try:
-            observation, reward, terminated, truncated, info = self._env.step(action_from_row(action))
+            observation, reward, terminated, truncated, info = self._env.step(self._layout.action(action))
         except ActionError as error:
             logging.warning("the episode ends: %s", error)
             return self._observation, 0.0, True, False, {"is_success": False}

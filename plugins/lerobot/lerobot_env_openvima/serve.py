@@ -14,19 +14,20 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from huggingface_hub import snapshot_download
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from openvima.data.lerobot.features import IMAGE_PREFIX, FrameLayout, action_from_row
+from openvima.data.lerobot.dense import frame_layout
+from openvima.data.lerobot.features import ACTION_NAMES, IMAGE_PREFIX
 from openvima.errors import PolicyError
 from openvima.policies.base import Policy, prompt_hash
 from openvima.scene import RenderedPrompt
+from openvima.scene.command import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES
 from openvima.serving import serve
 from openvima.serving.lerobot import lerobot_name
 
@@ -34,9 +35,14 @@ from openvima.serving.lerobot import lerobot_name
 class LerobotPolicy(Policy):
     """A LeRobot policy for several episodes, each with action queues and random numbers of its own.
 
+    Its control is that of its actions: primitives of 12 numbers, or commands of the tool of 5.
+
     Args:
         folder: A folder that `save_pretrained` wrote.
         device: Where the network computes.
+
+    Raises:
+        PolicyError: Its actions have another length.
     """
 
     modalities = ("rgb", "joints")
@@ -44,7 +50,7 @@ class LerobotPolicy(Policy):
     def __init__(self, folder: Path, device: str) -> None:
         config = PreTrainedConfig.from_pretrained(folder)
         config.device = device
-        self.kind = config.type
+        self.kind, self.control = config.type, _control(config)
         self._network = get_policy_class(config.type).from_pretrained(folder, config=config)
         self._preprocess, self._postprocess = make_pre_post_processors(
             policy_cfg=config,
@@ -56,7 +62,8 @@ class LerobotPolicy(Policy):
             {key.rsplit("_", 1)[0] for key in features if key.startswith(f"{IMAGE_PREFIX}prompt_")}
         )
         state = features.get(OBS_STATE)
-        self._layout = FrameLayout(num_images, has_joints=state is None or state.shape != (1,))
+        has_joints = state is None or state.shape != (1,)
+        self._layout = frame_layout(self.control, num_images, has_joints)
         self._episodes: list[_Episode] = []
 
     def new_session(self) -> "LerobotPolicy":
@@ -69,7 +76,7 @@ class LerobotPolicy(Policy):
         """Start a batch of episodes."""
         self._episodes = [_Episode(prompt, self._own_network()) for prompt in prompts]
 
-    def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
+    def act(self, observations: Sequence[Mapping | None]) -> list[Any]:  # Any: of its control
         """Decide the next action of every running episode, one after another."""
         return [
             None if observation is None else self._action(episode, observation)
@@ -83,14 +90,26 @@ class LerobotPolicy(Policy):
         network.reset()
         return network
 
-    def _action(self, episode: "_Episode", observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    def _action(self, episode: "_Episode", observation: Mapping[str, Any]) -> Any:  # Any: as above
         frame = self._layout.frame(observation, episode.prompt)
         batched = {"pixels": frame["pixels"], "agent_pos": frame["agent_pos"][None]}
         seen = {**preprocess_observation(batched), "task": [episode.prompt.text]}
         torch.manual_seed(episode.next_seed())
         with torch.inference_mode():
             action = self._postprocess(episode.network.select_action(self._preprocess(seen)))
-        return action_from_row(action[0].float().cpu().numpy())
+        return self._layout.action(action[0].float().cpu().numpy())
+
+
+def _control(config: PreTrainedConfig) -> str:
+    feature = (config.output_features or {}).get(ACTION)
+    shape = None if feature is None else tuple(feature.shape)
+    controls = {(len(ACTION_NAMES),): PRIMITIVES, (len(COMMAND_NAMES),): END_EFFECTOR}
+    if shape not in controls:
+        raise PolicyError(
+            f"actions of the policy have shape {shape}; allowed: ({len(ACTION_NAMES)},) for primitives, "
+            f"({len(COMMAND_NAMES)},) for commands of the tool, as docs/lerobot.md lists them."
+        )
+    return controls[shape]
 
 
 class _Episode:

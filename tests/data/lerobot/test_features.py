@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from openvima.data import Demonstration
+from openvima.data.lerobot.dense import frame_layout
 from openvima.data.lerobot.features import FrameLayout, action_from_row
 from openvima.env import TabletopEnv
 from openvima.errors import ActionError
 from openvima.scene import END_EFFECTORS, Action
+from openvima.scene.command import ToolCommand
 
 
 @pytest.mark.parametrize("has_joints", [True, False])
@@ -53,3 +55,16 @@ def test_a_row_beyond_the_bounds_is_brought_back_and_one_that_is_none_is_refused
             Action.from_arrays(action_from_row(row))
     with pytest.raises(ActionError, match=r"shape \(11,\)"):
         action_from_row(row[:11])
+    with pytest.raises(ActionError, match="dtype int64; it must be 12 floating-point numbers"):
+        action_from_row(np.zeros(12, np.int64))
+
+
+def test_a_row_of_commands_is_one_for_the_environment() -> None:
+    layout = frame_layout("end_effector", 0, True)
+    assert layout.action_names == ("dx", "dy", "dz", "dyaw", "tool")
+    row = np.array([0.5, 0, 0, 0, 0.7], np.float64)
+    assert ToolCommand.from_array(layout.action(row)).dx == pytest.approx(0.05)
+    for bad in (row[:4], row.astype(int), np.zeros((1, 5))):
+        with pytest.raises(ActionError, match="5 floating-point numbers: dx, dy, dz, dyaw, tool"):
+            layout.action(bad)
+    assert frame_layout("primitives", 0, False).state_names == ("end_effector",)

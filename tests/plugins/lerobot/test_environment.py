@@ -10,10 +10,12 @@ import gymnasium
 import numpy as np
 import pytest
 
+from openvima.data.lerobot.dense import DenseLayout
 from openvima.data.lerobot.features import FrameLayout
 
 FILE = Path(__file__).parents[3] / "plugins/lerobot/lerobot_env_openvima/env.py"
-LAYOUT = FrameLayout(1, True)
+FIXED = {"prompts": "multimodal", "control": "primitives", "layout": FrameLayout(1, True), "fps": 1}
+LOW_LEVEL = {"prompts": "text", "control": "end_effector", "layout": DenseLayout(0, True), "fps": 10}
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +25,7 @@ def make() -> Any:  # Any: a class of a file
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return partial(module.OpenVimaEnv, "rotate", level="L1", prompts="multimodal", layout=LAYOUT, fps=1)
+    return partial(module.OpenVimaEnv, "rotate", level="L1", **FIXED)
 
 
 def oracle_row(env: Any) -> np.ndarray:  # Any: as above
@@ -44,6 +46,31 @@ def test_the_oracle_solves_episodes_in_the_form_that_lerobot_reads(make: Any) ->
     _, rewards, terminated, _, info = envs.step(np.stack([oracle_row(env) for env in envs.envs]))
     assert terminated.all() and rewards.tolist() == [1, 1]
     assert info["final_info"]["is_success"].tolist() == [True, True]
+
+
+def test_the_oracle_solves_an_episode_by_commands_with_a_prompt_of_text(make: Any) -> None:
+    env = make(**LOW_LEVEL)
+    seen, _ = env.reset(seed=1000)
+    assert "{" not in env.task_description and env._max_episode_steps == 500
+    assert set(seen["pixels"]) == {"front", "top"} and seen["agent_pos"].shape == (12,)
+    terminated = False
+    while not terminated:
+        command = env._env.oracle_command().to_array()
+        seen, _, terminated, truncated, info = env.step(command)
+        assert not truncated
+    np.testing.assert_array_equal(seen["agent_pos"][6:11], env._env._observe()["tool"])
+    assert info["is_success"]
+
+
+@pytest.mark.parametrize("row", [np.zeros(12, np.float32), np.zeros(5, int), np.full(5, np.inf, np.float32)])
+def test_a_malformed_command_ends_the_episode_as_a_failure(
+    make: Any, row: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    env = make(**LOW_LEVEL)
+    env.reset(seed=1000)
+    with caplog.at_level(logging.WARNING):
+        assert env.step(row)[1:] == (0.0, True, False, {"is_success": False})
+    assert "the episode ends" in caplog.text
 
 
 def test_an_action_that_is_not_finite_ends_the_episode_as_a_failure(

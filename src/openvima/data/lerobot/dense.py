@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from openvima.catalog.user_assets import recorded_assets
-from openvima.data.lerobot.features import JOINT_NAMES, Feature, FrameLayout
+from openvima.data.lerobot.features import JOINT_NAMES, FrameLayout, check_row
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
 from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError
 from openvima.scene import END_EFFECTORS, RenderedPrompt
-from openvima.scene.command import COMMAND_NAMES
+from openvima.scene.command import COMMAND_NAMES, END_EFFECTOR
 
 if TYPE_CHECKING:  # comes with the simulator
     from openvima.env import TabletopEnv
@@ -60,10 +60,10 @@ class DenseLayout(FrameLayout):
         """Names of the numbers of `observation.state`."""
         return (*JOINT_NAMES, *TOOL_NAMES, "end_effector")
 
-    def value_features(self) -> dict[str, Feature]:
-        """Return the features that are columns of the tables, in order."""
-        action: Feature = {"dtype": "float32", "shape": [len(COMMAND_NAMES)], "names": list(COMMAND_NAMES)}
-        return {**FrameLayout.value_features(self), "action": action}
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the numbers of `action`."""
+        return COMMAND_NAMES
 
     def values(self, demo: DenseTrajectory) -> dict[str, np.ndarray]:  # type: ignore[override]  # of its own kind
         """Return what the frames of one trajectory hold besides images and counters, arrays of T rows."""
@@ -81,6 +81,21 @@ class DenseLayout(FrameLayout):
         """Return an observation of the environment in the form in which LeRobot's environments return it."""
         values = (*observation["joints"], *observation["tool"], observation["ee"])
         return {**FrameLayout.frame(self, observation, prompt), "agent_pos": np.array(values, np.float32)}
+
+    def action(self, row: np.ndarray) -> np.ndarray:
+        """Return the command that a row of `action` stands for, as the environment takes it.
+
+        Raises:
+            ActionError: The row has another shape or dtype.
+        """
+        check_row(row, COMMAND_NAMES)
+        return row.astype(np.float32)
+
+
+def frame_layout(control: str, num_prompt_images: int, has_joints: bool) -> FrameLayout:
+    """Return the layout of a control's frames; those of "end_effector" always have joints."""
+    kind = DenseLayout if control == END_EFFECTOR else FrameLayout
+    return kind(num_prompt_images, has_joints)
 
 
 def dense_settings(dataset: Dataset) -> dict[tuple[str, str], EnvConfig]:

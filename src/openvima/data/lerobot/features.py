@@ -47,6 +47,11 @@ class FrameLayout:
         return (*(JOINT_NAMES if self.has_joints else ()), "end_effector")
 
     @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the numbers of `action`."""
+        return ACTION_NAMES
+
+    @property
     def video_keys(self) -> tuple[str, ...]:
         """Names of the image features: the views, then those of the first prompt image, and so on."""
         prompts = (f"prompt_{n}_{view}" for n in range(self.num_prompt_images) for view in VIEWS)
@@ -56,7 +61,7 @@ class FrameLayout:
         """Return the features that are columns of the tables, in order."""
         return {
             "observation.state": _feature("float32", self.state_names),
-            "action": _feature("float32", ACTION_NAMES),
+            "action": _feature("float32", self.action_names),
             "next.reward": _feature("float32"),
             "next.done": _feature("bool"),
             "next.success": _feature("bool"),
@@ -139,6 +144,10 @@ class FrameLayout:
             "agent_pos": np.array([*joints, observation["ee"]], np.float32),
         }
 
+    def action(self, row: np.ndarray) -> Any:  # Any: as the environment takes it
+        """Return the action that a row of `action` stands for; see `action_from_row`."""
+        return action_from_row(row)
+
     def _pictures(self, views: Mapping[str, np.ndarray], prompt: RenderedPrompt) -> dict[str, np.ndarray]:
         shown = {f"{IMAGE_PREFIX}{view}": pictures for view, pictures in views.items()}
         for number, image in enumerate(prompt.images.values()):
@@ -164,13 +173,25 @@ def action_from_row(row: np.ndarray) -> dict[str, np.ndarray]:
         row: Shape (12,), float32; see `ACTION_NAMES`.
 
     Raises:
-        ActionError: The row has another shape.
+        ActionError: The row has another shape or dtype.
     """
-    if row.shape != (len(ACTION_NAMES),):
-        raise ActionError(f"the action has shape {row.shape}; it must be ({len(ACTION_NAMES)},).")
+    check_row(row, ACTION_NAMES)
     ends = np.cumsum(list(ACTION_SHAPES.values()))[:-1]
     parts = zip(ACTION_SHAPES, np.split(row.astype(np.float32), ends), strict=True)
     return {key: _within_bounds(values) for key, values in parts}
+
+
+def check_row(row: np.ndarray, names: tuple[str, ...]) -> None:
+    """Check that a row has a floating-point number for each name.
+
+    Raises:
+        ActionError: It has another shape or dtype.
+    """
+    if row.shape != (len(names),) or not np.issubdtype(row.dtype, np.floating):
+        raise ActionError(
+            f"the action has shape {row.shape}, dtype {row.dtype}; it must be {len(names)} floating-point "
+            f"numbers: {', '.join(names)}."
+        )
 
 
 def _within_bounds(values: np.ndarray) -> np.ndarray:
