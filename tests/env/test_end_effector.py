@@ -40,6 +40,22 @@ def test_the_oracle_solves_an_episode_and_success_comes_when_the_tool_has_let_go
     assert info["num_steps"] < STEPS_PER_PRIMITIVE * env.episode.oracle_max_steps
 
 
+@pytest.mark.parametrize("task", ["rotate", "sweep_without_exceeding"])
+def test_the_oracle_solves_an_episode_from_states_that_it_did_not_choose(task) -> None:
+    env, rng = make(task), np.random.default_rng(0)
+    env.reset(seed=0)
+    noise = np.array([0.02, 0.02, 0.02, 0.1, 0.0])
+    is_over = False
+    while not is_over:
+        command = env.oracle_command()
+        assert env.oracle_command() == command
+        given = command.to_array() + noise * rng.uniform(-1, 1, 5)
+        given[4] = rng.random() < 0.5 if rng.random() < 0.1 else given[4]
+        *_, terminated, truncated, _ = env.step(given.astype(np.float32))
+        is_over = terminated or truncated
+    assert env.outcome.success
+
+
 def test_the_environment_passes_the_checks_of_gymnasium() -> None:
     check_env(make("rotate", modalities=("rgb", "segm", "joints")), skip_render_check=True)
 

@@ -9,8 +9,9 @@ import pytest
 from openvima.scene import Action, Pose, Scene
 from openvima.scene.command import MAX_MOVE_M, MAX_TURN_RAD, ToolCommand
 from openvima.sim import World
+from openvima.sim.end_effectors import HOVER_TIP_Z_M
 from openvima.sim.spatula import SWEEP_M_S
-from openvima.sim.tool_path import PathFollower
+from openvima.sim.tool_path import PathFollower, onward_path, tool_path
 from openvima.sim.tool_world import MAX_JOINT_SPEED, ToolWorld
 from openvima.sim.ur5 import JOINT_LIMITS, forward, tool_pose
 from sim_tables import ASSETS, random_table, table
@@ -31,7 +32,8 @@ def go(world: ToolWorld, x: float, y: float, z: float, *, tool: bool, yaw_rad: f
 
 def perform(scene: Scene, action: Action) -> tuple[Scene, int]:
     """Follow a primitive to its end; return the final scene and how many manipulations ended."""
-    world, follower = ToolWorld(scene, ASSETS), PathFollower(action, scene.end_effector)
+    world = ToolWorld(scene, ASSETS)
+    follower = PathFollower(tool_path(action, scene.end_effector))
     num_ended = 0
     while (command := follower.next_command(world)) is not None:
         num_ended += world.command(command)
@@ -158,3 +160,33 @@ def test_bodies_that_hover_at_the_start_settle_first() -> None:
     world = ToolWorld(hovering, ASSETS)
     assert not world.command(OFF)
     assert world.scene[5].pose.z == pytest.approx(scene[5].pose.z, abs=1e-3)
+
+
+def test_a_path_is_taken_up_where_the_tool_is() -> None:
+    world = ToolWorld(table(("block", 0.6, 0.3, 0.0)), ASSETS)
+    (block,) = (placement.id for placement in world.scene.placements)
+    action = Action.planar((0.6, 0.3), (0.5, 0.1), 0.6)
+
+    def next_waypoint(object_id: int) -> tuple:
+        waypoint = onward_path(action, object_id, world)[0]
+        pose = waypoint.pose
+        return round(pose.x, 6), round(pose.y, 6), round(pose.z, 6), round(pose.yaw_rad, 6), waypoint.tool
+
+    above, below = HOVER_TIP_Z_M, -1.0
+    go(world, 0.5, 0.2, 0.1, tool=False)
+    assert next_waypoint(block) == pytest.approx((0.6, 0.3, above, 0, False))
+    go(world, 0.605, 0.3, 0.1, tool=False)
+    assert next_waypoint(block) == pytest.approx((0.6, 0.3, below, 0, True))
+    go(world, 0.605, 0.3, 0.0, tool=True)
+    assert world.grasped == block
+    assert next_waypoint(block) == pytest.approx((0.605, 0.3, above, 0, True))
+    assert next_waypoint(block + 1) == pytest.approx((0.605, 0.3, above, 0, False))  # puts it down
+    place = (0.5 + 0.005 * math.cos(0.6), 0.1 + 0.005 * math.sin(0.6))
+    go(world, 0.6, 0.2, 0.32, tool=True)
+    assert next_waypoint(block) == pytest.approx((*place, above, 0.6, True), abs=1e-5)
+    go(world, *place, 0.1, tool=True, yaw_rad=0.5)
+    assert next_waypoint(block) == pytest.approx((*place, below, 0.6, True), abs=1e-5)
+    go(world, *place, 0.0, tool=True, yaw_rad=0.6)
+    assert next_waypoint(block) == pytest.approx((*place, above, 0.6, False), abs=1e-5)
+    world.command(ToolCommand(0.0, 0.0, 0.05, 0.0, False))
+    assert not world.holds

@@ -10,11 +10,12 @@ from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
 from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
 from openvima.scene.command import END_EFFECTOR, PRIMITIVES, STAY, ToolCommand, steps_per_primitive
-from openvima.sim.tool_path import PathFollower
+from openvima.sim.tool_path import PathFollower, onward_path, tool_path
 from openvima.sim.tool_world import ToolWorld
 from openvima.sim.world import World
 from openvima.tasks import goals
 from openvima.tasks.goals import Progress
+from openvima.tasks.oracle import OracleDecision
 from openvima.tasks.seeding import make_rng
 
 FRAMES_PER_SECOND = 30
@@ -71,6 +72,11 @@ class PrimitiveRun:
     def build_world(self) -> World | ToolWorld:
         """Build the world at the start of the episode."""
         return World(self.episode.problem.scene, self.assets, compat=self.compat)
+
+    @property
+    def scene_at_rest(self) -> Scene:
+        """The scene when everything was last at rest."""
+        return self.world.scene
 
     @property
     def is_out_of_steps(self) -> bool:
@@ -130,7 +136,8 @@ class ToolRun(PrimitiveRun):
 
     control: ClassVar[str] = END_EFFECTOR
 
-    follower: PathFollower | None = None  # of the oracle
+    follower: PathFollower | None = None  # of the oracle, as long as its commands are executed
+    advice: ToolCommand | None = None  # the oracle's command for the current state
 
     def build_world(self) -> ToolWorld:
         """Build the world at the start of the episode."""
@@ -141,6 +148,11 @@ class ToolRun(PrimitiveRun):
         """The world."""
         assert isinstance(self.world, ToolWorld)
         return self.world
+
+    @property
+    def scene_at_rest(self) -> Scene:
+        """The scene before the tool took hold."""
+        return self.tool_world.scene_at_rest
 
     def checked(self, action: object) -> ToolCommand:
         """Validate a command.
@@ -154,6 +166,9 @@ class ToolRun(PrimitiveRun):
         """Follow a checked command; evaluate the goals where a manipulation has ended."""
         world, before = self.tool_world, self.world.joints
         self.frames = []
+        if action != self.advice:
+            self.follower = None
+        self.advice = None
         has_ended = world.command(
             action,
             monitor=self.monitor if goals.needs_monitoring(self.episode.problem) else None,
@@ -168,7 +183,7 @@ class ToolRun(PrimitiveRun):
     def commands(self, action: Action) -> Iterator[ToolCommand]:
         """Yield the commands of a primitive until the episode is over; each is to be executed at once."""
         tool = self.episode.problem.scene.end_effector
-        follower = PathFollower(action, tool, compat=self.compat)
+        follower = PathFollower(tool_path(action, tool, compat=self.compat))
         while not (self.outcome.is_over or self.is_out_of_steps):
             command = follower.next_command(self.tool_world)
             if command is None:
@@ -184,19 +199,22 @@ class ToolRun(PrimitiveRun):
             frames += self.frames
         self.joint_path, self.frames = np.array(path, np.float32), frames
 
-    def oracle_command(self, decide: Callable[[], Action]) -> ToolCommand:
-        """Return the oracle's next command.
+    def oracle_command(self, decide: Callable[[], OracleDecision]) -> ToolCommand:
+        """Return the oracle's next command: the next of its path, or of a new one if another was executed.
 
         Args:
             decide: Gives the oracle's next primitive.
         """
-        world = self.tool_world
-        command = self.follower and self.follower.next_command(world)
-        if command is None:
-            tool = self.episode.problem.scene.end_effector
-            self.follower = PathFollower(decide(), tool, compat=self.compat)
-            command = self.follower.next_command(world)
-        return command or STAY
+        if self.advice is None:
+            world = self.tool_world
+            command = self.follower and self.follower.next_command(world)
+            if command is None:
+                decision = decide()
+                path = onward_path(decision.action, decision.pick_id, world, compat=self.compat)
+                self.follower = PathFollower(path)
+                command = self.follower.next_command(world)
+            self.advice = self.checked(command or STAY)
+        return self.advice
 
     def observed_tool(self) -> dict[str, np.ndarray]:
         """Position of the tip and heading of the tool, and whether it holds."""

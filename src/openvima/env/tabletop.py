@@ -292,7 +292,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         self._run = None
 
     def oracle_decision(self) -> OracleDecision:
-        """Return the next action of the scripted oracle, which has access to the scene.
+        """Return the next action of the scripted oracle, from the scene when it was last at rest.
 
         Raises:
             EpisodeError: There is no episode yet.
@@ -302,20 +302,23 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         return oracle_action(
             run.episode.problem,
             run.progress,
-            run.world.scene,
+            run.scene_at_rest,
             assets=self.assets,
             rng=run.oracle_rng,
             compat=self.compat,
         )
 
     def oracle_command(self) -> ToolCommand:
-        """Return the oracle's next command, on the path of its primitive; for control "end_effector".
+        """Return the oracle's next command, for control "end_effector".
+
+        It continues the path of its primitive as long as its commands are executed; from any other state it
+        plans a path anew, so it labels the states of a policy too.
 
         Raises:
             ConfigError: The control is another.
             EpisodeError, OracleError: As for `oracle_decision`.
         """
-        return self._tool_run().oracle_command(lambda: self.oracle_decision().action)
+        return self._tool_run().oracle_command(self.oracle_decision)
 
     @property
     def oracle_max_steps(self) -> int:

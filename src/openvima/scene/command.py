@@ -11,6 +11,7 @@ PRIMITIVES, END_EFFECTOR = CONTROLS
 CONTROL_HZ = 10
 COMMAND_NAMES = ("dx", "dy", "dz", "dyaw", "tool")
 MAX_MOVE_M = 0.05  # of the tool in one step along each axis: 0.5 m/s
+HIGHEST_TIP_Z_M = 0.35  # of the tool
 MAX_TURN_RAD = 0.2  # of the tool in one step: 2 rad/s
 COMMAND_HIGH = (MAX_MOVE_M, MAX_MOVE_M, MAX_MOVE_M, MAX_TURN_RAD, 1.0)
 COMMAND_LOW = (-MAX_MOVE_M, -MAX_MOVE_M, -MAX_MOVE_M, -MAX_TURN_RAD, 0.0)

@@ -1,16 +1,20 @@
 """Primitives as sequences of commands: how the oracle acts under low-level control."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
-from openvima.scene import Action, EndEffector
+from openvima.scene import Action, EndEffector, Pose
 from openvima.scene.command import MAX_MOVE_M, MAX_TURN_RAD, STAY, ToolCommand, ToolPose
+from openvima.scene.pose import angle_difference
 from openvima.sim import end_effectors as tools
-from openvima.sim.primitives import sweep_plan
-from openvima.sim.tool_world import ToolWorld
+from openvima.sim.primitives import SweepPlan, sweep_plan
+from openvima.sim.tool_world import PRESS_WITHIN_M, ToolWorld
 
 _REACHED = 1e-6  # m and rad
+_NEAR_M = 0.01  # from where a path is taken up, rather than begun anew
+_NEAR_RAD = 0.2
+_FUNNEL = 0.3  # metres more from the axis per metre above it
 _DOWN_M = -1.0  # below the table: until contact
 
 
@@ -29,51 +33,112 @@ class Waypoint:
     take_hold: bool = False
 
 
-def tool_path(action: Action, end_effector: EndEffector, *, compat: bool = False) -> Iterator[Waypoint]:
-    """Yield the waypoints of a primitive.
+def tool_path(action: Action, end_effector: EndEffector, *, compat: bool = False) -> list[Waypoint]:
+    """Return the waypoints of a primitive.
 
     Args:
         action: The primitive.
         end_effector: The tool.
         compat: As in `sweep_plan`.
     """
-    if end_effector == "suction":
-        yield from _pick_and_place(action)
-        return
-    plan = sweep_plan(action, compat=compat)
-    if plan is None:
-        return
+    if end_effector == "spatula":
+        plan = sweep_plan(action, compat=compat)
+        return [] if plan is None else _sweep(plan)
+    hover = tools.HOVER_TIP_Z_M
+    pick = ToolPose(*action.pose0_position, hover, action.yaw0_rad)
+    return _pick_and_place(pick, ToolPose(*action.pose1_position, hover, action.yaw1_rad))
+
+
+def onward_path(action: Action, object_id: int, world: ToolWorld, *, compat: bool = False) -> list[Waypoint]:
+    """Return the waypoints of a primitive that are left from any state of the tool.
+
+    A tool near the path takes it up where it is. What it holds is carried on, or put down at once if it is
+    another object. What moves is left to come to rest before it is touched again.
+
+    Args:
+        action: The primitive, from the scene when it was last at rest.
+        object_id: The object to pick or to sweep.
+        world: The world.
+        compat: As in `sweep_plan`.
+    """
+    pose, tool = world.pose, world.scene.end_effector
+    if world.is_moving and not world.holds:
+        return [Waypoint(replace(pose, z=tools.HOVER_TIP_Z_M), tool=False)]
+    if tool == "spatula":
+        plan = sweep_plan(action, compat=compat)
+        return [] if plan is None else _sweep(plan)[_passed(plan, world) :]
+    path = tool_path(action, tool, compat=compat)
+    if world.grasp is None:
+        return path[int(_is_above(path[0].pose, pose)) :]
+    place = _carried(world.grasp, action) if world.grasped == object_id else pose
+    path = _pick_and_place(pose, replace(place, z=tools.HOVER_TIP_Z_M))[2:]
+    if _is_above(place, pose):
+        return path[3 if world.is_down else 2 :]
+    return path[int(pose.z > tools.HOVER_TIP_Z_M - _NEAR_M) :]
+
+
+def _pick_and_place(pick: ToolPose, place: ToolPose) -> list[Waypoint]:
+    """Waypoints between poses to hover at."""
+    return [
+        Waypoint(pick, tool=False),
+        Waypoint(replace(pick, z=_DOWN_M), tool=True, take_hold=True),
+        Waypoint(replace(pick, z=place.z), tool=True),
+        Waypoint(place, tool=True),
+        Waypoint(replace(place, z=_DOWN_M), tool=True),
+        Waypoint(place, tool=False),
+    ]
+
+
+def _sweep(plan: SweepPlan) -> list[Waypoint]:
     yaw_rad = math.remainder(plan.yaw_rad, math.pi)  # both faces of the spatula are alike
     hover, low = tools.SWEEP_HOVER_TIP_Z_M, tools.SWEEP_TIP_Z_M
-    yield Waypoint(ToolPose(*plan.start, hover, yaw_rad), tool=False)
-    yield Waypoint(ToolPose(*plan.start, low, yaw_rad), tool=False)
-    for x, y in (plan.start, *plan.legs):
-        yield Waypoint(ToolPose(x, y, low, yaw_rad), tool=True)
-    yield Waypoint(ToolPose(*plan.legs[-1], hover, yaw_rad), tool=False)
+    return [
+        Waypoint(ToolPose(*plan.start, hover, yaw_rad), tool=False),
+        Waypoint(ToolPose(*plan.start, low, yaw_rad), tool=False),
+        *(Waypoint(ToolPose(x, y, low, yaw_rad), tool=True) for x, y in (plan.start, *plan.legs)),
+        Waypoint(ToolPose(*plan.legs[-1], hover, yaw_rad), tool=False),
+    ]
 
 
-def _pick_and_place(action: Action) -> Iterator[Waypoint]:
-    pick, place = action.pose0_position, action.pose1_position
-    hover = tools.HOVER_TIP_Z_M
-    yield Waypoint(ToolPose(*pick, hover, action.yaw0_rad), tool=False)
-    yield Waypoint(ToolPose(*pick, _DOWN_M, action.yaw0_rad), tool=True, take_hold=True)
-    yield Waypoint(ToolPose(*pick, hover, action.yaw0_rad), tool=True)
-    yield Waypoint(ToolPose(*place, hover, action.yaw1_rad), tool=True)
-    yield Waypoint(ToolPose(*place, _DOWN_M, action.yaw1_rad), tool=True)
-    yield Waypoint(ToolPose(*place, hover, action.yaw1_rad), tool=False)
+def _carried(grasp: ToolPose, action: Action) -> ToolPose:
+    """Where a tool that grasped an object has it where an action moves it."""
+    before = Pose.planar(*action.pose0_position, action.yaw0_rad)
+    after = Pose.planar(*action.pose1_position, action.yaw1_rad)
+    moved = after @ before.inverse() @ Pose.planar(grasp.x, grasp.y)
+    return ToolPose(moved.x, moved.y, grasp.z, grasp.yaw_rad + action.yaw1_rad - action.yaw0_rad)
+
+
+def _is_above(goal: ToolPose, pose: ToolPose, period_rad: float = 2 * math.pi) -> bool:
+    """Whether a pose is in a funnel above a goal, from where a tool is lowered."""
+    turn = angle_difference(goal.yaw_rad, pose.yaw_rad, period_rad)
+    near_m = max(_NEAR_M, _FUNNEL * pose.z)
+    return math.dist((goal.x, goal.y), (pose.x, pose.y)) <= near_m and turn <= _NEAR_RAD
+
+
+def _passed(plan: SweepPlan, world: ToolWorld) -> int:
+    """How many waypoints of a sweep the spatula has behind it."""
+    pose, (x0, y0), (x1, y1) = world.pose, plan.start, plan.legs[-1]
+    fraction = 0.0
+    if world.holds:  # the nearest point of the line
+        along = (pose.x - x0) * (x1 - x0) + (pose.y - y0) * (y1 - y0)
+        fraction = min(max(along / max(math.dist((x0, y0), (x1, y1)) ** 2, 1e-12), 0.0), 1.0)
+    nearest = ToolPose(x0 + fraction * (x1 - x0), y0 + fraction * (y1 - y0), pose.z, plan.yaw_rad)
+    if not _is_above(nearest, pose, math.pi):
+        return 0
+    if world.holds:
+        return 3
+    return 2 if pose.z < tools.SWEEP_TIP_Z_M + PRESS_WITHIN_M else 1
 
 
 class PathFollower:
-    """Follows the path of one primitive, command by command.
+    """Follows waypoints, command by command.
 
     Args:
-        action: The primitive.
-        end_effector: The tool.
-        compat: As in `sweep_plan`.
+        waypoints: The path.
     """
 
-    def __init__(self, action: Action, end_effector: EndEffector, *, compat: bool = False) -> None:
-        self._waypoints = list(tool_path(action, end_effector, compat=compat))
+    def __init__(self, waypoints: Iterable[Waypoint]) -> None:
+        self._waypoints = list(waypoints)
         self._last: ToolPose | None = None  # where the tool was when the waypoint was last pursued
 
     def next_command(self, world: ToolWorld) -> ToolCommand | None:
@@ -100,7 +165,7 @@ class PathFollower:
 def _towards(waypoint: Waypoint, pose: ToolPose) -> ToolCommand:
     """The fastest command in a straight line, no farther than the waypoint."""
     goal = waypoint.pose
-    dx, dy, dz = goal.x - pose.x, goal.y - pose.y, goal.z - pose.z
+    dx, dy, dz = goal.x - pose.x, goal.y - pose.y, max(goal.z - pose.z, -MAX_MOVE_M)
     turn = goal.yaw_rad - pose.yaw_rad
     slower = max(
         abs(dx) / MAX_MOVE_M, abs(dy) / MAX_MOVE_M, abs(dz) / MAX_MOVE_M, abs(turn) / MAX_TURN_RAD, 1

@@ -9,7 +9,7 @@ import numpy as np
 from openvima.catalog.geometry import Assets
 from openvima.errors import ReachError
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Pose, Scene
-from openvima.scene.command import CONTROL_HZ, ToolCommand, ToolPose
+from openvima.scene.command import CONTROL_HZ, HIGHEST_TIP_Z_M, ToolCommand, ToolPose
 from openvima.sim import end_effectors as tools
 from openvima.sim import ur5
 from openvima.sim.arm_path import ArmPath, RecordFrame
@@ -21,7 +21,6 @@ from openvima.sim.settling import STRIDE_TICKS, Settling
 from openvima.sim.spatula import SWEEP_M_S, Spatula
 from openvima.sim.world import SEPARATION_SPEED
 
-HIGHEST_TIP_Z_M = 0.35
 MAX_JOINT_SPEED = math.pi  # rad/s, of every joint, as in the UR5's data sheet
 PRESS_WITHIN_M = 0.01  # the spatula is pressed to the table from at most this height above its lowest
 _MARGIN_M = tools.SPATULA_RUN_UP_M  # by which the tool leaves the workspace
@@ -67,6 +66,11 @@ class ToolWorld:
         return self._state.scene(None if held is None else (held.index, self._held_pose(held)))
 
     @property
+    def scene_at_rest(self) -> Scene:
+        """The scene when everything was last at rest, before the tool took hold."""
+        return self._scene
+
+    @property
     def joints(self) -> np.ndarray:
         """Current joint angles of the arm, shape (6,), float64, radians."""
         return self._joints.copy()
@@ -87,9 +91,19 @@ class ToolWorld:
         return None if self._held is None else self._scene.placements[self._held.index].id
 
     @property
+    def grasp(self) -> ToolPose | None:
+        """Pose of the tool when it took hold of the body on the cup."""
+        return None if self._held is None else self._held.grasp
+
+    @property
     def is_moving(self) -> bool:
         """Whether bodies that were let go have not come to rest."""
         return self._settling is not None
+
+    @property
+    def is_down(self) -> bool:
+        """Whether the cup or the held body touches what is below it."""
+        return self._pose.z <= self._lowest_z(self._pose) + _TOUCH_M
 
     def command(
         self,
