@@ -84,9 +84,23 @@ def test_rows_hold_what_lies_on_the_table_and_what_the_prompt_shows() -> None:
     assert np.abs(np.array(seen) - places).max() < 0.03
     assert prompt[:3, 0].tolist() == [1, 1, 0] and not prompt[:, 1:3].any()
     assert prompt[:2, 5].tolist() == [0, 1 / 16]
-    shown = [prompt[:, 6:] @ row[6:] / np.linalg.norm(row[6:]) for row in objects[: len(places)]]
+    shown = [prompt[:, 8:] @ row[8:] / np.linalg.norm(row[8:]) for row in objects[: len(places)]]
     assert len({int(np.argmax(each)) for each in np.transpose(shown)[:2]}) == 2
     assert words.sum() == 3  # put, the, into
+
+
+def test_the_tool_and_where_to_pick_are_seen_under_low_level_control() -> None:
+    env = FlatObservation(openvima.make("rotate", control="end_effector"))
+    observation, info = env.reset(seed=0)
+    while not info["grasped"]:
+        observation, *_, info = env.step(env.unwrapped.oracle_command())
+    objects, _, words = env.rows(observation)
+    x, y, z, *yaw_and_hold = words[65:]
+    assert env.observation_space.contains(observation) and yaw_and_hold == pytest.approx([0, 1, 1])
+    assert np.abs(objects[:2, 6:8] - (x, y)).max(axis=1).min() < 0.15  # 4 cm
+    assert 0.01 < (z + 1) / 2 * 0.35 < 0.06
+    with pytest.raises(ConfigError, match="control is 'end_effector', whose actions are a box already"):
+        FlatAction(openvima.make("rotate", control="end_effector"))
 
 
 def test_words_tell_prompts_of_one_task_apart() -> None:
@@ -112,7 +126,7 @@ def test_too_few_rows_and_missing_images_are_named() -> None:
 def test_vectors_of_gymnasium_take_the_wrappers() -> None:
     envs = gymnasium.make_vec("openvima/rotate-v1", 2, wrappers=[FlatAction, FlatObservation, ProgressReward])
     observations, infos = envs.reset(seed=0)
-    assert observations.shape == (2, 16 * 54 * 2 + 65)
+    assert observations.shape == (2, 16 * 56 * 2 + 65)
     assert infos["progress"]["angle_rad"].shape == (2,)
     assert envs.step(envs.action_space.sample())[1].shape == (2,)
 
@@ -125,4 +139,4 @@ def test_the_code_of_the_page_runs_from_top_to_bottom(capsys: pytest.CaptureFixt
     ):
         exec(compile(code, str(page), "exec"), names)
     printed = capsys.readouterr().out
-    assert "2 objects, the leftmost" in printed and f"(4, {16 * 54 * 2 + 65})" in printed
+    assert "2 objects, the leftmost" in printed and f"(4, {16 * 56 * 2 + 65})" in printed

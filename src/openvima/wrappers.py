@@ -13,11 +13,13 @@ from openvima.errors import ActionError, ConfigError
 from openvima.perception.objects import TOP, ObjectViews, observe, observe_prompt_image
 from openvima.render.camera import CAMERAS
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action
+from openvima.scene.command import END_EFFECTOR, HIGHEST_TIP_Z_M
 from openvima.tasks.goals import LEVER_M
 
 ACTION_SIZE = 6
 PATCHES = 4  # rows and columns of patches that a crop is averaged over
-OBJECT_SIZE = 6 + 3 * PATCHES**2
+OBJECT_SIZE = 8 + 3 * PATCHES**2
+TOOL_SIZE = 6
 NUM_BUCKETS = 64  # of words
 
 _LOW, _HIGH = np.array(WORKSPACE_LOW), np.array(WORKSPACE_HIGH)
@@ -33,7 +35,10 @@ class FlatAction(gymnasium.ActionWrapper):
     | 4, 5 | sine and cosine of the rotation, counter-clockwise from above, of any length; zeros: none |
 
     Args:
-        env: An environment of the package, wrapped or not.
+        env: An environment of the package, wrapped or not, with control "primitives".
+
+    Raises:
+        ConfigError: The control is another.
 
     Example:
         >>> env = FlatAction(openvima.make("rotate"))  # doctest: +SKIP
@@ -42,6 +47,12 @@ class FlatAction(gymnasium.ActionWrapper):
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
+        base: Any = env.unwrapped
+        if base.control == END_EFFECTOR:
+            raise ConfigError(
+                f"control is {END_EFFECTOR!r}, whose actions are a box already; FlatAction takes control "
+                "'primitives'. gymnasium.wrappers.RescaleAction(env, -1, 1) scales the box."
+            )
         self.action_space = spaces.Box(-1, 1, (ACTION_SIZE,), np.float32)
 
     def action(self, action: Any) -> dict[str, np.ndarray]:
@@ -84,7 +95,8 @@ class FlatObservation(gymnasium.Wrapper):
 
     It holds what policies over objects see, no state of the simulator: `max_objects` rows for objects on the
     table, from left to right, `max_prompt_objects` rows for objects in the prompt's images, in reading order,
-    64 numbers for the words of the prompt, and the end effector. `rows` splits a vector.
+    64 numbers for the words of the prompt, and the end effector; with control "end_effector" 6 numbers for
+    the tool too. `rows` splits a vector.
 
     | numbers of a row | meaning |
     |---|---|
@@ -92,9 +104,12 @@ class FlatObservation(gymnasium.Wrapper):
     | 1, 2 | x, y on the table; −1 and 1 are the bounds of actions. Of the prompt's object images: 0 |
     | 3, 4 | height and width of its box in the top view, as fractions of the image's |
     | 5 | of the prompt's objects: index of the image, divided by `max_prompt_objects` |
-    | 6 … 53 | colours of its crop in the top view, averaged over 4 × 4 patches |
+    | 6, 7 | x, y of its most interior pixel, where it can be picked, scaled as 1, 2 |
+    | 8 … 55 | colours of its crop in the top view, averaged over 4 × 4 patches |
 
     A word sets one of the 64 numbers, chosen by its CRC-32, to 1. The end effector is 0 (suction cup) or 1.
+    The tool's numbers are x, y, scaled as those of objects and clipped, its height, −1 at the table and 1 at
+    0.35 m, sine and cosine of its yaw, and 1 while it holds.
 
     Args:
         env: An environment of the package, wrapped or not, that observes `rgb` and `segm`.
@@ -114,6 +129,7 @@ class FlatObservation(gymnasium.Wrapper):
             raise ConfigError(f"rows are {max_objects} and {max_prompt_objects}; give at least one each.")
         self.max_objects, self.max_prompt_objects = max_objects, max_prompt_objects
         size = (max_objects + max_prompt_objects) * OBJECT_SIZE + NUM_BUCKETS + 1
+        size += TOOL_SIZE * (self._base.control == END_EFFECTOR)
         self.observation_space = spaces.Box(-1, 1, (size,), np.float32)
         self._prompt = np.zeros(0, np.float32)
 
@@ -135,16 +151,18 @@ class FlatObservation(gymnasium.Wrapper):
     def observation(self, observation: Mapping[str, Any]) -> np.ndarray:
         """Return an observation of the running episode as a vector."""
         objects = self._rows([(observe(observation), True)], "max_objects")
-        return np.concatenate([objects.ravel(), self._prompt, [observation["ee"]]], dtype=np.float32)
+        tool = _tool(observation["tool"]) if "tool" in observation else ()
+        return np.concatenate([objects.ravel(), self._prompt, [observation["ee"]], tool], dtype=np.float32)
 
     def rows(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Split vectors into objects, objects of the prompt, and words with the end effector.
+        """Split vectors into objects, objects of the prompt, and words with the end effector and the tool.
 
         Args:
             observation: Shape (..., size).
 
         Returns:
-            Shapes (..., max_objects, 54), (..., max_prompt_objects, 54) and (..., 65).
+            Shapes (..., max_objects, 56), (..., max_prompt_objects, 56) and (..., 65), with control
+            "end_effector" (..., 71).
         """
         ends = np.cumsum([self.max_objects, self.max_prompt_objects]) * OBJECT_SIZE
         objects, prompt, words = np.split(observation, ends, axis=-1)
@@ -162,7 +180,7 @@ class FlatObservation(gymnasium.Wrapper):
         return np.concatenate([rows.ravel(), words])
 
     def _rows(self, images: list[tuple[ObjectViews, bool]], limit: str) -> np.ndarray:
-        """One row for each object of images, shape (limit, 54), with its position if it is on the table."""
+        """One row for each object of images, shape (limit, 56), with its position if it is on the table."""
         num_rows = getattr(self, limit)
         num_objects = sum(len(objects) for objects, _ in images)
         if num_objects > num_rows:
@@ -174,9 +192,10 @@ class FlatObservation(gymnasium.Wrapper):
             filled[:, 0] = 1
             if is_on_table:
                 filled[:, 1:3] = np.clip(_scaled(objects.positions()), -1, 1)
+                filled[:, 6:8] = np.clip(_scaled(objects.grasp_points()), -1, 1)
             filled[:, 3:5] = objects.boxes[TOP][:, 2:] / (CAMERAS["top"].height, CAMERAS["top"].width)
             filled[:, 5] = index / num_rows
-            filled[:, 6:] = _patches(objects.crops[TOP])
+            filled[:, 8:] = _patches(objects.crops[TOP])
             start += len(objects)
         return rows
 
@@ -214,6 +233,12 @@ class ProgressReward(gymnasium.Wrapper):
 
 def _scaled(points: np.ndarray) -> np.ndarray:
     return (points - _LOW) / (_HIGH - _LOW) * 2 - 1
+
+
+def _tool(tool: np.ndarray) -> np.ndarray:
+    x, y, z, yaw_rad, holds = tool
+    height = 2 * z / HIGHEST_TIP_Z_M - 1
+    return np.clip([*_scaled(np.array([x, y])), height, np.sin(yaw_rad), np.cos(yaw_rad), holds], -1, 1)
 
 
 def _potential(progress: Mapping[str, float]) -> float:
