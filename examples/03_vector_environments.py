@@ -30,7 +30,7 @@ def play_round(envs, policy, seeds):
 
 def main():
     """Run eight rounds with a random policy."""
-    envs = openvima.make_vec(TASKS, 4, vectorization_mode="async", level="L1", domain="eval")
+    envs = openvima.make_vec(TASKS, 4, num_workers=2, level="L1", domain="eval")
     policy = load_policy("random", seed=0)  # or the folder of a run that `openvima train` wrote
     try:
         solved = [play_round(envs, policy, list(range(first, first + 4))) for first in range(0, 32, 4)]

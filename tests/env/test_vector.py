@@ -52,10 +52,10 @@ def oracle_actions(envs: VectorEnv) -> dict[str, np.ndarray]:
     return stack_actions([decision.action for decision in envs.call("oracle_decision")])
 
 
-@pytest.fixture(scope="module", params=["sync", "async"])
+@pytest.fixture(scope="module", params=[0, 2])
 def pair(request: pytest.FixtureRequest) -> Iterator[VectorEnv]:
     """Two sub-environments of different tasks and levels; tests leave them usable."""
-    envs = openvima.make_vec(TASKS, vectorization_mode=request.param, domain="eval")
+    envs = openvima.make_vec(TASKS, num_workers=request.param, domain="eval")
     yield envs
     envs.close()
 
@@ -184,10 +184,10 @@ def test_a_step_before_the_first_reset_is_refused() -> None:
         envs.step(stack_actions([None, None]))
 
 
-@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("num_workers", [0, 2])
 @pytest.mark.slow
-def test_the_next_step_after_an_end_begins_an_episode(kind: str) -> None:
-    envs = openvima.make_vec("rotate", 2, vectorization_mode=kind, seeds=[3, 4, 5, 6])
+def test_the_next_step_after_an_end_begins_an_episode(num_workers: int) -> None:
+    envs = openvima.make_vec("rotate", 2, num_workers=num_workers, seeds=[3, 4, 5, 6])
     assert envs.reset()[1]["seed"].tolist() == [3, 4]
     oracle = envs.call("oracle_decision")[0].action
     _, rewards, terminated, _, infos = envs.step(stack_actions([oracle, None]))
@@ -203,11 +203,11 @@ def test_the_next_step_after_an_end_begins_an_episode(kind: str) -> None:
     envs.close()
 
 
-@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("num_workers", [0, 2])
 @pytest.mark.slow
-def test_the_same_step_can_end_an_episode_and_begin_another(kind: str) -> None:
+def test_the_same_step_can_end_an_episode_and_begin_another(num_workers: int) -> None:
     envs = openvima.make_vec(
-        "rotate", 2, vectorization_mode=kind, seeds=range(3, 7), autoreset_mode="SameStep"
+        "rotate", 2, num_workers=num_workers, seeds=range(3, 7), autoreset_mode="SameStep"
     )
     envs.reset()
     single = TabletopEnv("rotate")
@@ -226,10 +226,10 @@ def test_the_same_step_can_end_an_episode_and_begin_another(kind: str) -> None:
     envs.close()
 
 
-@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("num_workers", [0, 2])
 @pytest.mark.slow
-def test_without_autoreset_an_ended_episode_waits_for_its_reset(kind: str) -> None:
-    envs = openvima.make_vec("rotate", 2, vectorization_mode=kind, autoreset_mode=AutoresetMode.DISABLED)
+def test_without_autoreset_an_ended_episode_waits_for_its_reset(num_workers: int) -> None:
+    envs = openvima.make_vec("rotate", 2, num_workers=num_workers, autoreset_mode=AutoresetMode.DISABLED)
     envs.reset(seed=[3, 4])
     oracle = envs.call("oracle_decision")[0].action
     assert envs.step(stack_actions([oracle, None]))[2].tolist() == [True, False]
@@ -246,8 +246,8 @@ def test_without_autoreset_an_ended_episode_waits_for_its_reset(kind: str) -> No
 
 @pytest.mark.slow
 def test_an_episode_does_not_depend_on_how_many_are_played_at_once() -> None:
-    def play(num_envs: int, kind: str) -> dict[int, object]:
-        envs = openvima.make_vec("rotate", num_envs, vectorization_mode=kind, level="L2")
+    def play(num_envs: int, num_workers: int) -> dict[int, object]:
+        envs = openvima.make_vec("rotate", num_envs, num_workers=num_workers, level="L2")
         episodes = {}
         for first in range(0, 6, num_envs):
             observations, infos = envs.reset(seed=first)
@@ -257,9 +257,9 @@ def test_an_episode_does_not_depend_on_how_many_are_played_at_once() -> None:
         envs.close()
         return episodes
 
-    expected = play(1, "sync")
+    expected = play(1, 0)
     assert len({str(episode) for episode in expected.values()}) == 6
-    assert play(3, "sync") == play(2, "async") == play(3, "async") == expected
+    assert play(3, 0) == play(2, 1) == play(3, 2) == expected
 
 
 @pytest.mark.parametrize(
@@ -308,10 +308,10 @@ def test_tasks_are_taken_in_turn() -> None:
     assert infos["level"].tolist() == ["L1", "L2", "L1"]
 
 
-@pytest.mark.parametrize("kind", ["sync", "async"])
-def test_what_cannot_be_built_is_refused_at_once(kind: str) -> None:
+@pytest.mark.parametrize("num_workers", [0, 1])
+def test_what_cannot_be_built_is_refused_at_once(num_workers: int) -> None:
     def build(tasks: object, *arguments: object, **options: object) -> None:
-        openvima.make_vec(tasks, *arguments, vectorization_mode=kind, **options)
+        openvima.make_vec(tasks, *arguments, num_workers=num_workers, **options)
 
     with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
         build(["visual_manipulation", "rotat"])
@@ -329,9 +329,38 @@ def test_what_cannot_be_built_is_refused_at_once(kind: str) -> None:
         build("rotate", 1, autoreset_mode="Never")
 
 
-def test_an_unknown_kind_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"vectorization mode 'threads'.*sync, async"):
-        openvima.make_vec("rotate", 2, vectorization_mode="threads")
+@pytest.mark.parametrize("num_workers", [-1, 3, True, 1.0])
+def test_a_number_of_workers_that_cannot_be_is_refused(num_workers: object) -> None:
+    with pytest.raises(
+        ConfigError, match=f"num_workers is {num_workers!r}; with 2 sub-environments give 0 to 2"
+    ):
+        openvima.make_vec("rotate", 2, num_workers=num_workers)
+
+
+def test_environments_of_different_spaces_do_not_make_a_batch() -> None:
+    tasks = ["rotate", {"task": "rotate", "control": "end_effector"}]
+    with pytest.raises(ConfigError, match="sub-environments 0 and 1 differ in their observation_space"):
+        openvima.make_vec(tasks)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_low_level_control_in_batches_gives_the_bytes_of_single_environments(num_workers: int) -> None:
+    options = {"level": "L1", "control": "end_effector"}
+    envs = openvima.make_vec("rotate", 3, num_workers=num_workers, **options)
+    single = TabletopEnv("rotate", **options)
+    envs.reset(seed=4)
+    single.reset(seed=6)
+    for _ in range(12):
+        commands = np.stack([command.to_array() for command in envs.call("oracle_command")])
+        observations, *_ = envs.step(commands)
+        expected, *_ = single.step(single.oracle_command())
+    assert frozen(rows(envs, observations)[2]) == frozen(expected)
+    with pytest.raises(ActionError, match=r"sub-environment 1: .*nan"):
+        envs.step(np.where(np.arange(3)[:, None] == 1, np.float32(np.nan), commands))
+    with pytest.raises(ActionError, match=r"array of shape \(3, 5\), not dict"):
+        envs.step(stack_actions([CORNER] * 3))
+    envs.close()
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from gymnasium.vector import AutoresetMode
 
 from openvima.errors import ActionError, ConfigError, EpisodeError
 from openvima.scene import ACTION_SHAPES, WORKSPACE_LOW, Action
+from openvima.scene.command import COMMAND_NAMES, PRIMITIVES, ToolCommand
 from openvima.tasks.seeding import checked_seed
 
 RESET_MASK = "reset_mask"  # Gymnasium's option: which sub-environments to reset, shape (N,), bool
@@ -22,10 +23,11 @@ class ActionValidator:
     Args:
         num_envs: Number of sub-environments.
         autoreset_mode: With "Disabled", a sub-environment whose episode is over needs a `reset`.
+        control: What an action is: "primitives" or "end_effector".
     """
 
-    def __init__(self, num_envs: int, autoreset_mode: AutoresetMode) -> None:
-        self.num_envs = num_envs
+    def __init__(self, num_envs: int, autoreset_mode: AutoresetMode, control: str = PRIMITIVES) -> None:
+        self.num_envs, self._control = num_envs, control
         self._waits_for_reset = autoreset_mode is AutoresetMode.DISABLED
         self._needs_reset = np.ones(num_envs, dtype=bool)
         self._reset_mask = np.zeros(num_envs, dtype=bool)
@@ -75,9 +77,12 @@ class ActionValidator:
             how = "reset()" if self._needs_reset.all() else f"reset(options={{'{RESET_MASK}': mask}})"
             raise EpisodeError(f"sub-environments {waiting} have no running episode; call {how} first.")
         places: dict[str, list[int]] = {}
-        for index, action in enumerate(_rows(actions, self.num_envs)):
+        is_primitive = self._control == PRIMITIVES
+        check = Action.from_arrays if is_primitive else ToolCommand.from_array
+        rows = (_rows if is_primitive else _commands)(actions, self.num_envs)
+        for index, action in enumerate(rows):
             try:
-                Action.from_arrays(action)
+                check(action)
             except ActionError as error:
                 places.setdefault(str(error).removesuffix(" Nothing was moved."), []).append(index)
         if places:
@@ -129,6 +134,15 @@ def _rows(actions: object, num_envs: int) -> list[dict[str, Any]]:
     known = {key: value for key, value in actions.items() if key in ACTION_SHAPES}
     others = {key: value for key, value in actions.items() if key not in ACTION_SHAPES}
     return [{key: value[index] for key, value in known.items()} | others for index in range(num_envs)]
+
+
+def _commands(actions: object, num_envs: int) -> np.ndarray:
+    """Split a batch of commands of the tool."""
+    shape = (num_envs, len(COMMAND_NAMES))
+    if not isinstance(actions, np.ndarray) or actions.shape != shape:
+        given = f"of shape {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
+        raise ActionError(f"actions are an array of shape {shape}, not {given}. Nothing was moved.")
+    return actions
 
 
 def _checked_mask(mask: object, seeds: Sequence[int | None]) -> np.ndarray:

@@ -1,12 +1,12 @@
-"""Vector environments, in this process or with one worker process per sub-environment.
+"""Vector environments, in this process or in worker processes.
 
-Both are Gymnasium's classes, with its spaces and autoreset modes, and validate calls before anything moves.
-See `workers` for the additions to the asynchronous kind.
+Both have Gymnasium's interface, spaces and autoreset modes, and validate calls before anything moves. See
+`workers` for the second kind.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any  # actions, observations and infos are nested dictionaries
+from typing import Any, cast  # Any: actions, observations and infos are nested dictionaries
 
 import gymnasium
 import numpy as np
@@ -14,19 +14,17 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from openvima.env.action_validation import ActionValidator
 from openvima.env.registration import make
+from openvima.env.tabletop import TabletopEnv
 from openvima.env.workers import AsyncTabletopEnvs
 from openvima.errors import ConfigError, unknown_name
-from openvima.scene.command import PRIMITIVES
 from openvima.tasks.seeding import checked_seed
-
-MODES = ("sync", "async")
 
 
 def make_vec(
     tasks: str | Sequence[str | Mapping[str, Any]],
     num_envs: int | None = None,
     *,
-    vectorization_mode: str = "sync",
+    num_workers: int = 0,
     autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     seeds: Iterable[int] | None = None,
     **options: Any,  # of whatever type the constructor takes
@@ -37,8 +35,8 @@ def make_vec(
         tasks: Name of the task; or a list of names, or of mappings with "task" and further options,
             assigned to the sub-environments in turn.
         num_envs: Number of sub-environments; by default one for each entry of `tasks`.
-        vectorization_mode: "sync": in this process. "async": one worker process each, with observations
-            in shared memory; scripts then need `if __name__ == "__main__":`, because workers import them.
+        num_workers: Number of worker processes, each with several sub-environments; 0: all are in this
+            process. Workers need `if __name__ == "__main__":` in scripts, because they import them.
         autoreset_mode: "NextStep", "SameStep" or "Disabled", or Gymnasium's `AutoresetMode`: when the next
             episode starts.
         seeds: Seeds of the episodes: sub-environment i takes every `num_envs`-th, starting with the i-th, and
@@ -51,7 +49,8 @@ def make_vec(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: A task is not defined at the level.
-        ConfigError: A mode, an option or a seed is invalid, or the control is not "primitives".
+        ConfigError: A number, a mode, an option or a seed is invalid, or sub-environments differ in their
+            spaces.
         WorkerError: A worker ended while it started.
 
     Example:
@@ -64,20 +63,18 @@ def make_vec(
     num_envs = len(choices) if num_envs is None else num_envs
     if not choices or isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
         raise ConfigError(f"got {len(choices)} tasks for {num_envs!r} sub-environments; give at least one.")
-    if vectorization_mode not in MODES:
-        raise ConfigError(unknown_name("vectorization mode", vectorization_mode, MODES))
+    if isinstance(num_workers, bool) or not isinstance(num_workers, int) or not 0 <= num_workers <= num_envs:
+        raise ConfigError(
+            f"num_workers is {num_workers!r}; with {num_envs} sub-environments give 0 to {num_envs}."
+        )
     mode = _autoreset_mode(autoreset_mode)
-    controls = [options, *(choice for choice in choices if isinstance(choice, Mapping))]
-    for control in (given.get("control", PRIMITIVES) for given in controls):
-        if control != PRIMITIVES:
-            raise ConfigError(f"control is {control!r}; vector environments have {PRIMITIVES!r} only.")
     seed_lists = _split_seeds(seeds, num_envs)
     env_fns = [_env_factory(choices[i % len(choices)], options, seed_lists[i]) for i in range(num_envs)]
-    if vectorization_mode == "sync":
-        return SyncTabletopEnvs(env_fns, mode)
-    for env_fn in env_fns:
-        env_fn().close()  # fails here rather than in a worker
-    return AsyncTabletopEnvs(env_fns, mode)
+    control = _common_control([env_fn() for env_fn in env_fns[: len(choices)]])
+    validator = ActionValidator(num_envs, mode, control)
+    if num_workers == 0:
+        return SyncTabletopEnvs(env_fns, validator, mode)
+    return AsyncTabletopEnvs(env_fns, validator, mode, num_workers)
 
 
 class SyncTabletopEnvs(SyncVectorEnv):
@@ -85,12 +82,18 @@ class SyncTabletopEnvs(SyncVectorEnv):
 
     Args:
         env_fns: Build the sub-environments.
+        validator: Checks resets and actions before anything moves.
         autoreset_mode: When the next episode starts.
     """
 
-    def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env]], autoreset_mode: AutoresetMode) -> None:
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gymnasium.Env]],
+        validator: ActionValidator,
+        autoreset_mode: AutoresetMode,
+    ) -> None:
         super().__init__(env_fns, autoreset_mode=autoreset_mode)
-        self._validator = ActionValidator(len(env_fns), autoreset_mode)
+        self._validator = validator
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in all sub-environments, or in those of `options["reset_mask"]`.
@@ -115,7 +118,8 @@ class SyncTabletopEnvs(SyncVectorEnv):
         """Take a step in every sub-environment.
 
         Args:
-            actions: The four keys of an action, one row per sub-environment.
+            actions: The four keys of an action, one row per sub-environment; with control "end_effector" an
+                array, shape (num_envs, 5).
 
         Returns:
             Batches of observation, reward, terminated, truncated and info.
@@ -177,6 +181,19 @@ def _env_factory(
     if "task" not in own:
         raise ConfigError(f"an entry of tasks is {own}; give a name, or a mapping with 'task' and options.")
     return EnvFactory({**options, **own}, seeds)
+
+
+def _common_control(envs: Sequence[gymnasium.Env]) -> str:
+    """Check that sub-environments have equal spaces; return their control."""
+    for index, env in enumerate(envs):
+        for name in ("observation_space", "action_space"):
+            if getattr(env, name) != getattr(envs[0], name):
+                raise ConfigError(
+                    f"sub-environments 0 and {index} differ in their {name}; give all the same control and "
+                    "modalities."
+                )
+        env.close()
+    return cast(TabletopEnv, envs[0].unwrapped).control
 
 
 def _split_seeds(seeds: Iterable[int] | None, num_envs: int) -> list[tuple[int, ...]]:

@@ -1,137 +1,222 @@
-"""Vector environments in worker processes.
+"""Vector environments in worker processes, each with several sub-environments.
 
-Additions to Gymnasium's `AsyncVectorEnv`: actions and seeds are validated before they reach a worker; an
-exception keeps its type and names the sub-environment; an exception, a killed worker or Ctrl-C terminates all
-workers at once; an exception in a `call`, such as an oracle without an action, terminates none.
+A call is one message to each worker and one back; observations are in shared memory. Actions and seeds are
+validated before they reach a worker; an exception keeps its type and names the sub-environment; an exception,
+a killed worker or Ctrl-C terminates all workers at once; an exception in a `call`, such as an oracle without
+an action, terminates none.
 """
 
 import atexit
 import contextlib
+import copy
 import functools
-import os
-import queue
-import sys
+import itertools
+import multiprocessing
+import pickle
+import time
+import traceback
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from typing import Any  # actions, observations and infos are nested dictionaries
 
 import gymnasium
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
-from gymnasium.vector.async_vector_env import AsyncState
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space, create_shared_memory, read_from_shared_memory
 
-from openvima.env.action_validation import ActionValidator
+from openvima.env.action_validation import RESET_MASK, ActionValidator
 from openvima.errors import WorkerError
 from openvima.multiprocess import defer_sigint, exit_with_parent, init_worker, single_threaded_workers
 
-_TIMEOUT_S = 5.0  # for an idle worker to exit, and for an exception to arrive
+_EXIT_S = 5.0  # for an idle worker to exit
+_CLOSE = "close"
 
 
-class AsyncTabletopEnvs(AsyncVectorEnv):
+class AsyncTabletopEnvs(VectorEnv):
     """Sub-environments in worker processes. See `make_vec` and `SyncTabletopEnvs`.
 
-    `call` and `get_attr` reach methods and attributes of all sub-environments and may raise without harm. An
-    exception in `reset` or `step`, a killed worker, or Ctrl-C while waiting closes all sub-environments.
+    `call`, `get_attr` and `set_attr` reach all sub-environments and may raise without harm. An exception in
+    `reset` or `step`, a killed worker, or Ctrl-C while waiting closes all sub-environments. The halves of
+    `reset`, `step` and `call`, such as `step_async` and `step_wait`, leave time for other work between them.
 
     Args:
-        env_fns: Build the sub-environments.
+        env_fns: Build the sub-environments, which have equal spaces.
+        validator: Checks resets and actions before they are sent.
         autoreset_mode: When the next episode begins.
+        num_workers: Number of processes; consecutive sub-environments share one.
     """
 
-    def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env]], autoreset_mode: AutoresetMode) -> None:
-        self._validator = ActionValidator(len(env_fns), autoreset_mode)
-        self._starting = contextlib.ExitStack()
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gymnasium.Env]],
+        validator: ActionValidator,
+        autoreset_mode: AutoresetMode,
+        num_workers: int,
+    ) -> None:
+        self.num_envs, self._validator = len(env_fns), validator
+        self._pending: str | None = None  # what was sent and not yet answered
+        self._pipes: list[Connection] = []
+        self.processes: list[multiprocessing.process.BaseProcess] = []
+        first = env_fns[0]()
+        self.metadata = {**first.metadata, "autoreset_mode": autoreset_mode}
+        self.render_mode = first.render_mode
+        self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        first.close()
+        bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
+        self._parts = [slice(*part) for part in itertools.pairwise(bounds)]
+        # Spawned: a forked child of a process with threads can inherit locks that are never released.
+        context = multiprocessing.get_context("spawn")
+        memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
+        self._observations = read_from_shared_memory(self.single_observation_space, memory, self.num_envs)
         try:
-            with self._starting, single_threaded_workers():
-                self._starting.enter_context(defer_sigint())
-                # Spawned: a forked child of a process with threads can inherit locks that are never released.
-                super().__init__(
-                    [functools.partial(_build, env_fn, os.getpid()) for env_fn in env_fns],
-                    context="spawn",
-                    autoreset_mode=autoreset_mode,
-                )
+            with single_threaded_workers(), defer_sigint():
+                for part in self._parts:
+                    here, there = context.Pipe()
+                    self._pipes.append(here)
+                    arguments = (there, env_fns[part], part, autoreset_mode, memory, self.num_envs)
+                    self.processes.append(context.Process(target=_work, args=arguments, daemon=True))
+                    self.processes[-1].start()
+                    there.close()
+            with self._close_on_error():
+                self._receive(None)  # that they have started
         except BaseException:
-            self._end_workers(at_once=True)
+            self.close(terminate=True)
             raise
         _OPEN.add(self)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start episodes, as `SyncTabletopEnvs.reset` does."""
+        self.reset_async(seed, options)
+        return self.reset_wait()
 
     def reset_async(self, seed: Any = None, options: dict[str, Any] | None = None) -> None:
         """Send a reset to the workers; arguments as in `SyncTabletopEnvs.reset`."""
         seeds = self._validator.check_reset(seed, options)
-        with self._close_on_error():
-            super().reset_async(seeds, dict(options or {}))
+        mask = (options or {}).get(RESET_MASK)
+        self._send("reset", [(seeds[part], None if mask is None else mask[part]) for part in self._parts])
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
-        """Wait for the reset."""
-        with self._close_on_error():
-            result = super().reset_wait(timeout)
+        """Wait for the reset, for `timeout` seconds at most."""
+        infos = self._wait("reset", timeout)
         self._validator.record_reset()
-        return result
+        return copy.deepcopy(self._observations), self._join_infos(infos)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Take a step in every sub-environment, as `SyncTabletopEnvs.step` does."""
+        self.step_async(actions)
+        return self.step_wait()
 
     def step_async(self, actions: Any) -> None:
         """Send a step to the workers; arguments as in `SyncTabletopEnvs.step`."""
         self._validator.check_step(actions)
-        with self._close_on_error():
-            super().step_async(actions)
+        self._send("step", [(_rows(actions, part),) for part in self._parts])
 
     def step_wait(
         self, timeout: float | None = None
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Wait for the step."""
-        with self._close_on_error():
-            result = super().step_wait(timeout)
-        self._validator.record_step(result[2] | result[3])
-        return result
+        """Wait for the step, for `timeout` seconds at most."""
+        answers = self._wait("step", timeout)
+        *ends, infos = zip(*answers, strict=True)
+        rewards, terminated, truncated = (np.concatenate(values) for values in ends)
+        self._validator.record_step(terminated | truncated)
+        observations = copy.deepcopy(self._observations)
+        return observations, rewards, terminated, truncated, self._join_infos(infos)
+
+    def call(self, name: str, /, *args: object, **kwargs: object) -> tuple[Any, ...]:
+        """Return an attribute, or the result of a method, of every sub-environment."""
+        self.call_async(name, *args, **kwargs)
+        return self.call_wait()
 
     def call_async(self, name: str, /, *args: object, **kwargs: object) -> None:
-        """Request an attribute, or the result of a method, of every sub-environment."""
-        with self._close_on_error():
-            super().call_async(name, *args, **kwargs)
+        """Request what `call` returns."""
+        self._send("call", [(name, args, kwargs)] * len(self._parts))
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """Wait for the results."""
+        """Wait for the results, for `timeout` seconds at most."""
+        results = [result for answer in self._wait("call", timeout) for result in answer]
+        for result in results:
+            if isinstance(result, _Failure):
+                raise result.error
+        return tuple(results)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute of every sub-environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every sub-environment; a list or tuple has a value for each."""
+        values = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
+        if len(values) != self.num_envs:
+            raise ValueError(f"got {len(values)} values for {self.num_envs} sub-environments; give one each.")
+        self._send("set_attr", [(name, values[part]) for part in self._parts])
+        self._wait("set_attr", None)
+
+    def render(self) -> tuple[Any, ...]:
+        """Return the picture of every sub-environment."""
+        return self.call("render")
+
+    def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
+        """End the workers: let them exit, or terminate them if asked or if they are busy."""
+        if not terminate and self._pending is None:
+            for pipe in self._pipes:
+                with contextlib.suppress(OSError):  # it may have died
+                    pipe.send((_CLOSE, ()))
+            for process in self.processes:
+                process.join(_EXIT_S if timeout is None else timeout)
+        for process in self.processes:
+            process.terminate()
+        for process in self.processes:
+            process.join()
+        for pipe in self._pipes:
+            pipe.close()
+
+    def __del__(self) -> None:
+        if not getattr(self, "closed", True):
+            self.close(terminate=True)
+
+    def _send(self, name: str, arguments: Sequence[tuple[Any, ...]]) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("the environments are closed; make new ones.")
+        if self._pending:
+            raise AlreadyPendingCallError(f"call `{self._pending}_wait` before `{name}`.", self._pending)
         with self._close_on_error():
-            answers = super().call_wait(timeout)
-        for index, answer in enumerate(answers):
-            if isinstance(answer, _Failed):
-                answer.error.add_note(f"raised in sub-environment {index}")
+            for pipe, given in zip(self._pipes, arguments, strict=True):
+                pipe.send((name, given))
+        self._pending = name
+
+    def _wait(self, name: str, timeout_s: float | None) -> list[Any]:
+        if self.closed:
+            raise ClosedEnvironmentError("the environments are closed; make new ones.")
+        if self._pending != name:
+            raise NoAsyncCallError(f"call `{name}_async` before `{name}_wait`.", name)
+        with self._close_on_error():
+            answers = self._receive(timeout_s)
+        self._pending = None
+        return answers
+
+    def _receive(self, timeout_s: float | None) -> list[Any]:
+        """Return the answers of all workers; raise the first exception among them."""
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        answers = []
+        for pipe in self._pipes:
+            if deadline_s is not None and not pipe.poll(max(0.0, deadline_s - time.monotonic())):
+                raise multiprocessing.TimeoutError(f"no answer of the workers in {timeout_s} s.")
+            answers.append(pipe.recv())
+        for answer in answers:
+            if isinstance(answer, _Failure):
                 raise answer.error
         return answers
 
-    def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
-        """Terminate the workers if asked or if they are busy, else let them exit.
-
-        Gymnasium's own version waits for busy workers, and fails if one has died.
-        """
-        self._end_workers(at_once=terminate or self._state != AsyncState.DEFAULT, timeout_s=timeout)
-
-    def _check_spaces(self) -> None:
-        self._starting.close()  # all workers have been started; Ctrl-C may interrupt the wait
-        with self._close_on_error():
-            super()._check_spaces()
-
-    def _raise_if_errors(self, successes: Iterable[bool]) -> None:
-        """Raise the first exception of a worker, without the warning that Gymnasium logs first."""
-        if all(successes):
-            return
-        try:
-            index, _, error, trace = self.error_queue.get(timeout=_TIMEOUT_S)
-        except queue.Empty:
-            raise WorkerError(
-                "a worker failed with an exception that cannot be pickled; see its output."
-            ) from None
-        error.add_note(f"raised in sub-environment {index}; all workers were ended.\n\n{trace}")
-        raise error
-
     @contextlib.contextmanager
     def _close_on_error(self) -> Iterator[None]:
-        """Terminate all workers if the block fails, except for calls in the wrong order."""
+        """Terminate all workers if the block fails."""
         try:
             yield
-        except (AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError):
-            raise
         except (EOFError, ConnectionError):
             message = self._describe_exit()
             self.close(terminate=True)
@@ -141,31 +226,20 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
             raise
 
     def _describe_exit(self) -> str:
-        for process in self.processes:
+        dead = []
+        for part, process in zip(self._parts, self.processes, strict=False):
             process.join(timeout=0.2)  # its exit code may arrive after the end of its pipe
-        codes = [(index, process.exitcode) for index, process in enumerate(self.processes)]
-        dead = [f"{index} (exit code {code})" for index, code in codes if code is not None]
+            if process.exitcode is not None:
+                to = f" to {part.stop - 1}" if part.stop - part.start > 1 else ""
+                dead.append(f"{part.start}{to} (exit code {process.exitcode})")
         return (
             f"the worker of sub-environment {', '.join(dead) or '?'} died; all others were terminated. "
             "Exit code -9 often means out of memory; 1 that it could not start: scripts need "
             '`if __name__ == "__main__":`, because workers import them.'
         )
 
-    def _end_workers(self, *, at_once: bool, timeout_s: float | None = None) -> None:
-        pipes = getattr(self, "parent_pipes", [])
-        processes = [process for process in getattr(self, "processes", []) if process.pid is not None]
-        if not at_once:
-            for pipe in pipes:
-                with contextlib.suppress(OSError):  # it may have died
-                    pipe.send(("close", None))
-            for process in processes:
-                process.join(_TIMEOUT_S if timeout_s is None else timeout_s)
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join()
-        for pipe in pipes:
-            pipe.close()
+    def _join_infos(self, infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        return _joined(infos, [part.stop - part.start for part in self._parts])
 
 
 _OPEN: weakref.WeakSet[AsyncTabletopEnvs] = weakref.WeakSet()
@@ -178,40 +252,157 @@ def _end_all_workers() -> None:
         envs.close(terminate=True)
 
 
+def _joined(infos: Sequence[Mapping[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:
+    """Join the infos of all workers, with blanks where one lacks a key."""
+    joined: dict[str, Any] = {}
+    for key in dict.fromkeys(key for info in infos for key in info):
+        values = [info.get(key) for info in infos]
+        some = next(value for value in values if value is not None)
+        if isinstance(some, dict):
+            joined[key] = _joined([value or {} for value in values], sizes)
+            continue
+        blank = None if some.dtype == object else 0
+        joined[key] = np.concatenate(
+            [
+                np.full((size, *some.shape[1:]), blank, some.dtype) if value is None else value
+                for value, size in zip(values, sizes, strict=True)
+            ]
+        )
+    return joined
+
+
 @dataclass(frozen=True, slots=True)
-class _Failed:
+class _Failure:
     """An exception instead of a result."""
 
     error: Exception
 
 
-class _ErrorCatcher(gymnasium.Wrapper):
-    """Returns exceptions of calls instead of raising them, which would end the worker."""
+class _Numbered(gymnasium.Wrapper):
+    """Notes in exceptions which sub-environment raised them, with the traceback.
 
-    def close(self) -> None:
-        # Gymnasium's worker closes its environment last. If its pipe broke, the parent has died: exit without
-        # a traceback.
-        if isinstance(sys.exc_info()[1], OSError):
-            exit_with_parent()
-        super().close()
+    Args:
+        env: The sub-environment.
+        index: Its number.
+    """
 
-    def get_wrapper_attr(self, name: str) -> Any:
+    def __init__(self, env: gymnasium.Env, index: int) -> None:
+        super().__init__(env)
+        self._index = index
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        with self._noted():
+            return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        with self._noted():
+            return self.env.step(action)
+
+    def attempt(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Return an attribute, the result of a method, or what it raised."""
         try:
             value = self.env.get_wrapper_attr(name)
+            return value(*args, **kwargs) if callable(value) else value
         except Exception as error:
-            return _Failed(error)
-        return functools.partial(_attempt, value) if callable(value) else value
+            error.add_note(f"raised in sub-environment {self._index}")
+            return _Failure(error)
+
+    @contextlib.contextmanager
+    def _noted(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            where = f"raised in sub-environment {self._index}; all workers were ended."
+            error.add_note(f"{where}\n\n{traceback.format_exc()}")
+            raise
 
 
-def _attempt(function: Any, *args: object, **kwargs: object) -> Any:
+class _Worker:
+    """The sub-environments of one process.
+
+    Args:
+        env_fns: Build them.
+        part: Their numbers.
+        autoreset_mode: When the next episode begins.
+        memory: Shared memory for the observations of all sub-environments.
+        num_envs: Number of all.
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gymnasium.Env]],
+        part: slice,
+        autoreset_mode: AutoresetMode,
+        memory: Any,
+        num_envs: int,
+    ) -> None:
+        self._numbered = [_Numbered(env_fn(), index) for index, env_fn in enumerate(env_fns, part.start)]
+        built = [functools.partial(lambda env: env, env) for env in self._numbered]
+        self.envs = SyncVectorEnv(built, copy=False, autoreset_mode=autoreset_mode)
+        self._part = part
+        self._shared = read_from_shared_memory(self.envs.single_observation_space, memory, num_envs)
+
+    def reset(self, seeds: list[int | None], mask: np.ndarray | None) -> dict[str, Any]:
+        """Start episodes where the mask is true; return the infos."""
+        if mask is not None and not mask.any():
+            return {}
+        observations, infos = self.envs.reset(seed=seeds, options={} if mask is None else {RESET_MASK: mask})
+        _copy(observations, self._shared, self._part)
+        return infos
+
+    def step(self, actions: Sequence[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Take a step; return rewards, terminated, truncated and infos."""
+        observations, *rest = self.envs.step(actions)
+        _copy(observations, self._shared, self._part)
+        return tuple(rest)
+
+    def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
+        """Return results, or what was raised instead."""
+        return [env.attempt(name, args, kwargs) for env in self._numbered]
+
+    def set_attr(self, name: str, values: Sequence[Any]) -> None:
+        """Set an attribute."""
+        self.envs.set_attr(name, values)
+
+
+def _rows(batch: Any, part: slice) -> Any:
+    """Return consecutive rows of a batch of actions, an array or a mapping of them."""
+    return {key: values[part] for key, values in batch.items()} if isinstance(batch, Mapping) else batch[part]
+
+
+def _copy(batch: Any, shared: Any, part: slice) -> None:
+    """Copy a batch of observations to its part of shared memory."""
+    if isinstance(batch, dict):
+        for key, values in batch.items():
+            _copy(values, shared[key], part)
+    else:
+        shared[part] = batch
+
+
+def _work(pipe: Connection, *arguments: Any) -> None:
+    """Build the sub-environments, and answer messages until told to close."""
+    init_worker()
     try:
-        return function(*args, **kwargs)
-    except Exception as error:
-        return _Failed(error)
+        worker = _Worker(*arguments)
+        pipe.send(None)
+        while (message := pipe.recv())[0] != _CLOSE:
+            name, given = message
+            try:
+                pipe.send(getattr(worker, name)(*given))
+            except (EOFError, ConnectionError):
+                raise
+            except Exception as error:
+                _send_failure(pipe, error)
+        worker.envs.close()
+    except (EOFError, ConnectionError):  # the parent has died: exit without a traceback
+        exit_with_parent()
 
 
-def _build(env_fn: Callable[[], gymnasium.Env], parent_pid: int) -> gymnasium.Env:
-    """Build a sub-environment in a worker; Gymnasium also builds one in the parent, for its spaces."""
-    if os.getpid() != parent_pid:
-        init_worker()
-    return _ErrorCatcher(env_fn())
+def _send_failure(pipe: Connection, error: Exception) -> None:
+    try:
+        pickle.loads(pickle.dumps(error))
+        pipe.send(_Failure(error))
+    except Exception:
+        traceback.print_exception(error)
+        message = "a worker failed with an exception that cannot be pickled; see its output."
+        pipe.send(_Failure(WorkerError(message)))
