@@ -16,6 +16,11 @@ ACTION_SHAPES = {
     "pose1_position": 2,
     "pose1_rotation": 4,
 }
+# Lowest and highest values of a position and a quaternion, in float32 precision.
+_LIMITS = {
+    2: tuple(np.array(limit, np.float32).tolist() for limit in (WORKSPACE_LOW, WORKSPACE_HIGH)),
+    4: ((-1.0,) * 4, (1.0,) * 4),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +45,7 @@ class Action:
 
         Positions are clipped to the workspace and rounded to float32.
         """
-        low, high = _workspace()
+        low, high = _LIMITS[2]
         pose0 = np.clip(np.array(pick, dtype=np.float32), low, high)
         pose1 = np.clip(np.array(place, dtype=np.float32), low, high)
         x, y, z, w = (float(np.float32(c)) for c in yaw_quaternion(yaw_rad))
@@ -106,10 +111,6 @@ def _tool_yaw(quaternion: Quaternion) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def _workspace() -> tuple[np.ndarray, np.ndarray]:
-    return np.array(WORKSPACE_LOW, dtype=np.float32), np.array(WORKSPACE_HIGH, dtype=np.float32)
-
-
 def _key_problems(action: Mapping[str, object]) -> list[str]:
     missing = [key for key in ACTION_SHAPES if key not in action]
     unknown = [str(key) for key in action if key not in ACTION_SHAPES]
@@ -129,17 +130,16 @@ def _checked(key: str, value: object, length: int) -> tuple[tuple[float, ...], l
     if array.shape != (length,):
         return (), [f"{key} has shape {array.shape}; it must be ({length},)."]
     with np.errstate(over="ignore"):  # reported below as not finite
-        array = array.astype(np.float32)
-    given = tuple(float(v) for v in array)
-    if not np.isfinite(array).all():
+        given = tuple(array.astype(np.float32).tolist())
+    low, high = _LIMITS[length]
+    if all(least <= value <= most for least, value, most in zip(low, given, high, strict=True)):
+        return given, []
+    if not all(map(math.isfinite, given)):
         return (), [f"{key} is {given}; all values must be finite."]
-    low, high = _workspace() if length == 2 else (np.full(4, -1.0), np.full(4, 1.0))
-    if (array < low).any() or (array > high).any():
-        text = ", ".join(f"{v:.4g}" for v in given)
-        allowed = (
-            f"x must lie in {low[0]:g} … {high[0]:g} m and y in {low[1]:g} … {high[1]:g} m"
-            if length == 2
-            else "each component must lie in -1 … 1"
-        )
-        return (), [f"{key} is ({text}); {allowed}."]
-    return given, []
+    text = ", ".join(f"{v:.4g}" for v in given)
+    allowed = (
+        f"x must lie in {low[0]:g} … {high[0]:g} m and y in {low[1]:g} … {high[1]:g} m"
+        if length == 2
+        else "each component must lie in -1 … 1"
+    )
+    return (), [f"{key} is ({text}); {allowed}."]
