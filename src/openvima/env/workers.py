@@ -19,6 +19,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any  # actions, observations and infos are nested dictionaries
 
 import gymnasium
@@ -59,7 +60,7 @@ class AsyncTabletopEnvs(VectorEnv):
         self.num_envs, self._validator = len(env_fns), validator
         self._pending: str | None = None  # what was sent and not yet answered
         self._pipes: list[Connection] = []
-        self.processes: list[multiprocessing.process.BaseProcess] = []
+        self.processes: list[BaseProcess] = []
         first = env_fns[0]()
         self.metadata = {**first.metadata, "autoreset_mode": autoreset_mode}
         self.render_mode = first.render_mode
@@ -352,9 +353,9 @@ class _Worker:
 
     def step(self, actions: Sequence[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take a step; return rewards, terminated, truncated and infos."""
-        observations, *rest = self.envs.step(actions)
+        observations, rewards, terminated, truncated, infos = self.envs.step(actions)
         _copy(observations, self._shared, self._part)
-        return tuple(rest)
+        return rewards, terminated, truncated, infos
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
         """Return results, or what was raised instead."""
@@ -380,7 +381,7 @@ def _copy(batch: Any, shared: Any, part: slice) -> None:
 
 
 def _work(pipe: Connection, *arguments: Any) -> None:
-    """Build the sub-environments, and answer messages until told to close."""
+    """Build the sub-environments, and answer messages until one says to close."""
     init_worker()
     try:
         worker = _Worker(*arguments)
