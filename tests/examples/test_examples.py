@@ -21,7 +21,7 @@ EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 # another simulator.
 APART = (
     *("policy_server", "custom_learner", "own_network", "own_training_loop", "score_my_policy"),
-    *("score_in_original_benchmark", "dagger"),
+    *("score_in_original_benchmark", "dagger", "vla_policy", "language_rule"),
 )
 
 
