@@ -47,18 +47,6 @@ def test_the_number_of_workers_does_not_change_a_byte(whole: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_ray_started_for_the_work_gives_the_same_bytes_and_is_stopped(whole: Path, tmp_path: Path) -> None:
-    ray = pytest.importorskip("ray")
-    reports: list[GenerationProgress] = []
-    generate(config(tmp_path, workers=2, engine="ray"), reports.append)
-    assert contents(tmp_path) == contents(whole)
-    assert not ray.is_initialized()
-    last = reports[-1]
-    assert (last.done, last.total, last.written) == (6, 6, 6)
-    assert last.tried >= 6
-
-
-@pytest.mark.slow
 def test_ray_stopped_by_hand_leaves_whole_files_and_is_continued(
     whole: Path, tmp_path: Path, ray: ModuleType
 ) -> None:
