@@ -32,6 +32,7 @@ except ImportError:  # Windows
 LOCK_NAME = ".lock"
 HEARTBEAT_S = 5.0
 HEARTBEATS_WATCHED = 3
+FINISH_S = 600.0  # to wait for another process that finishes a folder of several writers
 _POLL_S = 0.1
 _MAX_TEXT = 120  # characters of a command that a message shows
 _MAX_BYTES = 4096  # of an owner's file, which could be anything

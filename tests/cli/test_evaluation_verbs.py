@@ -119,3 +119,19 @@ def test_a_report_of_nothing_is_status_2(tmp_path, capsys):
 def test_recording_without_a_report_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--policy", "oracle", "--record-video", "rotate/3", "--no-report"]) == 2
     assert "--record-video needs the report" in capsys.readouterr().err
+
+
+def test_jobs_of_an_array_share_an_evaluation(tmp_path, capsys):
+    words = ["evaluate", "--policy", "oracle", "--tasks", "rotate", "--levels", "L1,L2", "--episodes", "1"]
+    words += ["--out", str(tmp_path / "scores"), "--no-report"]
+    assert main([*words, "--list-shards"]) == 0
+    assert capsys.readouterr().out == "0\toracle\trotate\tL1\t0\t1\n1\toracle\trotate\tL2\t0\t1\n"
+    assert not (tmp_path / "scores").exists()
+    assert main([*words, "--shard-range", "1:1"]) == 2
+    assert "shard_range is '1:1'; it must be a:b" in capsys.readouterr().err
+    assert main([*words, "--shard-range", "1:2"]) == 0
+    assert "lacks batches of other ranges" in capsys.readouterr().err
+    assert main([*words, "--shard-range", "0:1"]) == 0
+    assert "rotate" in capsys.readouterr().out and (tmp_path / "scores" / "results.json").exists()
+    assert main([*words, "--shard-range", "0:1"]) == 0
+    assert "is finished" in capsys.readouterr().err

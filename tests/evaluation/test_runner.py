@@ -9,6 +9,7 @@ from lock_holders import holding
 from openvima.env import EnvConfig
 from openvima.errors import AssetError, CheckpointError, ConfigError, FolderLockedError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
+from openvima.evaluation.config import plan
 
 ORACLE = EvaluationConfig(
     ("oracle",), ("rotate", "sweep_without_exceeding"), ("L2",), episodes=3, seed=40, batch=2
@@ -34,6 +35,44 @@ def test_the_oracle_solves_its_episodes(first):
 
 def test_two_workers_give_the_same_bytes(first, tmp_path):
     assert evaluate(replace(ORACLE, out=tmp_path, workers=2)).read_bytes() == first.read_bytes()
+
+
+def test_jobs_that_share_a_folder_give_the_same_bytes(first, tmp_path):
+    config = replace(ORACLE, out=tmp_path)
+    assert len(plan(config)) == 4
+    assert not runner.evaluate_range(config, (2, 9))
+    assert not (tmp_path / "results.json").exists()
+    with (
+        holding(tmp_path, 1, 2),
+        pytest.raises(FolderLockedError, match="is being written to by"),
+    ):
+        runner.evaluate_range(config, (0, 2))
+    assert runner.evaluate_range(config, (0, 2))
+    assert (tmp_path / "results.json").read_bytes() == first.read_bytes()
+    assert not runner.evaluate_range(config, (1, 3))  # all is there
+    with pytest.raises(ConfigError, match="4:5, but there are 4 shards, 0 … 3"):
+        runner.evaluate_range(config, (4, 5))
+    with pytest.raises(ConfigError, match="force and shard_range exclude"):
+        runner.evaluate_range(replace(config, force=True), (0, 1))
+    with pytest.raises(ConfigError, match="holds another evaluation"):
+        runner.evaluate_range(replace(config, seed=41), (0, 1))
+
+
+def test_a_job_plays_its_own_batches_only(tmp_path, monkeypatch):
+    played = []
+    play_batch = runner.play_batch
+
+    def noted(job, count):
+        played.append((job.batch.task, job.batch.first_seed))
+        return play_batch(job, count)
+
+    monkeypatch.setattr(runner, "play_batch", noted)
+    config = replace(ORACLE, out=tmp_path)
+    runner.evaluate_range(config, (0, 1))
+    runner.evaluate_range(config, (0, 2))
+    assert played == [("rotate", 40), ("rotate", 42)]
+    evaluate(config)
+    assert len(played) == 4
 
 
 def test_results_hold_no_times_and_the_log_apart_does(first):

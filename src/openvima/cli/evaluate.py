@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from openvima.cli.lists import parse_list
+from openvima.cli.lists import parse_list, parse_shard_range
 from openvima.cli.progress import progress_bar
 from openvima.cli.tables import print_table
 
@@ -37,6 +37,8 @@ def main(
     in_context: bool = False,
     boxes: str | None = None,
     batch: int = 16,
+    shard_range: str | None = None,
+    list_shards: bool = False,
     engine: Literal["processes", "ray"] = "processes",
     address: str | None = None,
     videos: int = 1,
@@ -92,6 +94,10 @@ def main(
         in_context: In-context evaluation: also prompt with an example, "Follow this motion: …". For twist,
             follow_motion and follow_order, of policies trained without these tasks.
         batch: Episodes that are run together, with batched inference.
+        shard_range: Play only these of the batches that --list-shards numbers, as a:b without b itself; for
+            job arrays with one --out. The last job writes results.json and the report.
+        list_shards: Print the batches, one a line: number, policy, task, level, first seed, episodes. Play
+            nothing.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
         videos: Solved episodes to record, and failures, of each trained policy, task and level.
@@ -114,6 +120,9 @@ def main(
     from openvima.errors import ConfigError
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.ablations import IN_CONTEXT
+    from openvima.evaluation.config import plan
+    from openvima.evaluation.results import FILE_NAME
+    from openvima.evaluation.runner import evaluate_range
     from openvima.report import VideoSelection, evaluate_and_report
 
     if in_context:
@@ -141,6 +150,18 @@ def main(
     selection = VideoSelection(videos, parse_list(record_video))
     if record_video and not report:
         raise ConfigError("--record-video needs the report; drop --no-report.")
+    if list_shards:
+        for number, shard in enumerate(plan(config)):
+            names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)
+            print(number, *names, shard.first_seed, shard.episodes, sep="\t")
+        return 0
+    if (shards := parse_shard_range(shard_range)) is not None:
+        with progress_bar("evaluation") as bar:
+            is_last = evaluate_range(config, shards, bar)
+        if not is_last:
+            what = "is finished" if (out / FILE_NAME).exists() else "lacks batches of other ranges"
+            print(f"{out} {what}.", file=sys.stderr)
+            return 0
     with progress_bar("evaluation") as bar:
         path = evaluate_and_report(config, selection, bar) if report else evaluate(config, bar)
     results = Results.read(path)

@@ -1,14 +1,12 @@
 """`openvima generate`: write demonstrations with the oracle."""
 
-import re
 import shlex
 import sys
 from pathlib import Path
 from typing import Literal
 
-from openvima.cli.lists import parse_list
+from openvima.cli.lists import parse_list, parse_shard_range
 from openvima.cli.progress import generation_table
-from openvima.errors import ConfigError
 
 
 def main(
@@ -91,7 +89,7 @@ def main(
         workers=workers,
         engine=engine,
         address=address,
-        shard_range=None if shard_range is None else _range(shard_range),
+        shard_range=parse_shard_range(shard_range),
         force=force,
     )
     if list_shards:
@@ -106,10 +104,3 @@ def main(
         print(f"{folder} is not finished yet: shards of other ranges are missing.", file=sys.stderr)
     print(folder)
     return 0
-
-
-def _range(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+):(\d+)", text)
-    if found is None:
-        raise ConfigError(f"shard_range is {text!r}; it must be a:b, two numbers from 0, such as 0:10.")
-    return int(found[1]), int(found[2])

@@ -18,10 +18,8 @@ from openvima.data.resuming import (
     storage_error,
 )
 from openvima.errors import ConfigError, DatasetError
-from openvima.folder_lock import folder_lock
+from openvima.folder_lock import FINISH_S, folder_lock
 from openvima.multiprocess import Counts, imap_with_progress
-
-FINISH_S = 600.0  # to wait for another process that writes index and manifest
 
 
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:

@@ -4,7 +4,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
-from openvima.folder_lock import folder_lock
+from openvima.folder_lock import FINISH_S, Part, folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.base import require_torch
 from openvima.policies.loading import load_policy
@@ -103,6 +103,47 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
             return evaluate_prepared(prepared, report)
 
 
+def evaluate_range(config: EvaluationConfig, shards: Part, report: Report | None = None) -> bool:
+    """Play some of the batches of an evaluation, for job arrays that share `config.out`.
+
+    Args:
+        config: What to evaluate, equal in all jobs.
+        shards: First and past-the-end position in `plan(config)` of the batches to play.
+        report: As for `evaluate`.
+
+    Returns:
+        Whether this was the last job, which has written `results.json`.
+
+    Raises:
+        ConfigError: There is no such batch, `force` is set, or as for `evaluate`.
+        FolderLockedError: Another job plays some of these batches.
+        OpenVimaError: As for `evaluate`.
+    """
+    if config.force:
+        raise ConfigError(
+            "force and shard_range exclude each other: each job would delete the results of others."
+        )
+    start, stop = shards
+    with config.served() as served:
+        prepared = prepare(served)
+        num_batches, path = len(prepared.batches), config.out / FILE_NAME
+        if start >= num_batches:
+            raise ConfigError(
+                f"shard_range is {start}:{stop}, but there are {num_batches} shards, 0 … {num_batches - 1}."
+            )
+        with folder_lock(config.out, shards):
+            if _earlier(path, prepared) is None:
+                _check_weights(served)
+                _play_all(replace(prepared, batches=prepared.batches[start:stop]), report)
+        if any(_kept(job, config.out) is None for job in _jobs(prepared)):
+            return False
+        with folder_lock(config.out, timeout_s=FINISH_S):  # others may have come to the same conclusion
+            if path.exists():
+                return False
+            evaluate_prepared(prepared)
+            return True
+
+
 def prepare(config: EvaluationConfig) -> PreparedEvaluation:
     """Check the names of policies and detector, before any episode and any file.
 
@@ -172,17 +213,12 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
 
 def _play_all(prepared: PreparedEvaluation, report: Report | None) -> dict[Batch, Rollouts]:
     """Run the batches that are not finished yet."""
-    config, batches = prepared.config, prepared.batches
+    config, jobs = prepared.config, _jobs(prepared)
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
-    assets = config.env_config.assets
-    source = source_hash(assets, what="assets") if is_code(assets) else ""
-    code = [prepared.versions, source]
-    prints = {name: json.dumps([what, *code], sort_keys=True) for name, what in prepared.policies.items()}
-    jobs = [Job(batch, prints[batch.policy] + (prepared.boxes if batch.boxes else "")) for batch in batches]
     kept = {job.batch: _kept(job, config.out) for job in jobs}
     finished = {batch: played for batch, played in kept.items() if played is not None}
-    total, done = sum(batch.episodes for batch in batches), sum(batch.episodes for batch in finished)
+    total, done = sum(job.batch.episodes for job in jobs), sum(batch.episodes for batch in finished)
     if report is not None:
         report(done, total, "")
     for job, played in _played(config, [job for job in jobs if job.batch not in finished]):
@@ -193,6 +229,18 @@ def _play_all(prepared: PreparedEvaluation, report: Report | None) -> dict[Batch
             words = (job.batch.policy, job.batch.ablation, job.batch.task, job.batch.level)
             report(done, total, " ".join(filter(None, words)))
     return finished
+
+
+def _jobs(prepared: PreparedEvaluation) -> list[Job]:
+    """Return the batches, each with what its outcomes depend on."""
+    assets = prepared.config.env_config.assets
+    source = source_hash(assets, what="assets") if is_code(assets) else ""
+    code = [prepared.versions, source]
+    prints = {name: json.dumps([what, *code], sort_keys=True) for name, what in prepared.policies.items()}
+    return [
+        Job(batch, prints[batch.policy] + (prepared.boxes if batch.boxes else ""))
+        for batch in prepared.batches
+    ]
 
 
 def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Rollouts]]:
