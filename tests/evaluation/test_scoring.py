@@ -45,7 +45,10 @@ def test_ablations_are_played_with_objects_too():
     results = score({"idle": Idle()}, **{**CELLS, "episodes": 1}, ablations=("no_prompt", "oracle"))
     played = {(row.policy, row.ablation): row.successes for row in results.rows}
     assert played == {("idle", ""): 0, ("idle", "no_prompt"): 0, ("oracle", ""): 1}
-    assert results.policies == {"idle": {"kind": "object"}, "oracle": {"kind": "oracle"}}
+    assert results.policies == {
+        "idle": {"kind": "object", "modalities": ["rgb", "segm"]},
+        "oracle": {"kind": "oracle"},
+    }
 
 
 def test_a_task_that_is_not_there_is_named():

@@ -430,6 +430,20 @@ def test_a_policy_is_described_with_the_tasks_that_its_training_left_out(results
     assert role(replace(results, policies=policies), "mine").endswith(" Trained without follow_order, twist.")
 
 
+@pytest.mark.parametrize(
+    ("record", "sentence"),
+    [
+        ({"kind": "remote", "metadata": {"modalities": ["rgb", "joints"]}}, " It got no segmentation."),
+        ({"kind": "remote", "metadata": {}}, "two camera images."),
+        ({"kind": "object", "modalities": ["rgb", "segm"]}, " The segmentation was sent to it."),
+    ],
+)
+def test_a_policy_of_others_is_described_with_whether_it_got_the_segmentation(
+    results, record: dict, sentence: str
+) -> None:
+    assert role(replace(results, policies={"mine": record}), "mine").endswith(sentence)
+
+
 def test_every_section_is_in_the_navigation_in_its_order(text):
     navigation = re.search(r'<nav class="contents".*?</nav>', text, flags=re.DOTALL)[0]
     assert re.findall(r'href="#(\w+)"', navigation) == re.findall(r'<section id="(\w+)"', text)

@@ -164,7 +164,8 @@ class Results:
         config: The configuration, as plain values.
         versions: Versions of the packages that results depend on.
         policies: For each policy name what it is: {"kind": …} and for trained ones {"sha256": …},
-            for remote ones {"metadata": …}.
+            for remote ones {"metadata": …}. "modalities", of remote ones in their metadata, lists what
+            observations held; of networks without it they were rgb and segm.
         actions_sha256: Of the recorded actions, which `verify_results` replays; empty without any.
     """
 

@@ -9,9 +9,9 @@ from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy
+from openvima.evaluation.sources import object_record
 from openvima.evaluation.versions import versions
 from openvima.policies.base import Policy
-from openvima.policies.own_code import parameters_hash
 from openvima.scene.command import PRIMITIVES
 
 
@@ -82,12 +82,9 @@ def score(
         )
         outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy))
     kinds = {
-        source.name: _record(policies[source.name]) if source.name in policies else source.record()
+        source.name: {"kind": "object", **object_record(policies[source.name])}
+        if source.name in policies
+        else source.record()
         for source in config.sources
     }
     return Results(rows_of(batches, outcomes), config.record(), versions(with_torch=True), kinds)
-
-
-def _record(policy: Policy) -> dict[str, str]:
-    weights = parameters_hash(policy)
-    return {"kind": "object"} | ({} if weights is None else {"weights_sha256": weights})

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
 from openvima.input_files import open_regular
+from openvima.policies.base import Policy
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.own_code import (
     LearnerCode,
@@ -29,7 +30,7 @@ from openvima.policies.sources import (
 )
 from openvima.serving.client import describe
 from openvima.serving.lerobot import SERVER_MODULE, is_lerobot, lerobot_name
-from openvima.serving.protocol import check_address, is_remote
+from openvima.serving.protocol import DEFAULT_MODALITIES, check_address, is_remote
 from openvima.user_code import load_function, source_hash, without_folder
 
 ORACLE = "oracle"
@@ -105,8 +106,8 @@ class PolicySource:
             "hub" with repository and commit if it is from there, and, as its settings declare,
             "excluded_tasks" of its training and "held_out_data", the demonstrations among its data that are
             held out for evaluation;
-            for a function its name without folders, "sha256" of its source file and, if the policy offers
-            weights, "weights_sha256". Files that the source file imports are not hashed.
+            for a function its name without folders, "sha256" of its source file, and `object_record` of its
+            policy. Files that the source file imports are not hashed.
 
         Raises:
             ConfigError: As for `check`, or a function raises.
@@ -119,9 +120,8 @@ class PolicySource:
         if self.kind == "remote":
             return {"kind": "remote", "metadata": describe(self.source)}
         if self.kind == "code":
-            weights = parameters_hash(policy_of_code(self.source))
-            what = {"kind": "code", **_code_record(self.source)}
-            return what if weights is None else {**what, "weights_sha256": weights}
+            policy = policy_of_code(self.source)
+            return {"kind": "code", **_code_record(self.source), **object_record(policy)}
         if code := self.learner:
             weights = weights_hash(self.source)
             return {"kind": "run", "sha256": weights, "code": _code_record(code.source), **self._seen()}
@@ -182,6 +182,18 @@ def weights_hash(source: str | Path) -> str:
         with open_regular(file) as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
     return digest.hexdigest()
+
+
+def object_record(policy: Policy) -> dict[str, Any]:  # Any: plain values
+    """What is known of a policy object: "modalities" of its observations, and "weights_sha256" if it has any.
+
+    Raises:
+        PolicyError: Its `weights_hash` is or returns no text.
+    """
+    weights = parameters_hash(policy)
+    asked = getattr(policy, "modalities", DEFAULT_MODALITIES)
+    modalities = [asked] if isinstance(asked, str) else list(asked)
+    return {"modalities": modalities} | ({} if weights is None else {"weights_sha256": weights})
 
 
 def _default_name(source: str) -> str:

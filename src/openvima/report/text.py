@@ -1,6 +1,7 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from openvima.evaluation.ablations import INPUT_ABLATIONS
 from openvima.evaluation.comparison import Comparison, Difference
@@ -57,12 +58,21 @@ def ablation_descriptions(ablations: Iterable[str]) -> dict[str, str]:
 
 
 def role(results: Results, policy: str) -> str:
-    """Sentences on what a policy is, the tasks that its training left out, and held-out data that it saw."""
+    """Sentences on what a policy is, whether it got the segmentation, and what its training saw."""
     record = results.policies.get(policy, {})
     excluded, seen = record.get("excluded_tasks"), record.get("held_out_data")
     left_out = f" Trained without {', '.join(map(str, excluded))}." if isinstance(excluded, list) else ""
     saw = f" Trained on held-out {', '.join(map(str, seen))}." if isinstance(seen, list) else ""
-    return _ROLES.get(record.get("kind", "run"), _ROLES["run"]) + left_out + saw
+    return _ROLES.get(record.get("kind", "run"), _ROLES["run"]) + _segmentation(record) + left_out + saw
+
+
+def _segmentation(record: Mapping[str, Any]) -> str:  # Any: plain values
+    """Say whether a policy of others was sent the segmentation, if the results do."""
+    metadata = record.get("metadata")
+    asked = (metadata if isinstance(metadata, dict) else record).get("modalities")
+    if not isinstance(asked, list):
+        return ""
+    return " The segmentation was sent to it." if "segm" in asked else " It got no segmentation."
 
 
 def series_colours(results: Results) -> dict[str, str]:

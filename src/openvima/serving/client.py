@@ -12,6 +12,7 @@ from openvima.scene.command import PRIMITIVES
 from openvima.serving.connection import Connection
 from openvima.serving.packing import pack, require_extra
 from openvima.serving.protocol import (
+    DEFAULT_MODALITIES,
     PROTOCOL,
     TOKEN_VARIABLE,
     check_control,
@@ -58,7 +59,9 @@ class RemotePolicy(Policy):
         self._connection = Connection(url, self._token, timeout_s)
         self.metadata = self._connection.metadata
         try:
-            self.modalities = check_modalities(self.metadata.get("modalities", ("rgb", "segm")), "the policy")
+            self.modalities = check_modalities(
+                self.metadata.get("modalities", DEFAULT_MODALITIES), "the policy"
+            )
             self.control = check_control(self.metadata.get("control", PRIMITIVES), "the policy")
         except MessageError as error:
             raise self._connection.broken(str(error)) from error

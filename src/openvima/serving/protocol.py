@@ -18,6 +18,7 @@ PROTOCOL = "openvima-policy/1"
 TOKEN_VARIABLE = "OPENVIMA_SERVE_TOKEN"  # read by server and client where no token is given
 SCHEMES = ("ws://", "wss://")
 MODALITIES = ("rgb", "segm", "joints")  # that observations may hold besides `ee`
+DEFAULT_MODALITIES = ("rgb", "segm")  # of policies that name none
 MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
 
 _KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")

@@ -20,7 +20,7 @@ from openvima.policies.prompt_limits import PromptLimits
 from openvima.scene.command import PRIMITIVES
 from openvima.serving.config import ServerConfig, server_config
 from openvima.serving.packing import pack, require_extra
-from openvima.serving.protocol import PROTOCOL, check_control, check_modalities
+from openvima.serving.protocol import DEFAULT_MODALITIES, PROTOCOL, check_control, check_modalities
 from openvima.serving.session import Session
 
 if TYPE_CHECKING:
@@ -144,7 +144,9 @@ class _PolicyServer:
                 "protocol": PROTOCOL,
                 "versions": {"openvima": __version__},
                 **about,
-                "modalities": check_modalities(getattr(policy, "modalities", ("rgb", "segm")), "the policy"),
+                "modalities": check_modalities(
+                    getattr(policy, "modalities", DEFAULT_MODALITIES), "the policy"
+                ),
                 "control": check_control(getattr(policy, "control", PRIMITIVES), "the policy"),
                 "limits": {
                     "message_bytes": config.max_message_bytes,
