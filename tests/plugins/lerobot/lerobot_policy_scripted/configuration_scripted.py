@@ -12,7 +12,13 @@ IMAGE = PolicyFeature(FeatureType.VISUAL, (3, 128, 256))
 @PreTrainedConfig.register_subclass("scripted")
 @dataclass
 class ScriptedConfig(PreTrainedConfig):
-    """Reads the text, the top view, and the top view of the first prompt image."""
+    """Reads the text, the top view, and the top view of the first prompt image.
+
+    Args:
+        low_level: Decide commands of the tool, from the text and the top view alone.
+    """
+
+    low_level: bool = False
 
     input_features: dict[str, PolicyFeature] | None = field(
         default_factory=lambda: {
@@ -26,6 +32,15 @@ class ScriptedConfig(PreTrainedConfig):
     )
 
     observation_delta_indices = action_delta_indices = reward_delta_indices = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.low_level:
+            self.input_features = {
+                "observation.images.top": IMAGE,
+                "observation.state": PolicyFeature(FeatureType.STATE, (12,)),
+            }
+            self.output_features = {"action": PolicyFeature(FeatureType.ACTION, (5,))}
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig()
