@@ -110,6 +110,11 @@ def imap_with_progress(
             pool.shutdown(cancel_futures=True)
 
 
+def num_cpus() -> int:
+    """Return the CPUs available to this process."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def check_workers(num_workers: int) -> None:
     """Check the number of processes.
 

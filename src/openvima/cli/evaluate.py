@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -70,7 +71,8 @@ def main(
         levels: Levels with commas in between: train, L1, L2, L3, L4.
         episodes: Episodes for each policy, task and level; 200 as in published tables.
         seed: Number of the first episode; evaluation episodes never occur in training.
-        workers: Processes; by default one, or all CPUs of the Ray cluster at --address.
+        workers: Processes; by default one for each CPU, fewer for less than four batches each, and one with
+            --device cuda. With --address, all CPUs of the Ray cluster.
         out: Folder to write to.
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
@@ -123,6 +125,7 @@ def main(
     from openvima.evaluation.config import plan
     from openvima.evaluation.results import FILE_NAME
     from openvima.evaluation.runner import evaluate_range
+    from openvima.multiprocess import num_cpus
     from openvima.report import VideoSelection, evaluate_and_report
 
     if in_context:
@@ -147,6 +150,8 @@ def main(
         trust_code=trust_code,
         python=python,
     )
+    if workers is None and engine == "processes" and device == "cpu":
+        config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 4)))
     selection = VideoSelection(videos, parse_list(record_video))
     if record_video and not report:
         raise ConfigError("--record-video needs the report; drop --no-report.")

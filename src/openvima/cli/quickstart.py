@@ -1,12 +1,12 @@
 """`openvima quickstart`: the whole way from nothing to a scored policy, in one command."""
 
 import json
-import os
 import sys
 from pathlib import Path
 
 from openvima.cli.progress import progress_bar
 from openvima.errors import ConfigError
+from openvima.multiprocess import num_cpus
 from openvima.policies.bundled import SMALL, bundled_folder
 
 TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
@@ -34,7 +34,7 @@ def main(
         demonstrations: Demonstrations a task to train on.
         episodes: Evaluation episodes for each policy, task and level.
         seed: Seed of the training and number of the first episode.
-        workers: Processes for demonstrations and evaluation; by default one a core, at most 8.
+        workers: Processes for demonstrations and evaluation; by default one for each CPU, at most 8.
 
     Returns:
         Exit status.
@@ -46,7 +46,7 @@ def main(
     require_torch("training")
     require_extra()
     bundled_folder(SMALL)  # fails before any work if missing
-    workers = workers or min(8, os.cpu_count() or 1)
+    workers = workers or min(8, num_cpus())
     out.mkdir(parents=True, exist_ok=True)
     _first_look(out / "first_look.png", seed)
     data = _generate(out / "demonstrations", demonstrations, seed, workers)

@@ -1,7 +1,6 @@
 """Behaviour cloning as a stage of training."""
 
 import math
-import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ from torch import nn
 from openvima.data.object_cache.cache import ObjectCache
 from openvima.data.torch_dataset import BatchStream, batches_of
 from openvima.errors import ConfigError
+from openvima.multiprocess import num_cpus
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
@@ -125,7 +125,7 @@ class BehaviourCloning:
                 distractor_prob=config.augmentation.distractor_prob,
             ),
         )
-        return iter(batches_of(stream, num_workers=min(config.loader.num_workers, _num_cpus())))
+        return iter(batches_of(stream, num_workers=min(config.loader.num_workers, num_cpus())))
 
     def _call(
         self, batch: Any, module: nn.Module
@@ -177,11 +177,6 @@ def freeze_crops(
             images = np.concatenate([episode.images for episode in cache[start : start + CHUNK]])
             features.append(learner.network.encode_images(torch.from_numpy(images).to(device)))
     learner.features = parallel.rows_of_all(torch.cat(features))
-
-
-def _num_cpus() -> int:
-    """Return the CPUs available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _add(sums: Metrics, values: dict[str, torch.Tensor], weight: float) -> None:
