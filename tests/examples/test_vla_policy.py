@@ -1,13 +1,19 @@
 """`examples/vla_policy.py`: what a rule for language should solve, it solves behind a policy server."""
 
+import re
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from openvima.catalog.textures import BASE_COLOURS
+from openvima.env import TabletopEnv
 from openvima.errors import ActionError, PolicyError, ServerError
 from openvima.evaluation import score
+from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies import load_policy
 from openvima.serving import RemotePolicy, serve_in_thread
 
@@ -32,6 +38,32 @@ def test_the_rule_solves_what_words_for_colours_tell(policy: Any, task: str, lev
         assert (remote.control, remote.modalities) == (policy.control, ("rgb", "joints"))
         results = score({"rule": remote}, **cells, control=policy.control)
     assert results.rows[0].successes == 3
+
+
+def is_told_by_colours(env: TabletopEnv) -> bool:
+    """Whether all descriptions of a prompt name colours that one object alone has."""
+    shown = [colours(texture) for _, texture in env.objects.values()]
+    wanted = [colours(text) for text in re.findall(r"the (.+?)(?= into |\.| \d)", env.prompt.text)]
+    return all(each[0] and shown.count(each) == 1 for each in wanted)
+
+
+def colours(text: str) -> tuple[frozenset[str], bool, bool]:
+    found = frozenset(re.findall("|".join(BASE_COLOURS), text))
+    return found, "dark" in text, bool(re.search("swirl|paisley", text))
+
+
+@pytest.mark.slow
+def test_the_rule_solves_every_episode_that_colours_tell(policy: Any) -> None:
+    solved = []
+    for task, level in product(("visual_manipulation", "rotate"), ("L1", "L2", "L3")):
+        for seed in range(12):
+            settings = {"prompts": "text", "modalities": policy.modalities, "control": policy.control}
+            env = TabletopEnv(task, level=level, domain="eval", **settings)
+            env.reset(seed=seed)
+            if is_told_by_colours(env):
+                (outcome,) = play([env], [seed], PromptedRolloutPolicy(policy))
+                solved.append(outcome.success)
+    assert solved == [True] * 50  # of 72; docs/vla.md says so
 
 
 def test_the_rule_reads_the_text() -> None:

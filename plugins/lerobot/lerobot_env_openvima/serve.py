@@ -58,9 +58,9 @@ class LerobotPolicy(Policy):
             preprocessor_overrides={"device_processor": {"device": device}},
         )
         features = config.input_features or {}
-        num_images = len(
-            {key.rsplit("_", 1)[0] for key in features if key.startswith(f"{IMAGE_PREFIX}prompt_")}
-        )
+        renamed = {key for step in self._preprocess.steps for key in getattr(step, "rename_map", {})}
+        shown = {key for key in {*features, *renamed} if key.startswith(f"{IMAGE_PREFIX}prompt_")}
+        num_images = max((int(key.split("_")[-2]) + 1 for key in shown), default=0)
         state = features.get(OBS_STATE)
         has_joints = state is None or state.shape != (1,)
         self._layout = frame_layout(self.control, num_images, has_joints)

@@ -32,7 +32,8 @@ def save(folder: Path, control: str) -> None:
 def save_smolvla(folder: Path, control: str) -> None:
     """Save a tiny SmolVLA with random weights, and beside it the VLM that its config names.
 
-    The VLM has SmolVLM's architecture, and a tokenizer of single bytes. Nothing is downloaded.
+    The VLM has SmolVLM's architecture, and a tokenizer of single bytes. Nothing is downloaded. Cameras have
+    the names of the published base model, as after `lerobot-train --rename_map`.
     """
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
@@ -71,10 +72,10 @@ def save_smolvla(folder: Path, control: str) -> None:
 
     numbers, state = (5, 12) if control == "end_effector" else (12, 7)
     image = PolicyFeature(FeatureType.VISUAL, (3, 128, 256))
+    cameras = {"front": "camera1", "top": "camera2", "prompt_0_top": "camera3"}
     config = SmolVLAConfig(
         input_features={
-            "observation.images.front": image,
-            "observation.images.top": image,
+            **{f"observation.images.{camera}": image for camera in cameras.values()},
             "observation.state": PolicyFeature(FeatureType.STATE, (state,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (numbers,))},
@@ -92,7 +93,10 @@ def save_smolvla(folder: Path, control: str) -> None:
         name: {"mean": torch.zeros(length), "std": torch.full((length,), 0.1)}
         for name, length in lengths.items()
     }
-    for processor in make_smolvla_pre_post_processors(config, statistics):
+    before, after = make_smolvla_pre_post_processors(config, statistics)
+    names = {f"observation.images.{ours}": f"observation.images.{camera}" for ours, camera in cameras.items()}
+    before.steps[0].rename_map = names
+    for processor in (before, after):
         processor.save_pretrained(folder)
 
 

@@ -110,7 +110,7 @@ def test_a_rule_for_language_solves_the_same_episodes_by_commands_of_the_tool(tm
     assert check(folder, tmp_path, batch=1, env_config=LOW_LEVEL) > EPISODES // 2
 
 
-@pytest.mark.parametrize("env_config", [EnvConfig(prompts="text"), LOW_LEVEL], ids=lambda each: each.control)
+@pytest.mark.parametrize("env_config", [PUBLISHED, LOW_LEVEL], ids=lambda each: each.control)
 def test_a_vision_language_action_model_acts_through_the_bridge(
     tmp_path: Path, env_config: EnvConfig
 ) -> None:
