@@ -71,11 +71,11 @@ def test_the_network_of_ones_own_is_trained_and_scored(
 @pytest.mark.slow
 def test_dagger_and_behaviour_cloning_are_compared_at_equal_labels() -> None:
     pytest.importorskip("torch")
-    words = ["--labels", "9", "--rounds", "3", "--steps", "3", "--episodes", "2"]
+    words = ["--labels", "90", "--rounds", "3", "--steps", "3", "--episodes", "2"]
     script = str(EXAMPLES[0].with_name("dagger.py"))
     done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True, check=True)
     lines = done.stdout.splitlines()
-    assert [line.split(":")[0] for line in lines] == ["behaviour cloning, 9 labels", "DAgger, 9 labels"]
+    assert [line.split(":")[0] for line in lines] == ["behaviour cloning, 90 labels", "DAgger, 90 labels"]
     assert all(" of 2, " in line for line in lines)
 
 

@@ -175,6 +175,8 @@ def test_a_path_is_taken_up_where_the_tool_is() -> None:
     above, below = HOVER_TIP_Z_M, -1.0
     go(world, 0.5, 0.2, 0.1, tool=False)
     assert next_waypoint(block) == pytest.approx((0.6, 0.3, above, 0, False))
+    go(world, 0.56, 0.3, 0.1, tool=False)
+    assert next_waypoint(block) == pytest.approx((0.6, 0.3, 0.04 / 0.3, 0, False), abs=1e-5)
     go(world, 0.605, 0.3, 0.1, tool=False)
     assert next_waypoint(block) == pytest.approx((0.6, 0.3, below, 0, True))
     go(world, 0.605, 0.3, 0.0, tool=True)
@@ -182,7 +184,7 @@ def test_a_path_is_taken_up_where_the_tool_is() -> None:
     assert next_waypoint(block) == pytest.approx((0.605, 0.3, above, 0, True))
     assert next_waypoint(block + 1) == pytest.approx((0.605, 0.3, above, 0, False))  # puts it down
     place = (0.5 + 0.005 * math.cos(0.6), 0.1 + 0.005 * math.sin(0.6))
-    go(world, 0.6, 0.2, 0.32, tool=True)
+    go(world, 0.6, 0.25, 0.2, tool=True)
     assert next_waypoint(block) == pytest.approx((*place, above, 0.6, True), abs=1e-5)
     go(world, *place, 0.1, tool=True, yaw_rad=0.5)
     assert next_waypoint(block) == pytest.approx((*place, below, 0.6, True), abs=1e-5)

@@ -12,9 +12,11 @@ from openvima.sim.primitives import SweepPlan, sweep_plan
 from openvima.sim.tool_world import PRESS_WITHIN_M, ToolWorld
 
 _REACHED = 1e-6  # m and rad
-_NEAR_M = 0.01  # from where a path is taken up, rather than begun anew
+_NEAR_M = 0.02  # from where a path is taken up, rather than begun anew
 _NEAR_RAD = 0.2
-_FUNNEL = 0.3  # metres more from the axis per metre above it
+_FUNNEL = 0.3  # metres that it may be off for each metre above
+_CARRY_M = 0.16  # what is held is lifted to here before it moves sideways …
+_FAR_M = 0.1  # … farther than this
 _DOWN_M = -1.0  # below the table: until contact
 
 
@@ -69,12 +71,23 @@ def onward_path(action: Action, object_id: int, world: ToolWorld, *, compat: boo
         return [] if plan is None else _sweep(plan)[_passed(plan, world) :]
     path = tool_path(action, tool, compat=compat)
     if world.grasp is None:
-        return path[int(_is_above(path[0].pose, pose)) :]
+        above, *rest = path
+        return rest if _is_above(above.pose, pose) else [_approach(above, pose), *rest]
     place = _carried(world.grasp, action) if world.grasped == object_id else pose
     path = _pick_and_place(pose, replace(place, z=tools.HOVER_TIP_Z_M))[2:]
     if _is_above(place, pose):
         return path[3 if world.is_down else 2 :]
-    return path[int(pose.z > tools.HOVER_TIP_Z_M - _NEAR_M) :]
+    lift, above, *rest = path
+    is_far = math.dist((place.x, place.y), (pose.x, pose.y)) > _FAR_M
+    return [*[lift][: is_far and pose.z < _CARRY_M], _approach(above, pose), *rest]
+
+
+def _approach(above: Waypoint, pose: ToolPose) -> Waypoint:
+    """Go above a goal at the height of the funnel where the tool is, so that commands change steadily."""
+    goal = above.pose
+    is_turned = angle_difference(goal.yaw_rad, pose.yaw_rad) <= _NEAR_RAD
+    height = math.dist((goal.x, goal.y), (pose.x, pose.y)) / _FUNNEL if is_turned else goal.z
+    return replace(above, pose=replace(goal, z=min(goal.z, height)))
 
 
 def _pick_and_place(pick: ToolPose, place: ToolPose) -> list[Waypoint]:
