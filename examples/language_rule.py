@@ -17,7 +17,7 @@ FASTEST = (0.05, 0.05, 0.05, 0.2)  # of a command: metres along x, y, z, and rad
 
 def components(mask):
     """Number the connected pixels of a mask alike; 0 elsewhere."""
-    numbers, before = np.arange(1, mask.size + 1).reshape(mask.shape) * mask, None
+    numbers, before = np.arange(1, mask.size + 1).reshape(mask.shape) * mask, mask
     while not np.array_equal(numbers, before):
         before = numbers
         for shift, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):

@@ -7,6 +7,6 @@ folder=${1:?"usage: make_environment.sh FOLDER [PYTHON]"} python=${2:-python3.12
 here=$(cd "$(dirname "$0")" && pwd)
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 12))' || { echo "$python is older than Python 3.12; name another one." >&2; exit 2; }
 "$python" -m venv "$folder"
-"$folder/bin/python" -m pip install 'lerobot[dataset,training]>=0.6,<0.7'
+"$folder/bin/python" -m pip install 'lerobot[dataset,training,smolvla]>=0.6,<0.7'
 "$folder/bin/python" -m pip install "$here/../..[serve]" "$here"
 echo "$(cd "$folder" && pwd)/bin/python"
