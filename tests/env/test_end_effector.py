@@ -94,8 +94,6 @@ def test_an_action_of_the_other_control_is_refused() -> None:
         other.oracle_command()
     with pytest.raises(ConfigError, match=r"no control 'end_efector'\. Did you mean 'end_effector'"):
         openvima.make("rotate", control="end_efector")
-    with pytest.raises(ConfigError, match="vector environments have 'primitives' only"):
-        openvima.make_vec("rotate", 2, control="end_effector")
     assert env.outcome == other.outcome
 
 

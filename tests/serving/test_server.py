@@ -69,6 +69,8 @@ def test_the_first_frame_says_what_is_served(url: str) -> None:
         "protocol": PROTOCOL,
         "versions": {"openvima": __version__},
         "policy": {"name": "telltale"},
+        "modalities": ["rgb", "segm"],
+        "control": "primitives",
         "limits": {
             "message_bytes": 2**16,
             "episodes": 3,
