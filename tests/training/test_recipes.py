@@ -1,5 +1,6 @@
 """Recipes, files of settings, and their precedence on the command line."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from openvima.training.recipes import (
 
 @pytest.fixture
 def trained(monkeypatch) -> list[TrainingConfig]:
-    """What the command line would train."""
+    """What the command line would train, in this process alone."""
     configs: list[TrainingConfig] = []
 
     def train(config, report, rollout, animate) -> Path:
@@ -30,6 +31,7 @@ def trained(monkeypatch) -> list[TrainingConfig]:
         return config.out
 
     monkeypatch.setattr("openvima.training.train", train)
+    monkeypatch.setattr("openvima.training.processes.joined_by", lambda others, words: nullcontext())
     return configs
 
 
