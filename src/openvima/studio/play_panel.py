@@ -67,20 +67,21 @@ class PlayPanel:
 
     def _open(self) -> None:
         """Show the episode before the policy, which takes longer to load."""
-        levels, level = task_spec(self._task.value).levels, self._level.value
-        self._level.options = levels
-        self._level.value = level if level in levels else levels[0]
+        task = self._task.value  # fields can change meanwhile; another call then follows
+        levels, level = task_spec(task).levels, self._level.value
+        level = level if level in levels else levels[0]
+        self._level.options, self._level.value = levels, level
         self.session.choose_assets(self._assets.value)
         config = self.session.env_config
         episode = sample_episode(
-            self._task.value,
-            level=self._level.value,
+            task,
+            level=level,
             seed=min(int(self._seed.value), MAX_SEED),
             domain="user",
             assets=self.session.assets,
             compat=config.compat,
             prompts=config.prompts,
-            **config.options(self._task.value),
+            **config.options(task),
         )
         self.session.open(episode, self.session.policy)
         self._choose_policy()
