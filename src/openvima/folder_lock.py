@@ -17,12 +17,13 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from openvima.atomic_io import atomic_write_file, process_runs, remove_stale
-from openvima.errors import FolderLockedError, StorageError
+from openvima.errors import ConfigError, FolderLockedError, StorageError
 
 try:
     import fcntl
@@ -39,9 +40,24 @@ _MAX_BYTES = 4096  # of an owner's file, which could be anything
 _END = 1 << 62
 
 Part = tuple[int, int]
+T = TypeVar("T")
 _LOGGER = logging.getLogger(__name__)
 _GUARD = threading.Lock()
 _held: set[Path] = set()  # by threads of this process, among which record locks make no difference
+
+
+def parts_in_range(parts: Sequence[T], shard_range: Part) -> Sequence[T]:
+    """Return the numbered parts of a folder that one of its writers has.
+
+    Raises:
+        ConfigError: The range lies beyond the last one.
+    """
+    start, stop = shard_range
+    if start >= len(parts):
+        raise ConfigError(
+            f"shard_range is {start}:{stop}, but there are {len(parts)} shards, 0 … {len(parts) - 1}."
+        )
+    return parts[start:stop]
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,8 @@ from openvima.data.resuming import (
     remove_leftovers,
     storage_error,
 )
-from openvima.errors import ConfigError, DatasetError
-from openvima.folder_lock import FINISH_S, folder_lock
+from openvima.errors import DatasetError
+from openvima.folder_lock import FINISH_S, folder_lock, parts_in_range
 from openvima.multiprocess import Counts, imap_with_progress
 
 
@@ -46,7 +46,7 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     if config.engine == "ray":  # its workers have other working directories
         config = replace(config, out=config.out.absolute())
     blocks = plan(config)
-    own = _own(config, blocks)
+    own = blocks if config.shard_range is None else parts_in_range(blocks, config.shard_range)
     config.out.mkdir(parents=True, exist_ok=True)
     try:
         with folder_lock(config.out, config.shard_range):
@@ -63,22 +63,6 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     except OSError as error:
         raise storage_error(config.out, [block.path for block in blocks], error) from error
     return config.out
-
-
-def _own(config: GenerateConfig, blocks: Sequence[Block]) -> Sequence[Block]:
-    """The blocks of this run.
-
-    Raises:
-        ConfigError: The range of shards lies beyond the last one.
-    """
-    if config.shard_range is None:
-        return blocks
-    start, stop = config.shard_range
-    if start >= len(blocks):
-        raise ConfigError(
-            f"shard_range is {start}:{stop}, but there are {len(blocks)} shards, 0 … {len(blocks) - 1}."
-        )
-    return blocks[start:stop]
 
 
 def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report | None) -> None:

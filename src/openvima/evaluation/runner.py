@@ -17,7 +17,7 @@ from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
-from openvima.folder_lock import FINISH_S, Part, folder_lock
+from openvima.folder_lock import FINISH_S, Part, folder_lock, parts_in_range
 from openvima.multiprocess import imap_unordered
 from openvima.policies.base import require_torch
 from openvima.policies.loading import load_policy
@@ -123,18 +123,13 @@ def evaluate_range(config: EvaluationConfig, shards: Part, report: Report | None
         raise ConfigError(
             "force and shard_range exclude each other: each job would delete the results of others."
         )
-    start, stop = shards
     with config.served() as served:
         prepared = prepare(served)
-        num_batches, path = len(prepared.batches), config.out / FILE_NAME
-        if start >= num_batches:
-            raise ConfigError(
-                f"shard_range is {start}:{stop}, but there are {num_batches} shards, 0 … {num_batches - 1}."
-            )
+        own, path = tuple(parts_in_range(prepared.batches, shards)), config.out / FILE_NAME
         with folder_lock(config.out, shards):
             if _earlier(path, prepared) is None:
                 _check_weights(served)
-                _play_all(replace(prepared, batches=prepared.batches[start:stop]), report)
+                _play_all(replace(prepared, batches=own), report)
         if any(_kept(job, config.out) is None for job in _jobs(prepared)):
             return False
         with folder_lock(config.out, timeout_s=FINISH_S):  # others may have come to the same conclusion
