@@ -26,6 +26,14 @@ def die(number: int, count: Callable[[int], None]) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+def die_at_first(path: Path, count: Callable[[int], None]) -> None:
+    """Be killed, unless the file says that this has happened before."""
+    if not path.exists():
+        path.write_text("died")
+        os.kill(os.getpid(), signal.SIGKILL)
+    path.write_text("done")
+
+
 def note_pid_and_hang(path: Path, count: Callable[[int], None]) -> None:
     """Write the id of the process, then wait to be ended."""
     path.with_suffix(".part").write_text(str(os.getpid()))

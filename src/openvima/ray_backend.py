@@ -4,9 +4,11 @@ The only module that imports Ray: `pip install openvima[scale]`.
 """
 
 import contextlib
+import importlib
 import os
 import socket
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
@@ -19,6 +21,7 @@ POLL_S = 0.5
 COUNT_INTERVAL_S = 1.0  # one message per job and second
 CANCEL_S = 20.0  # for jobs to end after an error or Ctrl-C
 CONNECT_S = 10.0
+RETRIES = 2  # of a job whose machine or process died
 OBJECT_STORE_BYTES = 100 * 2**20  # Ray's default is 30 % of the memory; results are files here
 AUTO = "auto"  # the cluster that this machine belongs to
 
@@ -33,6 +36,9 @@ def ray_imap_unordered(
     watch: Callable[[Counts], None] | None = None,
 ) -> Iterator[tuple[Any, Any]]:
     """Apply a job to every item on a Ray cluster and yield the results as they finish.
+
+    A job whose machine or process died runs again elsewhere, up to `RETRIES` times, so jobs must be
+    repeatable.
 
     Args:
         job: A function of a module that every machine can import.
@@ -50,7 +56,7 @@ def ray_imap_unordered(
         MissingExtraError: Ray is not installed.
         ConfigError: No cluster answers at the address, it has another version of Ray or Python, or it lacks
             the job's module.
-        WorkerError: A worker died.
+        WorkerError: A job died each time.
         Exception: Any exception of a job; the other jobs are stopped.
     """
     ray = _import_ray()
@@ -123,20 +129,31 @@ def _run_all(
     watch: Callable[[Counts], None],
 ) -> Iterator[tuple[Any, Any]]:
     counts: list[tuple[int, ...]] = [(0,) * num_counts] * len(items)
-    progress = ray.remote(num_cpus=0)(_ProgressActor).remote()
-    # No retries: the same command resumes, and the error says what happened.
+    # On the machine of this process, without which nothing goes on anyway.
+    strategies = importlib.import_module("ray.util.scheduling_strategies")
+    here = strategies.NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+    progress = ray.remote(num_cpus=0, scheduling_strategy=here)(_ProgressActor).remote()
+    # Ray's own retries have no limit where memory runs out.
     remote = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": _environment()})(_run_one)
-    waiting, running = iter(enumerate(items)), {}
+    waiting, running, deaths = deque(range(len(items))), {}, Counter[int]()
     try:
         while True:
-            while len(running) < num_workers and (entry := next(waiting, None)) is not None:
-                running[remote.remote(job, entry[1], entry[0], progress)] = entry[0]
+            while len(running) < num_workers and waiting:
+                slot = waiting.popleft()
+                running[remote.remote(job, items[slot], slot, progress)] = slot
             if not running:
                 return
             done, _ = ray.wait(list(running), timeout=POLL_S)
             for reference in done:
-                result, numbers = ray.get(reference)
                 slot = running.pop(reference)
+                try:
+                    result, numbers = ray.get(reference)
+                except _lost(ray):
+                    deaths[slot] += 1
+                    if deaths[slot] > RETRIES:
+                        raise
+                    waiting.appendleft(slot)
+                    continue
                 counts[slot] = numbers or counts[slot]
                 yield items[slot], result
             for slot, numbers in ray.get(progress.read.remote()).items():
@@ -157,6 +174,12 @@ def _run_all(
         ) from None
     finally:
         _stop(ray, list(running))
+
+
+def _lost(ray: ModuleType) -> tuple[type[Exception], ...]:
+    """What Ray raises where a process or machine died, alone or with a result that was still on it."""
+    errors = ray.exceptions
+    return errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError
 
 
 def _stop(ray: ModuleType, references: list[Any]) -> None:  # Any: Ray's references

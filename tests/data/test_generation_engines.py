@@ -83,9 +83,16 @@ def test_an_error_of_a_job_on_ray_reaches_the_caller(ray: ModuleType) -> None:
         list(ray_imap_unordered(worker_jobs.fail, [0, 1, 2], 2))
 
 
-def test_a_killed_worker_of_ray_is_reported(ray: ModuleType) -> None:
+def test_a_job_of_ray_that_always_dies_is_reported(ray: ModuleType) -> None:
     with pytest.raises(WorkerError, match=r"worker of the Ray cluster died.*same command continues"):
         list(ray_imap_unordered(worker_jobs.die, [0, 1, 2], 2))
+
+
+def test_a_job_of_ray_whose_worker_was_killed_runs_again(ray: ModuleType, tmp_path: Path) -> None:
+    paths = [tmp_path / str(k) for k in range(3)]
+    done = list(ray_imap_unordered(worker_jobs.die_at_first, paths, 2))
+    assert sorted(item for item, _ in done) == paths
+    assert [path.read_text() for path in paths] == ["done"] * 3
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
