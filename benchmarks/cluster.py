@@ -139,7 +139,7 @@ def on_a_cluster(work: Work, out: Path, total: int) -> Finding:
         lost, _ = (cluster.add_node(**options) for _ in range(2))
         cluster.wait_for_nodes()
         begun = time.monotonic()
-        process = subprocess.Popen(work.command(out, "--engine", "ray", "--address", cluster.address))
+        process = subprocess.Popen(work.command(out, "--engine", "ray", "--address", str(cluster.address)))
         latest: dict[str, tuple[int, int]] = {}
         at_loss: dict[str, tuple[int, int]] | None = None
         while process.poll() is None:

@@ -57,6 +57,23 @@ def test_demo_records_the_oracle(tmp_path, capsys):
         assert container.streams.video[0].codec_context.width == 768
 
 
+def test_demo_records_low_level_control(tmp_path, capsys):
+    path = tmp_path / "video.mp4"
+    words = ["demo", "rotate", "--control", "end_effector", "--out", str(path)]
+    assert main(words) == 0
+    steps = int(capsys.readouterr().out.split("solved; ")[1].split()[0])
+    with av.open(str(path)) as container:
+        frames = sum(1 for _ in container.decode(video=0))
+    assert steps > 20 and frames > 3 * steps  # 30 frames a second, commands of 0.1 s, and stills
+    path.unlink()
+    assert main([*words, "--policy", "random"]) == 2
+    assert "control 'primitives'" in capsys.readouterr().err
+    assert not path.exists()
+    episode = tmp_path / "episode.yaml"
+    assert main(["demo", "--episode", str(episode), "--control", "end_effector"]) == 2
+    assert "episodes of a file are played by primitives" in capsys.readouterr().err
+
+
 def test_demo_refuses_a_level_without_the_task(capsys):
     assert main(["demo", "sweep_without_exceeding", "--level", "L3", "--out", "never_written.mp4"]) == 2
     assert "not defined at level L3" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """`openvima demo`: record a video of the oracle or of a policy on one task or on an episode from a file."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -18,6 +18,7 @@ def main(
     compat: bool = False,
     prompts: str = "multimodal",
     task_options: str = "",
+    control: Literal["primitives", "end_effector"] = "primitives",
     device: str = "cpu",
     boxes: str | None = None,
     trust_code: bool = False,
@@ -44,6 +45,8 @@ def main(
         task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
             num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
             all that have the option.
+        control: primitives; or end_effector, an action each 0.1 s (see docs/end_effector.md), for the oracle
+            and for policies of that control.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
@@ -63,6 +66,8 @@ def main(
         raise ConfigError(
             "an episode file says all of --seed, --level, --prompts and --task-options; leave them out."
         )
+    if episode is not None and control != "primitives":
+        raise ConfigError(f"--control is {control}; episodes of a file are played by primitives.")
     level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
@@ -89,7 +94,7 @@ def main(
             explain=explain,
         )
     assert task is not None  # as checked
-    env_config = EnvConfig(assets, compat, prompts, task_options)
+    env_config = EnvConfig(assets, compat, prompts, task_options, control)
     check_task_options((task,), env_config.task_options)
     batch = Batch(
         policy,
