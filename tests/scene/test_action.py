@@ -8,6 +8,7 @@ from hypothesis import given
 
 from openvima.errors import ActionError
 from openvima.scene import Action
+from openvima.scene.action import is_valid_batch
 from strategies import angles
 
 
@@ -56,6 +57,18 @@ def test_an_action_that_cannot_be_is_refused_with_the_reason(
 ) -> None:
     with pytest.raises(ActionError, match=message):
         Action.from_arrays(arrays(**changes))
+    rows = {key: np.stack([value] * 2) for key, value in arrays().items()}
+    for key, value in changes.items():
+        rows[key] = np.stack([value] * 2) if isinstance(value, np.ndarray) else value
+    assert not is_valid_batch(rows, 2)
+
+
+def test_a_batch_is_valid_if_every_action_is() -> None:
+    batch = {key: np.stack([value] * 3) for key, value in arrays().items()}
+    assert is_valid_batch(batch, 3)
+    assert is_valid_batch({key: rows.astype(np.float64) for key, rows in batch.items()}, 3)
+    assert not is_valid_batch(batch, 2)
+    assert not is_valid_batch({key: rows.tolist() for key, rows in batch.items()}, 3)
 
 
 def test_all_problems_of_an_action_are_told_at_once() -> None:

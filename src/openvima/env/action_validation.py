@@ -8,6 +8,7 @@ from gymnasium.vector import AutoresetMode
 
 from openvima.errors import ActionError, ConfigError, EpisodeError
 from openvima.scene import ACTION_SHAPES, WORKSPACE_LOW, Action
+from openvima.scene.action import is_valid_batch
 from openvima.scene.command import COMMAND_NAMES, PRIMITIVES, ToolCommand
 from openvima.tasks.seeding import checked_seed
 
@@ -76,8 +77,10 @@ class ActionValidator:
             waiting = ", ".join(map(str, np.flatnonzero(self._needs_reset)))
             how = "reset()" if self._needs_reset.all() else f"reset(options={{'{RESET_MASK}': mask}})"
             raise EpisodeError(f"sub-environments {waiting} have no running episode; call {how} first.")
-        places: dict[str, list[int]] = {}
         is_primitive = self._control == PRIMITIVES
+        if is_primitive and isinstance(actions, Mapping) and is_valid_batch(actions, self.num_envs):
+            return
+        places: dict[str, list[int]] = {}
         check = Action.from_arrays if is_primitive else ToolCommand.from_array
         rows = (_rows if is_primitive else _commands)(actions, self.num_envs)
         for index, action in enumerate(rows):

@@ -103,6 +103,26 @@ class Action:
         return _tool_yaw(self.pose1_rotation)
 
 
+def is_valid_batch(actions: Mapping[str, object], count: int) -> bool:
+    """Return whether `Action.from_arrays` takes every row of a batch; faster than asking row by row.
+
+    Args:
+        actions: Arrays with `count` rows under the four keys.
+        count: Number of actions.
+    """
+    if actions.keys() != ACTION_SHAPES.keys():
+        return False
+    for key, length in ACTION_SHAPES.items():
+        value, (low, high) = actions[key], _LIMITS[length]
+        if not isinstance(value, np.ndarray) or value.shape != (count, length) or value.dtype.kind != "f":
+            return False
+        with np.errstate(over="ignore"):
+            rounded = value.astype(np.float32)
+        if not ((low <= rounded) & (rounded <= high)).all():  # nor is what is not finite
+            return False
+    return True
+
+
 def _tool_yaw(quaternion: Quaternion) -> float:
     """Heading of the tool's x axis; tilt is ignored."""
     if not any(quaternion):
