@@ -1,6 +1,7 @@
 """Actions are checked at the border."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from openvima.scene.action import is_valid_batch
 from strategies import angles
 
 
-def arrays(**changes: object) -> dict[str, object]:
-    action: dict[str, object] = {
+def arrays(**changes: object) -> dict[str, Any]:  # Any: also what is no array
+    action: dict[str, Any] = {
         "pose0_position": np.array([0.4, 0.1], np.float32),
         "pose0_rotation": np.array([0, 0, 0, 1], np.float32),
         "pose1_position": np.array([0.6, -0.2], np.float32),
