@@ -58,7 +58,7 @@ def test_an_action_that_cannot_be_is_refused_with_the_reason(
 ) -> None:
     with pytest.raises(ActionError, match=message):
         Action.from_arrays(arrays(**changes))
-    rows = {key: np.stack([value] * 2) for key, value in arrays().items()}
+    rows: dict[str, object] = {key: np.stack([value] * 2) for key, value in arrays().items()}
     for key, value in changes.items():
         rows[key] = np.stack([value] * 2) if isinstance(value, np.ndarray) else value
     assert not is_valid_batch(rows, 2)
