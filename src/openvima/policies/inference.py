@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,13 +16,18 @@ from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash
 from openvima.policies.batch import HistoryBatch
 from openvima.policies.checkpoint import load_network, save_checkpoint
 from openvima.policies.devices import usable_device
+from openvima.policies.episodes import Episodes
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
+from openvima.policies.nn.decoder import MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import PROMPT_LIMITS, Processor
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
 from openvima.scene.explanation import Explanation
+
+if TYPE_CHECKING:
+    from openvima.policies.joint_inference import JointCall
 
 # Pairs of tokens within a prompt, over a padded batch: 16 prompts of 256 tokens, 64 of 128. Attention scores
 # take memory for each.
@@ -33,50 +38,8 @@ NEAR_TIE = 1e-4  # difference of two logits below which float32 rounding may swa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Episodes:
-    """The running episodes of a batch; all have made the same number of steps.
-
-    Args:
-        indices: Index of each episode in the batch.
-        num_slots: Object slots of each episode, see `Processor.encode_observations`.
-        generators: One for each episode, to sample actions.
-        prompt: Encoded prompts.
-        state: Decoding state.
-        actions_BC: Last actions, metres and quaternions, float32; None before the first step.
-        margins_B: Smallest difference between the best and second-best logit over the components of the last
-            action; None before the first step.
-        features: Features of the images of the last step, or of the prompts, by digest.
-    """
-
-    indices: tuple[int, ...]
-    num_slots: tuple[int, ...]
-    generators: tuple[torch.Generator, ...]
-    prompt: Any  # the model's own record
-    state: Any  # likewise
-    actions_BC: torch.Tensor | None
-    margins_B: torch.Tensor | None
-    features: Mapping[bytes, torch.Tensor]
-
-    def select(self, indices: Sequence[int]) -> "_Episodes":
-        """Return the episodes with these indices in the batch."""
-        rows = [self.indices.index(index) for index in indices]
-        if len(rows) == len(self.indices):
-            return self
-        return _Episodes(
-            tuple(indices),
-            tuple(self.num_slots[row] for row in rows),
-            tuple(self.generators[row] for row in rows),
-            self.prompt.select(rows),
-            self.state.select(rows),
-            None if self.actions_BC is None else self.actions_BC[rows],
-            None if self.margins_B is None else self.margins_B[rows],
-            self.features,
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _StepInputs:
-    """What a step is decoded from: arguments of `decode_step`; slots and features as in `_Episodes`."""
+    """What a step is decoded from: arguments of `decode_step`; slots and features as in `Episodes`."""
 
     history: HistoryBatch
     features_KF: torch.Tensor
@@ -96,7 +59,7 @@ class _LastStep:
         choices: Class indices that were decoded, (B, 1) each, in order.
     """
 
-    episodes: _Episodes
+    episodes: Episodes
     observations: tuple[Mapping, ...]
     choices: tuple[torch.Tensor, ...]
 
@@ -158,7 +121,7 @@ class NetworkPolicy(Policy):
         self._is_bounded = False  # batches of one's own may be as large as the memory allows
         self._num_prompts = 0
         self._prompts: tuple[RenderedPrompt, ...] = ()
-        self._episodes: _Episodes | None = None
+        self._episodes: Episodes | None = None
         self._last_step: _LastStep | None = None
 
     @torch.inference_mode()
@@ -170,29 +133,7 @@ class NetworkPolicy(Policy):
             PromptError: A prompt is empty, T5 lacks a word, or placeholders and images do not match.
             ShapeError: An image has another shape or dtype.
         """
-        if not prompts:
-            raise PolicyError("reset got no prompts; give one for each episode.")
-        batch, stack = self.processor.encode_prompts(prompts)
-        count, length = batch.word_ids_BL.shape
-        if self._is_bounded and count * length**2 > MAX_PROMPT_PAIRS:
-            raise PolicyError(
-                f"{count} prompts of up to {length} tokens are too many at once; this policy takes "
-                f"{MAX_PROMPT_PAIRS // length**2} of that length. Reset with fewer episodes (--batch)."
-            )
-        features_KF, features = self._encode(stack, {})
-        prompt = self.network.encode_prompt(batch.to(self.device), features_KF)
-        seeds = [(self._seed ^ prompt_hash(prompt)) & (2**63 - 1) for prompt in prompts]
-        self._episodes = _Episodes(
-            indices=tuple(range(len(prompts))),
-            num_slots=(0,) * len(prompts),
-            generators=tuple(torch.Generator().manual_seed(seed) for seed in seeds),
-            prompt=prompt,
-            state=self.network.init_cache(prompt),
-            actions_BC=None,
-            margins_B=None,
-            features=features,
-        )
-        self._num_prompts, self._prompts, self._last_step = len(prompts), tuple(prompts), None
+        self.begin(prompts, self.start_episodes(prompts))
 
     @torch.inference_mode()
     def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
@@ -209,32 +150,14 @@ class NetworkPolicy(Policy):
                 end of its episode; no object is visible; or a history is too long.
             ShapeError: An image has another shape or dtype.
         """
-        if self._episodes is None:
-            raise PolicyError("there are no prompts yet; call reset with one for each episode first.")
-        if len(observations) != self._num_prompts:
-            raise PolicyError(
-                f"got {len(observations)} observations for {self._num_prompts} prompts; give one for each, "
-                "and None for episodes that have ended."
-            )
-        running = {index: each for index, each in enumerate(observations) if each is not None}
-        ended = sorted(running.keys() - self._episodes.indices)
-        if ended:
-            raise PolicyError(
-                f"episode {', '.join(map(str, ended))} ended with a None before; call reset to start again."
-            )
-        before = episodes = self._episodes.select(list(running))
-        actions: list[dict[str, np.ndarray] | None] = [None] * len(observations)
+        before = episodes = self.episodes_to_step(observations)
+        running = [each for each in observations if each is not None]
         choices: list[torch.Tensor] = []
         if running:
-            episodes = self._step(before, list(running.values()), choices)
-            assert episodes.actions_BC is not None
-            arrays_BC = episodes.actions_BC.cpu().numpy()
-            for index, array_C in zip(running, arrays_BC, strict=True):
-                actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
-        self._episodes = episodes
+            episodes = self.step_episodes(before, running, choices)
         if self.network.explains and not self._is_bounded:  # the caches before a step take memory
-            self._last_step = _LastStep(before, tuple(running.values()), tuple(choices))
-        return actions
+            self._last_step = _LastStep(before, tuple(running), tuple(choices))
+        return self.go_on(episodes)
 
     @torch.inference_mode()
     def explain(self) -> list[Explanation | None]:
@@ -259,7 +182,6 @@ class NetworkPolicy(Policy):
             return explanations
         from openvima.policies.explaining import explain_row
 
-        assert self._episodes.actions_BC is not None
         step = self._step_inputs(last.episodes, last.observations)
         trace = self.network.explain_step(
             last.episodes.prompt,
@@ -291,6 +213,26 @@ class NetworkPolicy(Policy):
         # Never changed in place, so nothing else is shared.
         other._num_prompts, other._episodes, other._last_step = 0, None, None
         return other
+
+    def joint_call(self, kind: str, inputs: Sequence[Any]) -> "JointCall | None":
+        """Return `reset` or `act` as a call that is computed together with those of other sessions.
+
+        Args:
+            kind: "reset" or "act".
+            inputs: Prompts or observations.
+
+        Returns:
+            The call; None where rounding could change actions (below float64), or samples could be drawn
+            twice.
+
+        Raises:
+            PolicyError: As `reset` and `act`.
+        """
+        if self.dtype != torch.float64 or self._temperature:
+            return None
+        from openvima.policies.joint_inference import JointAct, JointReset
+
+        return JointReset(self, inputs) if kind == "reset" else JointAct(self, inputs)
 
     @property
     def near_ties(self) -> list[bool]:
@@ -338,16 +280,81 @@ class NetworkPolicy(Policy):
         """
         save_checkpoint(self.network, folder, self.processor.tokenizer, dtype=dtype)
 
-    def _step(
-        self, episodes: _Episodes, observations: Sequence[Mapping], choices: list[torch.Tensor]
-    ) -> _Episodes:
-        """Decode one action for every running episode, and append the classes that were chosen."""
-        cached = getattr(episodes.state, "cache", episodes.state).mask_BS
+    def start_episodes(self, prompts: Sequence[RenderedPrompt]) -> Episodes:
+        """Encode prompts of new episodes; the policy does not change. Raises as `reset`."""
+        if not prompts:
+            raise PolicyError("reset got no prompts; give one for each episode.")
+        batch, stack = self.processor.encode_prompts(prompts)
+        self._check_pairs(*batch.word_ids_BL.shape)
+        features_KF, features = self._encode(stack, {})
+        prompt = self.network.encode_prompt(batch.to(self.device), features_KF)
+        seeds = [(self._seed ^ prompt_hash(prompt)) & (2**63 - 1) for prompt in prompts]
+        return Episodes(
+            indices=tuple(range(len(prompts))),
+            num_slots=(0,) * len(prompts),
+            generators=tuple(torch.Generator().manual_seed(seed) for seed in seeds),
+            prompt=prompt,
+            state=self.network.init_cache(prompt),
+            actions_BC=torch.zeros(len(prompts), ACTION_WIDTH, device=self.device),
+            has_acted=(False,) * len(prompts),
+            margins_B=None,
+            features=features,
+        )
+
+    def check_prompts(self, prompts: Sequence[RenderedPrompt]) -> None:
+        """Check prompts that are encoded in pieces as `start_episodes` checks those that are not.
+
+        Raises:
+            PolicyError: The batch is empty, or a session's batch is too large for it.
+        """
+        if not prompts:
+            raise PolicyError("reset got no prompts; give one for each episode.")
+        if self._is_bounded and len(prompts) * MAX_PROMPT_POSITIONS**2 > MAX_PROMPT_PAIRS:
+            self._check_pairs(*self.processor.encode_prompts(prompts)[0].word_ids_BL.shape)
+
+    def _check_pairs(self, count: int, length: int) -> None:
+        if self._is_bounded and count * length**2 > MAX_PROMPT_PAIRS:
+            raise PolicyError(
+                f"{count} prompts of up to {length} tokens are too many at once; this policy takes "
+                f"{MAX_PROMPT_PAIRS // length**2} of that length. Reset with fewer episodes (--batch)."
+            )
+
+    def begin(self, prompts: Sequence[RenderedPrompt], episodes: Episodes) -> None:
+        """Make episodes those of the policy."""
+        self._episodes = episodes
+        self._num_prompts, self._prompts, self._last_step = len(prompts), tuple(prompts), None
+
+    def episodes_to_step(self, observations: Sequence[Mapping | None]) -> Episodes:
+        """Return the episodes that have an observation; the policy does not change. Raises as `act`."""
+        if self._episodes is None:
+            raise PolicyError("there are no prompts yet; call reset with one for each episode first.")
+        if len(observations) != self._num_prompts:
+            raise PolicyError(
+                f"got {len(observations)} observations for {self._num_prompts} prompts; give one for each, "
+                "and None for episodes that have ended."
+            )
+        running = [index for index, each in enumerate(observations) if each is not None]
+        ended = sorted(set(running).difference(self._episodes.indices))
+        if ended:
+            raise PolicyError(
+                f"episode {', '.join(map(str, ended))} ended with a None before; call reset to start again."
+            )
+        episodes = self._episodes.select(running)
+        cached = episodes.cache.mask_BS
         if self._is_bounded and cached.numel() > MAX_CACHED_TOKENS:
             raise PolicyError(
                 f"the histories of {len(cached)} episodes have {cached.shape[1]} tokens each, padded; this "
                 f"policy takes {MAX_CACHED_TOKENS:,} in all. Act in fewer episodes (--batch) or steps."
             )
+        return episodes
+
+    def step_episodes(
+        self, episodes: Episodes, observations: Sequence[Mapping], choices: list[torch.Tensor]
+    ) -> Episodes:
+        """Decode one action for every episode, and append the classes that were chosen.
+
+        The policy does not change. Raises as `act`.
+        """
         step = self._step_inputs(episodes, observations)
         strategy = sampling(episodes.generators, self._temperature) if self._temperature else greedy
         margins: list[torch.Tensor] = []
@@ -365,25 +372,31 @@ class NetworkPolicy(Policy):
             num_slots=step.num_slots,
             state=state,
             actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as returned
+            has_acted=(True,) * len(episodes),
             margins_B=torch.stack(margins).amin(0) if margins else None,
             features=step.features,
         )
 
-    def _step_inputs(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _StepInputs:
+    def go_on(self, episodes: Episodes) -> list[dict[str, np.ndarray] | None]:
+        """Make episodes that were stepped those of the policy, and return their actions, as `act` does."""
+        self._episodes = episodes
+        actions: list[dict[str, np.ndarray] | None] = [None] * self._num_prompts
+        for index, array_C in zip(episodes.indices, episodes.actions_BC.cpu().numpy(), strict=True):
+            actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
+        return actions
+
+    def _step_inputs(self, episodes: Episodes, observations: Sequence[Mapping]) -> _StepInputs:
         """Encode observations and previous actions."""
         batch, stack = self.processor.encode_observations(
             [[observation] for observation in observations], episodes.num_slots
         )
         features_KF, features = self._encode(stack, episodes.features)
         history = batch if self.device.type == "cpu" else batch.to(self.device)
-        previous_BC = episodes.actions_BC
-        if previous_BC is None:
-            previous_BC = torch.zeros(len(observations), ACTION_WIDTH, device=self.device)
         return _StepInputs(
             history,
             features_KF,
-            previous_BC[:, None],
-            torch.full_like(history.steps_BT, episodes.actions_BC is not None),
+            episodes.actions_BC[:, None],
+            torch.tensor(episodes.has_acted, device=self.device)[:, None],
             tuple(batch.num_slots_BT[:, 0].tolist()),
             features,
         )

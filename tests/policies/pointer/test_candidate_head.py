@@ -61,7 +61,7 @@ def drawn_inputs(batch: int = B, seed: int = 1) -> HeadInputs:
         grasps_BTN2=positions + 0.01,
         has_suction_BT=has_suction.repeat(batch // B + 1, 1)[:batch],
         previous_BTC=drawn(batch, T, 12) * (torch.arange(T) > 0)[:, None],
-        steps_T=torch.arange(T),
+        steps_BT=torch.arange(T)[None],
         first_step=first_step,
         prompt=pointer_prompt(
             prompt, prompt_appearance, torch.ones(batch, M, dtype=torch.bool), prompt_objects

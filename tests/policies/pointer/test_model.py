@@ -97,7 +97,7 @@ def test_reading_step_by_step_gives_the_head_what_reading_at_once_does(network, 
             torch.testing.assert_close(now.query_BTD[0, 0], whole.query_BTD[b, t])
             torch.testing.assert_close(now.objects_BTND[0, 0], whole.objects_BTND[b, t, :count])
             torch.testing.assert_close(now.previous_BTC[0, 0], whole.previous_BTC[b, t])
-            assert now.steps_T.tolist() == [t]
+            assert now.steps_BT.tolist() == [[t]]
             for one, all_of_them in (
                 (now.first_step, whole.first_step),
                 (now.prompt.objects, whole.prompt.objects),

@@ -55,7 +55,7 @@ def inputs() -> HeadInputs:
         grasps_BTN2=positions + 0.001,
         has_suction_BT=torch.tensor([[True, True], [False, False], [True, False]]),
         previous_BTC=torch.zeros(B, T, 12, dtype=torch.float64),
-        steps_T=torch.arange(T),
+        steps_BT=torch.arange(T)[None],
         first_step=nothing,
         prompt=pointer_prompt(prompt, prompt_appearance, prompt_masks, nothing),
         rotations_BTNR=appearance[..., :0],

@@ -362,10 +362,10 @@ class PlacePointer(nn.Module):
 
     def _context(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
         """Combine the action query, the picked object and the index of the step, (B, T, D)."""
-        steps_T = inputs.steps_T.clamp(max=self.step_embedding.num_embeddings - 1)
+        steps_BT = inputs.steps_BT.clamp(max=self.step_embedding.num_embeddings - 1)
         picked_BTD = at(inputs.objects_BTND, pick_BT)
         context_BTD = self.context(torch.cat([inputs.query_BTD, picked_BTD], dim=-1))
-        return torch.relu(context_BTD + self.step_embedding(steps_T))
+        return torch.relu(context_BTD + self.step_embedding(steps_BT))
 
     def _prompt_appearance(self, inputs: HeadInputs, context_BTD: torch.Tensor) -> torch.Tensor:
         """Appearance of what the prompt asks for, (B, T, A): from words, and from the attended object."""

@@ -5,7 +5,7 @@ width of appearance, P attributes, X width of all their projections, C component
 rotations.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -79,6 +79,12 @@ class PointerPrompt(TensorRecord):
     attributes_BLX: torch.Tensor | None = None
     describes_BL: torch.Tensor | None = None
 
+    def filled(self) -> "PointerPrompt":
+        """Return the prompts with a mask of the words that describe appearance, if none does."""
+        if self.describes_BL is not None:
+            return self
+        return replace(self, describes_BL=torch.zeros_like(self.mask_BL))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadInputs:
@@ -94,7 +100,7 @@ class HeadInputs:
         has_suction_BT: Whether the end effector is the suction cup, which carries an object rigidly; the
             spatula pushes.
         previous_BTC: The action before each step, metres and quaternions; zero where there was none.
-        steps_T: Indices of the steps, from 0.
+        steps_BT: Indices of the steps, from 0; (1, T) if they are those of all episodes.
         first_step: Objects in view at the first step of the episode.
         prompt: Encoded prompts.
         rotations_BTNR: Probabilities of the rotation that brings each object in view to the heading in which
@@ -111,7 +117,7 @@ class HeadInputs:
     grasps_BTN2: torch.Tensor
     has_suction_BT: torch.Tensor
     previous_BTC: torch.Tensor
-    steps_T: torch.Tensor
+    steps_BT: torch.Tensor
     first_step: ObjectSet
     prompt: PointerPrompt
     rotations_BTNR: torch.Tensor

@@ -21,7 +21,7 @@ from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.nn.step_trace import StepTrace
-from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.nn.tensor_record import TensorRecord, join_rows
 from openvima.policies.pointer.attributes import Attributes, without_crops
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
@@ -44,16 +44,16 @@ SUCTION = END_EFFECTORS.index("suction")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DecodingState(TensorRecord):
-    """What is known of the steps so far; all episodes of a batch have equally many.
+    """What is known of the steps so far.
 
     Args:
         cache: Keys and values.
-        num_steps: Number of steps.
-        first_step: Objects in view at the first of them; None before it.
+        num_steps_B: Number of steps of each episode, int64.
+        first_step: Objects in view at the first of them, zeros for episodes before it; None if all are.
     """
 
     cache: KVCache
-    num_steps: int = 0
+    num_steps_B: torch.Tensor
     first_step: ObjectSet | None = None
 
 
@@ -168,7 +168,8 @@ class Pointer(PolicyNetwork):
 
     def init_cache(self, prompt: PointerPrompt) -> DecodingState:
         """Return the state of decoding after the prompt and before the first step."""
-        return DecodingState(self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL))
+        cache = self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)
+        return DecodingState(cache, torch.zeros_like(cache.length_B))
 
     def loss(
         self, prompt: PointerPrompt, history: HistoryBatch, features_KF: torch.Tensor, targets: ActionTargets
@@ -228,12 +229,15 @@ class Pointer(PolicyNetwork):
         previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
         outputs_BTQD, cache = decode_observations(self.decoder, state.cache, tokens, previous)
         objects_BTND = outputs_BTQD[:, :, :-1]
-        first_step, num_steps = state.first_step, history.steps_BT.shape[1]
-        if first_step is None:
-            first = objects.at_step(0)
-            no_rotations = first.appearance_NA[..., :0]
-            first_step = ObjectSet.of(objects_BTND[:, 0], first, no_rotations)
-        steps_T = torch.arange(state.num_steps, state.num_steps + num_steps, device=prompt.mask_BL.device)
+        num_steps = history.steps_BT.shape[1]
+        steps_BT = torch.arange(num_steps, device=prompt.mask_BL.device)[None]
+        first_step, is_first_B = state.first_step, state.num_steps_B == 0
+        if first_step is not None:
+            steps_BT = steps_BT + state.num_steps_B[:, None]
+        if first_step is None or is_first_B.any():
+            now = objects.at_step(0)
+            now = ObjectSet.of(objects_BTND[:, 0], now, now.appearance_NA[..., :0])
+            first_step = now if first_step is None else _replaced(first_step, now, is_first_B)
         inputs = HeadInputs(
             query_BTD=tokens.query(outputs_BTQD),
             objects_BTND=objects_BTND,
@@ -243,13 +247,13 @@ class Pointer(PolicyNetwork):
             grasps_BTN2=history.grasps_BTN2.to(objects.positions_N2.dtype),
             has_suction_BT=history.end_effector_BT == SUCTION,
             previous_BTC=previous_BTC * has_previous_BT[..., None],
-            steps_T=steps_T,
+            steps_BT=steps_BT,
             first_step=first_step,
             prompt=prompt,
             rotations_BTNR=rotations_BTNR,
             attributes_BTNX=attributes_BTNX,
         )
-        return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
+        return inputs, DecodingState(cache, state.num_steps_B + num_steps, first_step)
 
     def embed_appearance(
         self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
@@ -395,6 +399,13 @@ def _objects_in_view(
         exists_BTN,
         now_BTN,
     )
+
+
+def _replaced(objects: ObjectSet, others: ObjectSet, rows_B: torch.Tensor) -> ObjectSet:
+    """Return a set with some rows of another one."""
+    count = len(rows_B)
+    both = join_rows([objects, others], [count, count])
+    return both.select(torch.arange(count, device=rows_B.device) + count * rows_B)
 
 
 def _scene_index(objects: ObjectFeatures) -> torch.Tensor:
