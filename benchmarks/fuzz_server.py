@@ -434,11 +434,11 @@ def memory_mb(pid: int, field: str) -> float:
 
 
 @contextmanager
-def served(policy: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """Run `openvima serve` in a process of its own; its address, and the process."""
+def served(policy: str, *options: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """Run `openvima serve` with some options in a process of its own; its address, and the process."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "openvima", "serve", policy, "--port", str(port)]
+    command = [sys.executable, "-m", "openvima", "serve", policy, "--port", str(port), *options]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
         assert server.stdout is not None

@@ -11,9 +11,10 @@ import pytest
 from openvima.policies.prompt_limits import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
+from openvima.serving.batching import WaitingRequest
 from openvima.serving.packing import pack, unpack
 from openvima.serving.protocol import MAX_PIXELS, encode_prompt
-from openvima.serving.session import Session
+from openvima.serving.session import Calls, Session
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
 
@@ -31,6 +32,12 @@ def refusal(message: Any, policy: Any = None) -> str:  # Any: whatever can be pa
     return answer
 
 
+def answered(session: Session, calls: Calls) -> bytes | str:
+    request = WaitingRequest(session, calls, is_joint=False)
+    request.begin()
+    return request.reply.result()
+
+
 def prompt_with(text: str = "Look at {thing}.", **fields: Any) -> dict[str, Any]:  # Any: of a message
     sent = encode_prompt(made_up_prompt(1))
     return {"text": text, "images": [{**sent["images"][0], **fields}]}
@@ -45,7 +52,7 @@ def test_a_policy_that_reads_language_is_served_descriptions() -> None:
     session = Session(policy, 64, "text")
     request = session.read(pack({"type": "reset", "prompts": [encode_prompt(made_up_prompt(3))]}))
     assert not isinstance(request, str)
-    assert session.answer(request) == pack({"type": "reset", "episodes": 1})
+    assert answered(session, request) == pack({"type": "reset", "episodes": 1})
     (prompt,) = policy.prompts
     assert (prompt.text, prompt.images) == ("Look at the red swirl bowl, number 3.", {})
     long = prompt_with(objects=[{"object_id": 2, "object": "x" * 201, "texture": "red"}])
@@ -149,7 +156,7 @@ def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCap
     request = session.read(pack({"type": "reset", "prompts": [prompt_with()]}))
     assert not isinstance(request, str)
     with caplog.at_level(logging.ERROR):
-        answers = [session.answer(request)]
+        answers = [answered(session, request)]
     answers += [
         refusal({"type": hostile}),
         refusal({"type": "reset", hostile: 1}),

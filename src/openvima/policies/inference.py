@@ -214,6 +214,7 @@ class NetworkPolicy(Policy):
         other._num_prompts, other._episodes, other._last_step = 0, None, None
         return other
 
+    @torch.inference_mode()
     def joint_call(self, kind: str, inputs: Sequence[Any]) -> "JointCall | None":
         """Return `reset` or `act` as a call that is computed together with those of other sessions.
 

@@ -47,6 +47,19 @@ class JointCall:
         """Change the session, and return what the call returns."""
         raise NotImplementedError
 
+    @staticmethod
+    @torch.inference_mode()
+    def compute_together(pieces: "Sequence[tuple[JointCall, int]]") -> None:
+        """Compute the next rows of several calls in one batch.
+
+        Args:
+            pieces: Calls that join each other, and how many rows of each.
+
+        Raises:
+            OpenVimaError: As `reset` or `act`, of any of the calls; none of them has changed.
+        """
+        type(pieces[0][0])._compute(pieces)
+
     def _rows(self, count: int) -> slice:
         return slice(self._num_done, self._num_done + count)
 
@@ -74,6 +87,7 @@ class JointReset(JointCall):
         super().__init__(policy, prompts)
         policy.check_prompts(prompts)
 
+    @torch.inference_mode()
     def finish(self) -> None:
         """Start the episodes."""
         self._policy.begin(self._inputs, self._joined(range(len(self._inputs))))
@@ -99,6 +113,7 @@ class JointAct(JointCall):
         super().__init__(policy, [each for each in observations if each is not None])
         self._before = policy.episodes_to_step(observations)
 
+    @torch.inference_mode()
     def finish(self) -> list[dict[str, np.ndarray] | None]:
         """Take the step, and return the actions."""
         if not self._pieces:  # all have ended
@@ -112,16 +127,3 @@ class JointAct(JointCall):
         after = pieces[0][0]._policy.step_episodes(join(parts), observations, [])
         for (call, _), part in zip(pieces, after.split_as(parts) if len(parts) > 1 else [after], strict=True):
             call._take(part)
-
-
-@torch.inference_mode()
-def compute_together(pieces: Sequence[tuple[JointCall, int]]) -> None:
-    """Compute the next rows of several calls in one batch.
-
-    Args:
-        pieces: Calls that join each other, and how many rows of each.
-
-    Raises:
-        OpenVimaError: As `reset` or `act`, of any of the calls; none of them has changed.
-    """
-    type(pieces[0][0])._compute(pieces)

@@ -25,6 +25,8 @@ class ServerConfig:
             observation.
         max_episodes: Episodes of the largest batch, for which 128 MiB are enough.
         max_connections: Clients at the same time.
+        max_batch: Episodes of several clients that a network computes at once; with 1 it answers one request
+            after the other.
         idle_s: Seconds after which a client is dropped that has not sent a whole message, or not taken an
             answer.
         num_threads: Threads that a network computes with. One gives the last bits of `openvima evaluate`.
@@ -42,6 +44,7 @@ class ServerConfig:
     max_message_bytes: int = 128 * 2**20
     max_episodes: int = 64
     max_connections: int = 16
+    max_batch: int = 16
     idle_s: float = 600.0
     num_threads: int = 1
     prompts: str = "multimodal"
@@ -53,6 +56,7 @@ class ServerConfig:
                 ("port", self.port, 0, 65535),
                 ("max_message_bytes", self.max_message_bytes, 1024, 2**32),
                 ("max_episodes", self.max_episodes, 1, MAX_LENGTH),
+                ("max_batch", self.max_batch, 1, 1024),
                 ("max_connections", self.max_connections, 1, 10_000),
                 ("idle_s", self.idle_s, 0.01, 10**6),
                 ("num_threads", self.num_threads, 1, 1024),

@@ -18,6 +18,7 @@ from openvima.policies.base import Policy
 from openvima.policies.own_code import checked_policy
 from openvima.policies.prompt_limits import PromptLimits
 from openvima.scene.command import PRIMITIVES
+from openvima.serving.batching import DynamicBatcher
 from openvima.serving.config import ServerConfig, server_config
 from openvima.serving.packing import pack, require_extra
 from openvima.serving.protocol import DEFAULT_MODALITIES, PROTOCOL, check_control, check_modalities
@@ -127,8 +128,8 @@ class _PolicyServer:
     """A served policy.
 
     Connections share one event loop, in which nothing takes long. Requests are read and checked in threads of
-    their own, and answered and packed in one other thread, one after the other, so that policies need not be
-    safe to use from several.
+    their own, and answered and packed in one other thread, so that policies need not be safe to use from
+    several.
     """
 
     def __init__(self, policy: Policy, config: ServerConfig, about: Mapping[str, Any]) -> None:
@@ -164,9 +165,10 @@ class _PolicyServer:
         config = self._config
         threads = (config.num_threads,)
         with (
-            ThreadPoolExecutor(2, "openvima-reading") as self._reading,
-            ThreadPoolExecutor(1, "openvima-policy", _set_threads, threads) as self._computing,
+            ThreadPoolExecutor(2, "openvima-reading") as readers,
+            ThreadPoolExecutor(1, "openvima-policy", _set_threads, threads) as computing,
         ):
+            self._batcher = DynamicBatcher(readers, computing, config.max_batch)
             try:
                 server = await serve(
                     self._serve_client,
@@ -231,19 +233,14 @@ class _PolicyServer:
 
     async def _converse(self, connection: "ServerConnection") -> None:
         session = Session(self._new_policy(), self._config.max_episodes, self._config.prompts)
-        loop = asyncio.get_running_loop()
         reply: bytes | str = self._metadata
         while True:
             async with asyncio.timeout(self._config.idle_s):
                 await connection.send(reply)
                 data = await _whole_message(connection)
-            request = await loop.run_in_executor(self._reading, session.read, data)
+            answer = await self._batcher.submit(session, data)
             del data  # it may be large, and the policy may be busy with others
-            if isinstance(request, str):
-                reply = request
-            else:
-                reply = await loop.run_in_executor(self._computing, session.answer, request)
-            del request
+            reply = answer if isinstance(answer, str) else await answer
             if isinstance(reply, str):
                 _LOG.warning("%s: refused: %s", _name(connection), reply)
 

@@ -2,9 +2,9 @@
 
 import logging
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
@@ -31,15 +31,31 @@ MAX_IN_PROMPTS, MAX_IN_VIEW = 64, 24
 _MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
 _LOG = logging.getLogger(__name__)
 
-Answer = Callable[[], dict[str, Any] | None]  # plain values and arrays
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolicyCall:
+    """A call that a policy is to compute.
+
+    Args:
+        kind: The name of the method.
+        inputs: Its prompts or observations.
+    """
+
+    kind: Literal["reset", "act"]
+    inputs: Sequence[Any]
+
+
+# Gives the calls that an answer needs, is sent what they return, and returns the answer.
+Calls = Generator[PolicyCall, Any, Any]  # Any: actions; plain values and arrays
+ReplyCalls = Generator[PolicyCall, Any, bytes | str]
 
 
 class Session:
     """Answers the requests of one client.
 
     A request is read and checked in one thread and answered in that of the policy, so one that is refused
-    keeps no other client waiting. Neither method raises: a refusal is a text, and the next request may be a
-    better one.
+    keeps no other client waiting. No method raises: a refusal is a text, and the next request may be a better
+    one.
 
     Args:
         policy: Has no other user. Its `prompt_limits`, if any, bound the prompts.
@@ -48,24 +64,24 @@ class Session:
     """
 
     def __init__(self, policy: Policy, max_episodes: int, prompts: str = MULTIMODAL) -> None:
-        self._policy = policy
+        self.policy = policy
         self._limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
         self._control: str = getattr(policy, "control", PRIMITIVES)
         self._max_episodes = max_episodes
         self._prompts = prompts
         self._num_episodes = 0
 
-    def read(self, data: bytes | str) -> Answer | str:
-        """Read a request, whatever it is, and return what answers it."""
+    def read(self, data: bytes | str) -> Calls | str:
+        """Read a request, whatever it is, and return what answers it; nothing is called yet."""
         try:
             return self._read(data)
         except OpenVimaError as error:
             return _refusal(error)
 
-    def answer(self, request: Answer) -> bytes | str:
-        """Answer a request that `read` returned."""
+    def reply(self, request: Calls) -> ReplyCalls:
+        """Answer a request that `read` returned. Whoever runs this makes the calls."""
         try:
-            return pack(request())
+            return pack((yield from request))
         except OpenVimaError as error:
             return _refusal(error)
         except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
@@ -73,7 +89,7 @@ class Session:
             _LOG.error("the policy failed\n%s", where)
             return f"the policy failed: {type(error).__name__}: {echo(str(error))}"
 
-    def _read(self, data: bytes | str) -> Answer:
+    def _read(self, data: bytes | str) -> Calls:
         if isinstance(data, str):
             raise MessageError("a text frame came in; requests are binary frames of MessagePack.")
         message = unpack(data)
@@ -83,7 +99,7 @@ class Session:
             protocol = message.get("protocol", PROTOCOL)
             check_protocol(protocol, theirs="the client", ours="this server")
             prompts = read_list(message, "reset", "prompts", self._max_episodes, optional=("protocol",))
-            return partial(self._begin, self._decoded(prompts))
+            return self._begin(self._decoded(prompts))
         if kind == "act":
             seen = read_list(message, "act", "observations", self._max_episodes)
             observations = [
@@ -92,13 +108,11 @@ class Session:
             ]
             num_ids = sum(_num_ids(one["segm"]) for one in observations if one and "segm" in one)
             self._check_objects(num_ids, MAX_IN_VIEW)
-            return partial(self._act, observations)
+            return self._act(observations)
         if isinstance(message, dict) and "type" not in message:
             prompt = message.pop("prompt", None)
             sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
-            return partial(
-                self._infer, decode_observation(message, control=self._control), self._decoded(sent)
-            )
+            return self._infer(decode_observation(message, control=self._control), self._decoded(sent))
         raise MessageError(
             f"a request must be a map with type 'reset' or 'act', or an observation ({PROTOCOL})."
         )
@@ -119,24 +133,24 @@ class Session:
                 "Send fewer episodes."
             )
 
-    def _begin(self, prompts: Sequence[RenderedPrompt]) -> dict[str, Any]:  # Any: plain values
-        self._reset(prompts)
+    def _begin(self, prompts: Sequence[RenderedPrompt]) -> Calls:
+        yield from self._reset(prompts)
         return {"type": "reset", "episodes": self._num_episodes}
 
-    def _reset(self, prompts: Sequence[RenderedPrompt]) -> None:
+    def _reset(self, prompts: Sequence[RenderedPrompt]) -> Calls:
         if not prompts:
             raise MessageError("reset has no prompts; give one for each episode.")
         self._num_episodes = 0  # should the policy fail, there is nothing to go on with
-        self._policy.reset(prompts)
+        yield PolicyCall("reset", prompts)
         self._num_episodes = len(prompts)
 
-    def _act(self, observations: Sequence[dict[str, Any] | None]) -> dict[str, Any]:  # Any: values and arrays
-        actions = self._actions(observations)
-        near_ties = getattr(self._policy, "near_ties", None)
+    def _act(self, observations: Sequence[dict[str, Any] | None]) -> Calls:  # Any: values and arrays
+        actions = yield from self._actions(observations)
+        near_ties = getattr(self.policy, "near_ties", None)
         extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
         return {"type": "act", "actions": actions, **extra}
 
-    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> list[Any]:  # Any: values and arrays
+    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> Calls:  # Any: values and arrays
         """Ask the policy."""
         if not self._num_episodes:
             raise MessageError("there are no episodes yet; send a reset with their prompts first.")
@@ -145,18 +159,19 @@ class Session:
                 f"act has {len(observations)} observations for {self._num_episodes} prompts; send one for "
                 "each, and nil for episodes that have ended."
             )
-        actions = [encode_action(action, self._control) for action in self._policy.act(observations)]
+        given = yield PolicyCall("act", observations)
+        actions = [encode_action(action, self._control) for action in given]
         if len(actions) != len(observations):
             raise MessageError(
                 f"the policy gave {len(actions)} actions for {len(observations)} observations."
             )
         return actions
 
-    def _infer(self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]) -> Any:
+    def _infer(self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]) -> Calls:
         """Act in a single episode, which an observation with a prompt begins."""
         if prompts:
-            self._reset(prompts)
-        return self._actions([observation])[0]
+            yield from self._reset(prompts)
+        return (yield from self._actions([observation]))[0]
 
 
 def _num_ids(segm: Mapping[str, np.ndarray]) -> int:

@@ -56,7 +56,7 @@ def join_rows(parts: Sequence[Any], counts: Sequence[int]) -> Any:  # Any: their
     if isinstance(first, tuple):
         columns = [[None] * len(first) if part is None else part for part in parts]
         return tuple(join_rows(column, counts) for column in zip(*columns, strict=True))
-    if is_dataclass(first):
+    if not isinstance(first, torch.Tensor):
         names = [field.name for field in fields(first)]
         columns = {name: [getattr(part, name, None) for part in parts] for name in names}
         if any(0 < sum(part is None for part in column) < len(parts) for column in columns.values()):
