@@ -159,7 +159,8 @@ def summary(rounds: Sequence[tuple[float, float]], waits_ms: Sequence[float]) ->
 def table(cases: dict[str, dict[str, Any]]) -> str:  # Any: see `measure`
     """Return the results as lines of text."""
     lines = [
-        f"{'clients':<34}{'requests':>10}{'obs/s':>9}{'CPU ms/obs':>12}{'p50 ms':>9}{'p95 ms':>9}{'p99 ms':>9}"
+        f"{'clients':<34}{'requests':>10}{'obs/s':>9}{'CPU ms/obs':>12}"
+        + "".join(f"{f'p{q} ms':>9}" for q in QUANTILES)
     ]
     for name, case in cases.items():
         for mode in MODES:

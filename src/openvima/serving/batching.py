@@ -66,23 +66,30 @@ class DynamicBatcher:
 
     def _run(self) -> None:
         """Compute batches until no request waits. It runs for each request, and may find none."""
-        self._gather()
+        self._gather([])
         while self._waiting:
-            self._compute_batch()
-            self._gather()
+            self._gather(self._compute_batch())
 
-    def _gather(self) -> None:
-        """Take the requests that have arrived; wait a little for those that are being read."""
+    def _gather(self, unfinished: "Sequence[WaitingRequest]") -> None:
+        """Take the requests that have arrived, and some behind them; wait a little if more are being read."""
         until = time.monotonic() + WINDOW_S
         with self._changed:
-            while self._num_reading and 0 < len(self._arrived) + len(self._waiting) < self._max_batch:
+            while self._num_reading and 0 < self._num_waiting(unfinished) < self._max_batch:
                 if not self._changed.wait(until - time.monotonic()):
                     break
             arrived, self._arrived = self._arrived, []
         self._waiting += [each for each in arrived if each.begin()]
+        self._waiting += unfinished
 
-    def _compute_batch(self) -> None:
-        """Compute rows of the request that has waited longest, and of those that join it."""
+    def _num_waiting(self, unfinished: "Sequence[WaitingRequest]") -> int:
+        return len(self._arrived) + len(self._waiting) + len(unfinished)
+
+    def _compute_batch(self) -> "list[WaitingRequest]":
+        """Compute rows of the request that has waited longest, and of those that join it.
+
+        Returns:
+            Those of them that are not finished; they no longer wait.
+        """
         calls = [(each, each.joint) for each in self._waiting if each.joint]
         first = calls[0][1]
         calls = [(each, call) for each, call in calls if call.joins(first)]
@@ -90,8 +97,8 @@ class DynamicBatcher:
         pieces = [(*call, share) for call, share in zip(calls, shares, strict=True) if share]
         _compute(pieces)
         served = [each for each, _, _ in pieces]
-        waiting = [each for each in self._waiting if each not in served] + served
-        self._waiting = [each for each in waiting if each.joint]
+        self._waiting = [each for each in self._waiting if each not in served]
+        return [each for each in served if each.joint]
 
 
 class WaitingRequest:
