@@ -29,6 +29,7 @@ import numpy as np
 
 import openvima
 from fuzz_server import connected, served
+from openvima.env import TabletopEnv
 from openvima.serving.packing import pack
 from openvima.serving.protocol import encode_observation, encode_prompt
 from sim import circumstances
@@ -54,24 +55,33 @@ class Played:
 
 
 def record(tasks: Sequence[str], seed: int, num_episodes: int) -> list[tuple[bytes, int]]:
-    """Play episodes with the oracle; packed requests, each with its number of observations."""
-    requests = []
-    for number in range(num_episodes):
-        env = openvima.make(tasks[(seed + number) % len(tasks)]).unwrapped
-        observation, _ = env.reset(seed=1000 * seed + number)
-        requests.append((pack({"type": "reset", "prompts": [encode_prompt(env.prompt)]}), 0))
-        is_over = False
-        while not is_over:
-            seen = [encode_observation(observation)]
-            requests.append((pack({"type": "act", "observations": seen}), 1))
-            observation, _, terminated, truncated, _ = env.step(env.oracle_decision().action)
-            is_over = terminated or truncated
+    """Play episodes with the oracle, one after the other; requests, each with its number of observations."""
+    return [
+        request
+        for number in range(num_episodes)
+        for request in record_batch([tasks[(seed + number) % len(tasks)]], 1000 * seed + number)
+    ]
+
+
+def record_batch(tasks: Sequence[str], seed: int) -> list[tuple[bytes, int]]:
+    """Play one episode of each task with the oracle, all at once; requests as of `record`."""
+    envs = [TabletopEnv(task, domain="user") for task in tasks]
+    observations: list[dict[str, Any] | None] = [env.reset(seed=seed)[0] for env in envs]
+    requests = [(pack({"type": "reset", "prompts": [encode_prompt(env.prompt) for env in envs]}), 0)]
+    while any(observations):
+        seen = [encode_observation(observation) for observation in observations]
+        count = sum(observation is not None for observation in observations)
+        requests.append((pack({"type": "act", "observations": seen}), count))
+        for index, (env, observation) in enumerate(zip(envs, observations, strict=True)):
+            if observation is not None:
+                following, _, terminated, truncated, _ = env.step(env.oracle_decision().action)
+                observations[index] = None if terminated or truncated else following
     return requests
 
 
 def many_episodes(task: str, steps: int) -> list[tuple[bytes, int]]:
     """Return requests of a client with `LARGE` episodes at once, each seen at its start at every step."""
-    env = openvima.make(task).unwrapped
+    env = TabletopEnv(task, domain="user")
     prompts, seen = [], []
     for seed in range(LARGE):
         observation, _ = env.reset(seed=seed)
@@ -136,7 +146,7 @@ def measure(
         refusals = [answer for answer in answers["single"] if isinstance(answer, str)]
         if refusals or answers["joint"] != answers["single"]:
             raise RuntimeError(f"the servers give different answers, or refuse: {refusals[:1]}")
-    result = {mode: summary(rounds[mode], waits[mode]) for mode in servers}
+    result: dict[str, Any] = {mode: summary(rounds[mode], waits[mode]) for mode in servers}
     for name, index in (("ratio", 0), ("cpu_ratio", 1)):
         pairs = zip(rounds["joint"], rounds["single"], strict=True)
         ratios = [joint[index] / single[index] for joint, single in pairs]
