@@ -1,6 +1,6 @@
 """What `long_day.py` keeps busy: clients of a policy server, evaluations, vector environments.
 
-Each function runs in a process of its own until it is told to stop, and appends one JSON record a line to a
+Each function runs in a process of its own until an event stops it, and appends one JSON record a line to a
 file: what happened in a span of time, and what was lost in it. Nothing may be.
 """
 

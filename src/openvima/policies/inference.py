@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from openvima.policies.batch import HistoryBatch
 from openvima.policies.checkpoint import load_network, save_checkpoint
 from openvima.policies.devices import usable_device
 from openvima.policies.episodes import Episodes
+from openvima.policies.joint_inference import JointAct, JointCall, JointReset
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
 from openvima.policies.nn.decoder import MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -25,9 +26,6 @@ from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
 from openvima.scene.explanation import Explanation
-
-if TYPE_CHECKING:
-    from openvima.policies.joint_inference import JointCall
 
 # Pairs of tokens within a prompt, over a padded batch: 16 prompts of 256 tokens, 64 of 128. Attention scores
 # take memory for each.
@@ -215,7 +213,7 @@ class NetworkPolicy(Policy):
         return other
 
     @torch.inference_mode()
-    def joint_call(self, kind: str, inputs: Sequence[Any]) -> "JointCall | None":
+    def joint_call(self, kind: str, inputs: Sequence[Any]) -> JointCall | None:
         """Return `reset` or `act` as a call that is computed together with those of other sessions.
 
         Args:
@@ -231,8 +229,6 @@ class NetworkPolicy(Policy):
         """
         if self.dtype != torch.float64 or self._temperature:
             return None
-        from openvima.policies.joint_inference import JointAct, JointReset
-
         return JointReset(self, inputs) if kind == "reset" else JointAct(self, inputs)
 
     @property

@@ -6,7 +6,7 @@ a batch for each, and a large call that is computed in pieces lets smaller ones 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -14,8 +14,37 @@ import torch
 from openvima.policies.episodes import Episodes, join
 from openvima.scene import RenderedPrompt
 
-if TYPE_CHECKING:
-    from openvima.policies.inference import NetworkPolicy
+
+class NetworkSession(Protocol):
+    """What joint calls need of a `NetworkPolicy`; see there."""
+
+    network: Any  # that of all sessions whose calls join each other
+
+    def check_prompts(self, prompts: Sequence[RenderedPrompt]) -> None:
+        """Check prompts before they are encoded in pieces."""
+        ...
+
+    def start_episodes(self, prompts: Sequence[RenderedPrompt]) -> Episodes:
+        """Encode prompts; the session does not change."""
+        ...
+
+    def begin(self, prompts: Sequence[RenderedPrompt], episodes: Episodes) -> None:
+        """Make episodes those of the session."""
+        ...
+
+    def episodes_to_step(self, observations: Sequence[Mapping | None]) -> Episodes:
+        """Return the episodes that have an observation."""
+        ...
+
+    def step_episodes(
+        self, episodes: Episodes, observations: Sequence[Mapping], choices: list[torch.Tensor]
+    ) -> Episodes:
+        """Decode an action for each episode; the session does not change."""
+        ...
+
+    def go_on(self, episodes: Episodes) -> list[dict[str, np.ndarray] | None]:
+        """Make episodes after a step those of the session, and return the actions."""
+        ...
 
 
 class JointCall:
@@ -28,7 +57,7 @@ class JointCall:
         inputs: What each row of the batch is computed from.
     """
 
-    def __init__(self, policy: "NetworkPolicy", inputs: Sequence[Any]) -> None:
+    def __init__(self, policy: NetworkSession, inputs: Sequence[Any]) -> None:
         self._policy = policy
         self._inputs = inputs
         self._pieces: list[Episodes] = []
@@ -83,7 +112,7 @@ class JointReset(JointCall):
         prompts: The prompts.
     """
 
-    def __init__(self, policy: "NetworkPolicy", prompts: Sequence[RenderedPrompt]) -> None:
+    def __init__(self, policy: NetworkSession, prompts: Sequence[RenderedPrompt]) -> None:
         super().__init__(policy, prompts)
         policy.check_prompts(prompts)
 
@@ -109,7 +138,7 @@ class JointAct(JointCall):
         observations: One for each prompt, None for episodes that have ended.
     """
 
-    def __init__(self, policy: "NetworkPolicy", observations: Sequence[Mapping | None]) -> None:
+    def __init__(self, policy: NetworkSession, observations: Sequence[Mapping | None]) -> None:
         super().__init__(policy, [each for each in observations if each is not None])
         self._before = policy.episodes_to_step(observations)
 
