@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-import time
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Executor, Future
 from functools import partial
@@ -72,17 +71,19 @@ class DynamicBatcher:
 
     def _gather(self, unfinished: "Sequence[WaitingRequest]") -> None:
         """Take the requests that have arrived, and some behind them; wait a little if more are being read."""
-        until = time.monotonic() + WINDOW_S
-        with self._changed:
-            while self._num_reading and 0 < self._num_waiting(unfinished) < self._max_batch:
-                if not self._changed.wait(until - time.monotonic()):
-                    break
-            arrived, self._arrived = self._arrived, []
-        self._waiting += [each for each in arrived if each.begin()]
+        self._take_arrived()
+        if count := len(self._waiting) + len(unfinished):
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: not self._num_reading or count + len(self._arrived) >= self._max_batch, WINDOW_S
+                )
+            self._take_arrived()
         self._waiting += unfinished
 
-    def _num_waiting(self, unfinished: "Sequence[WaitingRequest]") -> int:
-        return len(self._arrived) + len(self._waiting) + len(unfinished)
+    def _take_arrived(self) -> None:
+        with self._changed:
+            arrived, self._arrived = self._arrived, []
+        self._waiting += [each for each in arrived if each.begin()]
 
     def _compute_batch(self) -> "list[WaitingRequest]":
         """Compute rows of the request that has waited longest, and of those that join it.
