@@ -12,9 +12,8 @@ from openvima.serving.session import Calls, PolicyCall, Session
 if TYPE_CHECKING:
     from openvima.policies.joint_inference import JointCall
 
-WINDOW_S = (
-    0.005  # that a batch waits for requests that are being read; a batch of 16 takes several times that
-)
+# Of waiting for requests that are being read; a batch of 16 takes several times that.
+WINDOW_S = 0.005
 
 
 class DynamicBatcher:
