@@ -19,35 +19,52 @@ def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        is_temporary = temporary is not None and str(error.filename).startswith(str(temporary))
+        names = (str(error.filename), str(error.filename2))  # of a copy the second is what is written
+        is_temporary = temporary is not None and any(name.startswith(str(temporary)) for name in names)
         if not error.errno or (error.filename is not None and not is_temporary):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """Write a file under a temporary name and rename it when the block succeeds.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Let a library write a file under a temporary name, and rename it when the block succeeds.
 
-    An exception leaves nothing, a crash a hidden `.tmp` file. The folder must exist.
+    An exception leaves nothing, a crash a hidden `.tmp` file, which the next writer of that name deletes. The
+    folder must exist.
 
     Args:
         path: Final name; an existing file is replaced atomically.
 
     Yields:
-        The file, open for writing bytes.
+        The temporary name.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    remove_stale(path.parent, path.name)
     try:
         with naming(path, temporary):
-            with open(temporary, "wb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
+            yield temporary
+            sync_file(temporary)
             os.replace(temporary, path)
-            _sync_folder(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+            sync_folder(path.parent)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def atomic_write(path: Path) -> Iterator[BinaryIO]:
+    """Write a file as `atomic_path` does.
+
+    Args:
+        path: Final name; its folder must exist.
+
+    Yields:
+        The file, open for writing bytes.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        yield file
 
 
 def atomic_write_file(path: Path, content: bytes | str) -> Path:
@@ -85,17 +102,17 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     remove_stale(path.parent, path.name)
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
     try:
         with naming(path, temporary):
+            temporary.mkdir()
             yield temporary
-            _sync_files(temporary)
+            sync_files(temporary)
             backup = _backup_path(path)
             if path.exists():
                 shutil.rmtree(backup, ignore_errors=True)
                 os.replace(path, backup)
             os.replace(temporary, path)
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
             shutil.rmtree(backup, ignore_errors=True)
     finally:
         restore_folder(path)
@@ -126,7 +143,8 @@ def remove_stale(folder: Path, name: str | None = None) -> None:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 def process_runs(process_id: int) -> bool:
@@ -144,14 +162,20 @@ def _backup_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.old")
 
 
-def _sync_files(folder: Path) -> None:
+def sync_file(file: Path) -> None:
+    """Wait until the content of a file is on the disk."""
+    with open(file, "rb+") as stream:
+        os.fsync(stream.fileno())
+
+
+def sync_files(folder: Path) -> None:
+    """Wait until the content of all files below a folder is on the disk."""
     for file in folder.rglob("*"):
         if file.is_file():
-            with open(file, "rb+") as stream:
-                os.fsync(stream.fileno())
+            sync_file(file)
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Make a rename durable, on POSIX systems."""
     if os.name != "posix":
         return

@@ -135,8 +135,8 @@ def folder_lock(folder: Path, part: Part | None = None, *, timeout_s: float = 0.
 
 
 def is_lock_file(path: Path) -> bool:
-    """Whether a file belongs to a lock rather than to the content of its folder."""
-    return path.name == LOCK_NAME or path.name.startswith(f"{LOCK_NAME}.")
+    """Whether a file belongs to a lock, perhaps one that was being taken, and not to the folder's content."""
+    return path.name == LOCK_NAME or path.name.startswith((f"{LOCK_NAME}.", f".{LOCK_NAME}."))
 
 
 def _acquire(path: Path, own: Owner) -> int:

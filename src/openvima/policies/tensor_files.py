@@ -33,6 +33,7 @@ _OPCODES = (OPCODES | {"BINPERSID"}) - {"STACK_GLOBAL"}
 _GLOBALS = re.compile(
     r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch(\.storage)? \w+Storage"
 )
+_SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")  # in messages of safetensors
 # Layouts from the specification of the format (APPNOTE 6.3.9): end record, and its 64-bit form before a
 # pointer of 20 bytes to that.
 _END, _END_64, _POINTER_64_BYTES = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q"), 20
@@ -94,14 +95,16 @@ def write_safetensors(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
     """Write a safetensors file, readable for whoever the umask allows; safetensors makes it private.
 
     Raises:
-        StorageError: It cannot be written, for example because the disk is full.
+        OSError: It cannot be written, for example because the disk is full.
     """
     try:
         with file.open("wb") as stream:
             mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
         save_file(dict(tensors), file)
         file.chmod(mode)
-    except (OSError, SafetensorError) as error:
+    except SafetensorError as error:
+        if found := _SYSTEM_ERROR.search(str(error)):
+            raise OSError(int(found[1]), os.strerror(int(found[1])), str(file)) from error
         raise StorageError(f"{file} cannot be written ({_reason(error)}). {FREE_SPACE}") from error
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 import yaml
 
-from openvima.atomic_io import atomic_write_file, naming, remove_stale
+from openvima.atomic_io import atomic_write_file, naming, remove_stale, sync_file, sync_files, sync_folder
 from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.folder_lock import folder_lock, is_lock_file
 from openvima.input_files import read_json, read_yaml
@@ -135,21 +135,24 @@ class RunFolder:
             state: Weights and optimizer state.
             progress: Progress of the run.
         """
+        final = self.checkpoints / name
         partial = self.checkpoints / f"{name}{_PARTIAL}"
         shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
-        learner.write(partial, state.weights)
-        tensors = {
-            f"{parameter}|{name}": tensor.detach().cpu().contiguous()
-            for parameter, values in state.optimizer.items()
-            for name, tensor in values.items()
-        }
-        write_safetensors(tensors, partial / OPTIMIZER_FILE)
-        progressed = {field: getattr(progress, field) for field in Progress.__slots__}
-        atomic_write_file(partial / STATE_FILE, json.dumps(progressed))
-        final = self.checkpoints / name
-        shutil.rmtree(final, ignore_errors=True)
-        partial.rename(final)
+        with naming(final, partial):
+            partial.mkdir()
+            learner.write(partial, state.weights)
+            tensors = {
+                f"{parameter}|{name}": tensor.detach().cpu().contiguous()
+                for parameter, values in state.optimizer.items()
+                for name, tensor in values.items()
+            }
+            write_safetensors(tensors, partial / OPTIMIZER_FILE)
+            progressed = {field: getattr(progress, field) for field in Progress.__slots__}
+            atomic_write_file(partial / STATE_FILE, json.dumps(progressed))
+            self._sync(partial)
+            shutil.rmtree(final, ignore_errors=True)
+            partial.rename(final)
+            sync_folder(self.checkpoints)
         self._note_best(progress)
         for other in self.checkpoints.iterdir():
             is_used = other.name in (name, progress.best_checkpoint) or self._is_kept(other.name)
@@ -203,6 +206,12 @@ class RunFolder:
             if (values["stage"], values["step"]) <= (progress.stage, progress.step)
         ]
         atomic_write_file(file, "".join(kept))
+
+    def _sync(self, checkpoint: Path) -> None:
+        """Wait until a checkpoint and the metrics of the steps before it are on the disk."""
+        sync_files(checkpoint)
+        if (self.path / METRICS_FILE).exists():
+            sync_file(self.path / METRICS_FILE)
 
     def _note_best(self, progress: Progress) -> None:
         if progress.best_checkpoint:

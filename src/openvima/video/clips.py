@@ -61,7 +61,7 @@ def save_clips(clips: Sequence[Clip], folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     records = []
     for clip in clips:
-        (folder / clip.file_name).write_bytes(clip.video)
+        atomic_write_file(folder / clip.file_name, clip.video)
         record = asdict(clip)
         del record["video"]
         record["prompt"] = [part if isinstance(part, str) else {"png": _text(part)} for part in clip.prompt]

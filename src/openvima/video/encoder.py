@@ -1,13 +1,13 @@
 """H.264 encoding in MP4 files with PyAV, which is imported on first use. Equal frames give equal bytes."""
 
 import contextlib
-import os
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from openvima.atomic_io import atomic_path
 from openvima.errors import ShapeError
 from openvima.extras import import_extra
 
@@ -70,9 +70,11 @@ class VideoWriter:
             raise ShapeError(f"a video of {width} × {height} pixels cannot be encoded; both must be even.")
         self._av = import_av()  # before a folder is made
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._path, self._partial = path, path.with_name(f".{path.name}.{os.getpid()}.tmp")
         self._shape = (height, width, 3)
-        self._container, self._stream = open_video(self._partial, frames_per_second)
+        with contextlib.ExitStack() as closing:
+            partial = closing.enter_context(atomic_path(path))
+            self._container, self._stream = open_video(partial, frames_per_second)
+            self._closing = closing.pop_all()
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         # x264's macroblock tree gave other bytes in about 1 of 200 equal runs, in one thread as well
         self._stream.options = {"crf": _CRF, "preset": "medium", "threads": "1", "x264-params": "mbtree=0"}
@@ -101,11 +103,11 @@ class VideoWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
+        if kind is not None:
+            with contextlib.suppress(OSError):  # a container without frames cannot be finished
+                self._container.close()
+            self._closing.__exit__(kind, error, trace)
+            return
+        with self._closing:
             self._container.mux(self._stream.encode(None))
             self._container.close()
-            os.replace(self._partial, self._path)
-            return
-        with contextlib.suppress(OSError):  # a container without frames cannot be finished
-            self._container.close()
-        self._partial.unlink(missing_ok=True)
