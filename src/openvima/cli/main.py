@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -86,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if words[0] not in VERBS:
         return _fail(unknown_name("verb", words[0], VERBS), 2)
-    with _warnings_in_one_line():
+    with _warnings_in_one_line(), _failed_threads_in_one_line():
         return _run(words[0], words[1:])
 
 
@@ -162,6 +163,24 @@ def _warnings_in_one_line() -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = shown
+
+
+@contextmanager
+def _failed_threads_in_one_line() -> Iterator[None]:
+    """Print what the system refused to a thread of a library, such as to write, without its traceback."""
+    shown = threading.excepthook
+
+    def show(failure: threading.ExceptHookArgs) -> None:
+        if isinstance(failure.exc_value, OSError | MemoryError):
+            _fail(f"{failure.exc_type.__name__}: {failure.exc_value}", 0)
+        else:
+            shown(failure)
+
+    threading.excepthook = show
+    try:
+        yield
+    finally:
+        threading.excepthook = shown
 
 
 def _fail(message: str, status: int) -> int:
