@@ -115,11 +115,12 @@ class RunFolder:
             )
         if differing:
             self._clear()
+        # First, since a folder without it, perhaps of a run that was killed at once, is refused.
+        atomic_write_file(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
         self.checkpoints.mkdir(parents=True, exist_ok=True)
         for leftover in self.checkpoints.glob(f"*{_PARTIAL}"):
             shutil.rmtree(leftover)
         remove_stale(self.checkpoints)
-        atomic_write_file(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
 
     def latest(self) -> Path | None:
         """Return the last complete checkpoint, or None."""
