@@ -10,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 import pyarrow as pa
 
+from openvima.atomic_io import NO_SPACE
 from openvima.data.checksums import Envelope, spans_of
 from openvima.data.hash_split import split_hashes
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
@@ -237,6 +238,8 @@ def open_object_cache(
         try:
             target.mkdir(parents=True, exist_ok=True)
         except OSError as error:
+            if error.errno in NO_SPACE:
+                raise
             raise DatasetError(
                 f"cannot write the object cache to {target}: {error.strerror}. Name another folder."
             ) from None
