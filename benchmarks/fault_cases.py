@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from unittest.mock import patch
@@ -197,8 +198,8 @@ def _small_pack() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _small_quickstart() -> Iterator[None]:
-    """One task, one level, one baseline and two steps of training."""
-    from openvima import training
+    """One task, one level, one baseline, a step of training and no videos."""
+    from openvima import report, training
     from openvima.cli import quickstart
     from openvima.training import TrainingConfig
 
@@ -206,8 +207,10 @@ def _small_quickstart() -> Iterator[None]:
         small = {"schedule.steps": 1, "loader.batch_size": 2, "runtime.threads": 1, "pretraining.steps": 0}
         return TrainingConfig.of({"data": data, "out": out, "seed": seed, "preset": "tiny", **small})
 
+    evaluate, no_videos = report.evaluate_and_report, report.VideoSelection(0)
     with (
         _tiny_networks(),
+        patch.object(report, "evaluate_and_report", partial(evaluate, videos=no_videos)),
         patch.multiple(quickstart, TASKS=("rotate",), LEVELS=("L1",), BASELINES=("oracle",)),
         patch.object(training, "TrainingConfig", config),
     ):

@@ -211,6 +211,7 @@ def _serve(process: int, listener: int | None, decide: Decide, root: Path, deadl
             raise TimeoutError("it did not end")
         if process in ready:
             return
+        assert listener is not None
         notice = bytearray(_NOTICE.size)
         try:
             fcntl.ioctl(listener, _RECEIVE, notice)

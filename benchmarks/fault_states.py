@@ -270,7 +270,7 @@ def _image(content: bytes) -> None:
 def _video(content: bytes) -> None:
     import av
 
-    with av.open(io.BytesIO(content)) as video:
+    with av.open(io.BytesIO(content), "r") as video:
         assert sum(1 for _ in video.decode(video=0)), "no frames"
 
 

@@ -12,6 +12,7 @@ from fault_campaign import KINDS
 from fault_cases import CASES, READ_ONLY
 
 ROOT = Path(__file__).parents[1]
+MAX_WORDS = 10  # of a command that is shown whole
 PAGE = ROOT / "docs" / "reliability.md"
 _HERE = "the faults below"
 # Promise, and where it is tested.
@@ -135,7 +136,10 @@ def _places(places: tuple[str, ...]) -> str:
 
 def _row(case: dict[str, Any]) -> str:  # Any: JSON
     cells = [_cell(case["kinds"].get(kind)) for kind in KINDS]
-    named = [f"`{case['case']}`", case["calls"], case["points"], *cells, case["states"]]
+    words = case["case"].split()
+    if len(words) > MAX_WORDS:
+        words = [*words[:3], "…", *words[-3:]]
+    named = [f"`{' '.join(words)}`", case["calls"], case["points"], *cells, case["states"]]
     return f"| {' | '.join(map(str, named))} |"
 
 

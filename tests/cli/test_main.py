@@ -202,38 +202,3 @@ def test_what_a_message_quotes_cannot_steer_the_terminal(
     shown = capsys.readouterr().err.strip()
     assert shown.isprintable()
     assert len(shown) < 5000
-
-
-FULL_DISK = """
-import resource, sys
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
-from openvima.cli.main import main
-sys.exit(main(sys.argv[2:]))
-"""
-VERB_WORDS = {
-    "generate": "--tasks rotate --episodes 20 --out {out}",
-    "evaluate": "--policy oracle --tasks rotate --levels L1 --episodes 40 --out {out}",
-    "demo": "rotate --out {out}/video.mp4",
-    "train": "--data {data} --preset nano --schedule.steps 2 --pretraining.steps 0 --out {out}",
-    "data": "export-lerobot {data} {out}",
-    "quickstart": "--demonstrations 4 --episodes 2 --out {out}",
-}
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="the system does not limit the size of files")
-@pytest.mark.parametrize("verb", VERB_WORDS)
-def test_a_full_disk_ends_every_verb_with_one_line(verb: str, tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    assert main(["generate", "--tasks", "rotate", "--episodes", "30", "--out", str(data)]) == 0
-    words = VERB_WORDS[verb].format(out=tmp_path / "out", data=data).split()
-    # Files end at 6 kB: enough for locks and configs, too little for data, weights, results and videos.
-    ended = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, "6000", verb, *words], capture_output=True, text=True, check=False
-    )
-    lines = [line for line in ended.stderr.splitlines() if line.startswith("openvima: ")]
-    assert ended.returncode == 1, ended.stderr
-    assert len(lines) == 1
-    assert str(tmp_path) in lines[0]
-    assert "Free space" in lines[0] or "Make room" in lines[0]
-    assert "Traceback" not in ended.stderr
