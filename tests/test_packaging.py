@@ -16,8 +16,7 @@ POLICY_FILES = {
     "MODEL_CARD.md",
     "training_data.json",
     *(
-        f"training/{part}{name}"
-        for part in ("", "pretraining/")
+        f"training/{name}"
         for name in ("config.yaml", "metrics.jsonl", "sessions_log.jsonl", "timings_log.jsonl")
     ),
 }
