@@ -184,8 +184,6 @@ def _pair_table(pairs: Sequence[tuple[str, str]]) -> str:
 
 def main() -> None:
     """Ship weights, or write record, figures and tables of evaluations."""
-    from sim import circumstances
-
     folder = BUNDLED[SMALL].folder
     default = [Path("README.md"), Path("docs/openvima_small.md"), BUNDLED[SMALL].model_card]
     raw = argparse.RawDescriptionHelpFormatter
@@ -208,6 +206,8 @@ def main() -> None:
             print(f"{folder}: weights {weights_hash(folder)[:12]} of {given.run}")
         if given.scores is None:
             return
+        from sim import circumstances
+
         findings = find(given.scores, weights_hash(folder))
         evaluation = given.failures or given.scores / "default"
         if not (evaluation / ACTIONS_NAME).is_file():
