@@ -122,8 +122,8 @@ def works(episodes: int) -> dict[str, Work]:
         ),
         "study": Work(
             ("study", f"{Path(__file__).resolve()}:study", "--seeds", "2"),
-            ("*/results.json", "*/*/results.json", "**/checkpoints/*/model.safetensors"),
-            ("study.json",),
+            ("**/results.json", "**/model.safetensors"),
+            ("**/results.json", "**/model.safetensors"),  # study.json also has times
         ),
     }
 
