@@ -122,7 +122,7 @@ def works(episodes: int) -> dict[str, Work]:
         ),
         "study": Work(
             ("study", f"{Path(__file__).resolve()}:study", "--seeds", "2"),
-            ("**/results.json", "**/model.safetensors"),
+            ("**/results.json", "**/checkpoints/*[0-9]/model.safetensors"),
             ("**/results.json", "**/model.safetensors"),  # study.json also has times
         ),
     }
