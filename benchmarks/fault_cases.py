@@ -125,8 +125,8 @@ def import_everything(*, with_torch: bool = True) -> None:
 @contextlib.contextmanager
 def _tiny_networks() -> Iterator[None]:
     """Presets of narrow networks."""
+    import small_networks
     from openvima.detector import config as detectors
-    from openvima.detector.config import BackboneConfig, DetectorConfig
     from openvima.policies import presets
     from openvima.policies.nn.conv_encoder import ConvConfig
 
@@ -137,15 +137,7 @@ def _tiny_networks() -> Iterator[None]:
         prompt=replace(nano.prompt, text=replace(nano.prompt.text, num_layers=1)),
         decoder=replace(nano.decoder, width=32, num_layers=1, num_self_heads=2, num_cross_heads=2),
     )
-    backbone = BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8)
-    detector = DetectorConfig(
-        backbone,
-        (32.0,),
-        box_head_widths=(8,),
-        mask_head_widths=(8,),
-        rpn_post_nms_top_n=4,
-        rpn_pre_nms_top_n=8,
-    )
+    detector = small_networks.one_level_detector()
     with (
         patch.dict(presets.PRESETS, {"tiny": lambda: tiny, "nano": lambda: tiny}),
         patch.dict(detectors.DETECTORS, {"small": lambda: detector}),

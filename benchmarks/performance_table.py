@@ -20,6 +20,7 @@ The date is that of the file's name. Rows are in the order of the files, then of
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -95,15 +96,15 @@ def page(results: Path) -> str:
     return HEAD + "".join(f"{row.cells(file)}\n" for row, file in read_rows(results).values())
 
 
-def main() -> None:
-    """Write the page."""
+def write_page(about: str | None, page: Callable[[Path], str], out: Path) -> None:
+    """Run a command that writes a page which is made from a folder of results."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser = argparse.ArgumentParser(description=about, formatter_class=raw)
     parser.add_argument("--results", type=Path, default=ROOT / "results", help="folder of results")
-    parser.add_argument("--out", type=Path, default=PAGE, help="file to write")
+    parser.add_argument("--out", type=Path, default=out, help="file to write")
     options = parser.parse_args()
     options.out.write_text(page(options.results), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    write_page(__doc__, page, PAGE)

@@ -3,13 +3,13 @@
 python benchmarks/reliability_page.py [--results DIR] [--out FILE]
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 from fault_campaign import KINDS
 from fault_cases import CASES, READ_ONLY
+from performance_table import write_page
 
 ROOT = Path(__file__).parents[1]
 MAX_WORDS = 10  # of a command that is shown whole
@@ -150,15 +150,5 @@ def _cell(count: dict[str, int] | None) -> str:
     return f"{count['harmless']} + {count['resumed']}{failed}"
 
 
-def main() -> None:
-    """Write the page."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--results", type=Path, default=ROOT / "results", help="folder of results")
-    parser.add_argument("--out", type=Path, default=PAGE, help="file to write")
-    options = parser.parse_args()
-    options.out.write_text(page(options.results), encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    write_page(__doc__, page, PAGE)

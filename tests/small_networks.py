@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from openvima.detector.config import BackboneConfig, DetectorConfig
 from openvima.policies.nn.conv_encoder import ConvConfig
 from openvima.policies.pointer.config import CorrespondenceConfig, PointerConfig, small
 
@@ -19,4 +20,16 @@ def narrow_small(width: int = 32, crop_width: int = 4) -> PointerConfig:
         head=replace(sizes.head, hidden_width=32),
         correspondence=CorrespondenceConfig(hidden_width=32),
         attributes=None,
+    )
+
+
+def one_level_detector() -> DetectorConfig:
+    """Sizes of a detector that trains in moments."""
+    return DetectorConfig(
+        BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8),
+        (32.0,),
+        box_head_widths=(8,),
+        mask_head_widths=(8,),
+        rpn_post_nms_top_n=4,
+        rpn_pre_nms_top_n=8,
     )

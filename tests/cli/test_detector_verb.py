@@ -14,9 +14,10 @@ from openvima.cli.main import main  # noqa: E402
 from openvima.data import GenerateConfig, generate  # noqa: E402
 from openvima.detector import config as sizes  # noqa: E402
 from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
-from openvima.detector.config import BackboneConfig, DetectorConfig  # noqa: E402
+from openvima.detector.config import DetectorConfig  # noqa: E402
 from openvima.detector.network import MaskRCNN  # noqa: E402
 from openvima.policies.devices import torch_threads  # noqa: E402
+from small_networks import one_level_detector  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -27,15 +28,7 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def tiny() -> DetectorConfig:
-    backbone = BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8)
-    return DetectorConfig(
-        backbone,
-        (32.0,),
-        box_head_widths=(8,),
-        mask_head_widths=(8,),
-        rpn_post_nms_top_n=4,
-        rpn_pre_nms_top_n=8,
-    )
+    return one_level_detector()
 
 
 @pytest.fixture
