@@ -142,11 +142,11 @@ class DetectorConfig:
 def small() -> DetectorConfig:
     """0.96 M parameters, for frames of 128 × 256 pixels; trains from scratch within an hour on two cores."""
     backbone = BackboneConfig(
-        block="basic", depths=(1, 1, 1), widths=(32, 64, 128), stem_width=16, stem_kernel=5, fpn_width=64
+        block="basic", depths=(1, 1, 1), widths=(32, 64, 128), stem_width=16, stem_kernel=5, fpn_width=32
     )
     # Half of the objects are 22 to 25 pixels high and 24 to 26 wide. With these sizes 13 anchors per object
     # have an IoU of 0.5; with 16, 32 and 64 it was 5.5.
-    return DetectorConfig(backbone, anchor_sizes=(20.0, 28.0, 60.0))
+    return DetectorConfig(backbone, anchor_sizes=(20.0, 28.0, 60.0), mask_head_widths=(32, 32))
 
 
 def resnet50() -> DetectorConfig:
