@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from openvima.atomic_io import naming
 from openvima.catalog.packs import load_assets
 from openvima.data.checksums import spans_of
 from openvima.data.generation import finish
@@ -231,9 +232,10 @@ def _check_bytes(written: Path, place: Path, sha256: str | None) -> None:
 def _staging(folder: Path) -> Iterator[Path]:
     staging = folder / _STAGING
     shutil.rmtree(staging, ignore_errors=True)  # of a repair that was killed
-    staging.mkdir()
     try:
-        yield staging
+        with naming(folder, staging):
+            staging.mkdir()
+            yield staging
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 
