@@ -23,7 +23,7 @@ def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
         is_temporary = temporary is not None and any(name.startswith(str(temporary)) for name in names)
         if not error.errno or (error.filename is not None and not is_temporary):
             raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error  # libraries add names
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """Anchor boxes of a feature pyramid."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 
@@ -26,8 +27,9 @@ def cell_anchors(size: float) -> torch.Tensor:
     return torch.cat([-halves, halves], dim=1)
 
 
+@lru_cache(maxsize=64)
 def level_anchors(size: float, *, stride: int, height: int, width: int) -> torch.Tensor:
-    """Return all anchors of one pyramid level.
+    """Return all anchors of one pyramid level; the tensor is shared between calls.
 
     Args:
         size: As for `cell_anchors`.

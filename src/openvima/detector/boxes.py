@@ -7,6 +7,8 @@ import math
 
 import torch
 
+from openvima.detector.kernels import suppress
+
 MAX_LOG_SCALE = math.log(1000 / 16)  # of one regression step, as in Detectron2; keeps exp from overflowing
 
 Weights = tuple[float, float, float, float]
@@ -74,10 +76,6 @@ def decode_boxes(deltas: torch.Tensor, references: torch.Tensor, weights: Weight
 def nms(boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float) -> torch.Tensor:
     """Apply greedy non-maximum suppression; of equal scores the first wins.
 
-    All pairs are compared at once: boxes that a kept box suppresses are removed until nothing changes. Each
-    round settles at least the best unsettled box, so the result is that of the sequential algorithm. A few
-    rounds suffice in practice.
-
     Args:
         boxes: Shape (N, 4).
         scores: Shape (N,).
@@ -87,14 +85,8 @@ def nms(boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float) -> torc
         Indices of the kept boxes by descending score, shape (K,), int64.
     """
     order = scores.argsort(descending=True, stable=True)
-    boxes = boxes[order]
-    suppresses = (box_iou(boxes, boxes) > iou_threshold).triu(diagonal=1)  # row suppresses column
-    kept = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-    while True:
-        now = ~suppresses[kept].any(dim=0)
-        if torch.equal(now, kept):
-            return order[kept]
-        kept = now
+    best_first = boxes.detach()[order].double().cpu().numpy()
+    return order[torch.from_numpy(suppress(best_first, iou_threshold)).to(order.device)]
 
 
 def _centres_and_sizes(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
