@@ -33,4 +33,4 @@ def test_it_finds_the_objects_of_scenes_and_prompts(task: str) -> None:
             num_right += len(match_ids_to_slots(found, true))
             num_found += len(found)
     assert num_right >= 0.95 * num_true
-    assert num_found <= 1.25 * num_true  # split objects and false positives
+    assert num_found <= 1.5 * num_true  # split objects and false positives

@@ -105,7 +105,7 @@ def show(
     level: str | None = None,
     frames: int = 12,
     prompt_prob: float = 0.25,
-    score: float = 0.5,
+    score: float = 0.1,
     seed: int = 0,
 ) -> int:
     """Draw detections: masks, boxes and scores; ground-truth boxes are dashed.
@@ -119,7 +119,7 @@ def show(
         level: train, L1, L2, L3 or L4, instead of --data; by default L3, with novel objects and textures.
         frames: Number of images, rounded up to pairs of views.
         prompt_prob: Probability of a prompt image instead of an observation.
-        score: Least score of the detections that are drawn.
+        score: Least score of the detections that are drawn; by default all that a policy gets.
         seed: Seed of the image sampling; also the first seed of generated episodes.
 
     Returns:

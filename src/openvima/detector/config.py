@@ -140,7 +140,7 @@ class DetectorConfig:
 
 
 def small() -> DetectorConfig:
-    """0.96 M parameters, for frames of 128 × 256 pixels; trains from scratch within an hour on two cores."""
+    """0.57 M parameters, for frames of 128 × 256 pixels; trains from scratch within an hour on two cores."""
     backbone = BackboneConfig(
         block="basic", depths=(1, 1, 1), widths=(32, 64, 128), stem_width=16, stem_kernel=5, fpn_width=32
     )

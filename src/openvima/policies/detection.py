@@ -159,13 +159,14 @@ class DetectedObjects:
 
     Args:
         detector: The detector.
-        min_score: Detections with a lower score are dropped.
+        min_score: Detections with a lower score are dropped. The default is low, since a missed object costs a
+            policy more than a false one: docs/detector.md has measurements.
         prompt_extractor: Extractor of prompt images, for detectors that are not trained on them;
             `GROUND_TRUTH`, for example.
     """
 
     detector: Detector
-    min_score: float = field(default=0.5, kw_only=True)
+    min_score: float = field(default=0.1, kw_only=True)
     prompt_extractor: ObjectExtractor | None = field(default=None, kw_only=True)
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
