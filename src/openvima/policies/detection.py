@@ -159,8 +159,8 @@ class DetectedObjects:
 
     Args:
         detector: The detector.
-        min_score: Detections with a lower score are dropped. The default is low, since a missed object costs a
-            policy more than a false one: docs/detector.md has measurements.
+        min_score: Detections with a lower score are dropped. The default is low, since a missed object
+            costs a policy more than a false one: docs/detector.md has measurements.
         prompt_extractor: Extractor of prompt images, for detectors that are not trained on them;
             `GROUND_TRUTH`, for example.
     """
