@@ -2,18 +2,22 @@
 
 import asyncio
 import threading
+import time
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Executor, Future
 from functools import partial
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 from openvima.serving.session import Calls, PolicyCall, Session
 
 if TYPE_CHECKING:
     from openvima.policies.joint_inference import JointCall
 
-# Of waiting for requests that are being read; a batch of 16 takes several times that.
-WINDOW_S = 0.005
+# Of waiting for the other clients, which are those that asked within the last second. A client that was just
+# answered needs a few ms for its next request, and a batch of 16 takes ten times the window.
+WINDOW_S = 0.01
+ACTIVE_S = 1.0
 
 
 class DynamicBatcher:
@@ -36,7 +40,7 @@ class DynamicBatcher:
         self._readers, self._computing = readers, computing
         self._max_batch = max_batch
         self._changed = threading.Condition()
-        self._num_reading = 0
+        self._last_asked_s: WeakKeyDictionary[Session, float] = WeakKeyDictionary()
         self._arrived: list[WaitingRequest] = []
         self._waiting: list[WaitingRequest] = []  # those that have waited longest come first
 
@@ -47,20 +51,17 @@ class DynamicBatcher:
             The answer, which is to be awaited, or a refusal. The message is no longer needed.
         """
         loop = asyncio.get_running_loop()
-        self._num_reading += 1
-        requests: list[WaitingRequest] = []
-        try:
-            calls = await loop.run_in_executor(self._readers, session.read, data)
-            if isinstance(calls, str):
-                return calls
-            requests = [WaitingRequest(session, calls, is_joint=self._max_batch > 1)]
-        finally:
-            with self._changed:
-                self._num_reading -= 1
-                self._arrived += requests
-                self._changed.notify()
+        with self._changed:
+            self._last_asked_s[session] = time.monotonic()
+        calls = await loop.run_in_executor(self._readers, session.read, data)
+        if isinstance(calls, str):
+            return calls
+        request = WaitingRequest(session, calls, is_joint=self._max_batch > 1)
+        with self._changed:
+            self._arrived.append(request)
+            self._changed.notify()
         self._computing.submit(self._run)
-        return asyncio.wrap_future(requests[0].reply)
+        return asyncio.wrap_future(request.reply)
 
     def _run(self) -> None:
         """Compute batches until no request waits. It runs for each request, and may find none."""
@@ -69,13 +70,14 @@ class DynamicBatcher:
             self._gather(self._compute_batch())
 
     def _gather(self, unfinished: "Sequence[WaitingRequest]") -> None:
-        """Take the requests that have arrived, and some behind them; wait a little if more are being read."""
+        """Take the requests that have arrived, and some behind them; wait a little for other clients."""
         self._take_arrived()
         if count := len(self._waiting) + len(unfinished):
+            since_s = time.monotonic() - ACTIVE_S
             with self._changed:
-                self._changed.wait_for(
-                    lambda: not self._num_reading or count + len(self._arrived) >= self._max_batch, WINDOW_S
-                )
+                num_active = sum(asked_s > since_s for asked_s in self._last_asked_s.values())
+                full = min(num_active, self._max_batch)
+                self._changed.wait_for(lambda: count + len(self._arrived) >= full, WINDOW_S)
             self._take_arrived()
         self._waiting += unfinished
 
