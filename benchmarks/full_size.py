@@ -32,6 +32,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from openvima.data import Dataset
+from openvima.tasks import list_tasks, task_spec
 from sim import circumstances
 
 INTERVAL_S = 2.0  # between two samples of memory
@@ -141,7 +142,8 @@ def measure(options: argparse.Namespace) -> Entry:
     """Run all commands that have no record in the folder yet."""
     folder, episodes, workers = options.folder, options.episodes, ["--workers", str(options.workers)]
     folder.mkdir(parents=True, exist_ok=True)
-    record = folder / "record.json"
+    tasks = sum("train" in task_spec(task).levels for task in list_tasks())
+    more, record = episodes + max(episodes // 100, 1), folder / "record.json"
     entries: Entry = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
 
     def step(name: str, work: Callable[[], Entry], *, gone: Sequence[str] = ()) -> None:
@@ -154,23 +156,23 @@ def measure(options: argparse.Namespace) -> Entry:
         for each in gone:
             shutil.rmtree(folder / each, ignore_errors=True)
 
-    def command(*arguments: str, out: str = "", count: int = 0) -> Callable[[], Entry]:
+    def command(*arguments: str, out: str = "", count: int = more) -> Callable[[], Entry]:
         def work() -> Entry:
             entry = run(["openvima", *arguments, *workers], folder)
-            entry["count"] = count or entries["read"]["whole"]["episodes"]
+            entry["count"] = count * tasks
             return entry | ({"mb": round(size_mb(folder / out), 1)} if out else {})
 
         return work
 
     def generate(number: int, new: int) -> Callable[[], Entry]:
         arguments = ["generate", "--tasks", "all", "--episodes", str(number), "--out", "demos"]
-        return command(*arguments, out="demos", count=new * len(TRAINING_TASKS))
+        return command(*arguments, out="demos", count=new)
 
     train = ["train", "--data", "merged", "--preset", "nano", "--pretraining.steps", "0"]
     train += ["--schedule.steps", str(options.steps), "--out", "run"]
-    step("generate", generate(episodes))
-    step("verify", command("data", "verify", "demos"))
-    step("extend", generate(episodes + episodes // 100))
+    step("generate", generate(episodes, episodes))
+    step("verify", command("data", "verify", "demos", count=episodes))
+    step("extend", generate(more, more - episodes))
     step("sample", command("data", "sample", "demos", "sample", "--fraction", "0.1", out="sample"))
     step("read", lambda: reading(folder / "sample", folder / "demos"), gone=["sample"])
     parts = "training=0.9,validation=0.1"
@@ -178,7 +180,7 @@ def measure(options: argparse.Namespace) -> Entry:
     sources = ["parts/training", "parts/validation"]
     step("merge", command("data", "merge", *sources, "merged", out="merged"), gone=["parts"])
     step("preprocess", command("data", "preprocess", "merged", out="merged/object_cache"))
-    step("train", lambda: run(["openvima", *train, "--out", "run"], folder))
+    step("train", lambda: run(["openvima", *train], folder) | {"count": options.steps})
     return entries
 
 
@@ -222,16 +224,17 @@ def report(result: Entry, figure: str) -> str:
         found = [rate for _, rate in rates(entry)]
         cells = [f"{value:,.1f}" for value in (found[0], found[-1])] if found else ["", ""]
         written = f"{entry['mb'] / 1024:.1f}" if "mb" in entry else ""
+        rate, most = entry["count"] / entry["seconds"], max(value for _, value in entry["memory_mb"])
         lines.append(
-            f"| `{entry['command']}` | {entry['seconds'] / 60:.1f} | {entry['count'] / entry['seconds']:,.1f} | "
-            f"{' | '.join(cells)} | {max(value for _, value in entry['memory_mb']):,.0f} | "
-            f"{written} |"
+            f"| `{entry['command']}` | {entry['seconds'] / 60:.1f} | {rate:,.1f} | {' | '.join(cells)} "
+            f"| {most:,.0f} | {written} |"
         )
     read = result["entries"]["read"]
     lines += [
         "",
-        "Episodes per second, for `train` steps. Rates of the first and last tenth of the work come from the lines of progress. Memory is the most "
-        "that a command and its children had together, without mapped files.",
+        "Episodes per second, for `train` steps. Rates of the first and last tenth of the work come from the "
+        "lines of progress. Memory is the most that a command and its children had together, without mapped "
+        "files.",
         "",
         "| reading | episodes | opening, s | a whole episode at random, ms |",
         "|---|---:|---:|---:|",
