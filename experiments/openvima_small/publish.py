@@ -32,7 +32,7 @@ from openvima.report.typesetting import Line, Table, markdown
 from tables import tables
 from weights import facts, settings, ship, shipped
 
-OUT = Path("results/2026-11-23_small_4")
+OUT = Path("results/2026-11-24_small")
 IMAGES = Path("docs/images")
 MARK = "<!-- small:{name} -->"
 END = "<!-- /small:{name} -->"
