@@ -149,10 +149,11 @@ def measure(options: argparse.Namespace) -> Entry:
     def step(name: str, work: Callable[[], Entry], *, gone: Sequence[str] = ()) -> None:
         if name not in entries:
             print(name, flush=True)
-            entries[name] = work()
+            entry = work()
+            if entry.get("status", 0):
+                raise SystemExit("\n".join(entry["output"]))
+            entries[name] = entry
             record.write_text(json.dumps(entries), encoding="utf-8")
-            if entries[name].get("status", 0):
-                raise SystemExit("\n".join(entries[name]["output"]))
         for each in gone:
             shutil.rmtree(folder / each, ignore_errors=True)
 
