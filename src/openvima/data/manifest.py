@@ -383,7 +383,8 @@ def _index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
         "num_bytes": pa.array([span.num_bytes for span in spans], pa.int32()),
         "crc32": pa.array([span.crc32 for span in spans], pa.uint32()),
     }
-    return pa.table([columns[column] for column in INDEX_SCHEMA.names], schema=INDEX_SCHEMA)
+    rows = pa.table([columns[column] for column in INDEX_SCHEMA.names], schema=INDEX_SCHEMA)
+    return rows.combine_chunks()  # of one row each, which take several kB more
 
 
 def _sum(table: pa.Table, column: str) -> int:
