@@ -124,8 +124,9 @@ def reading(sample: Path, whole: Path) -> Entry:
 
 def rates(entry: Entry) -> list[tuple[float, float]]:
     """Return the middle of each tenth of a command's work, in seconds, and its rate in `count` per second."""
-    marks = [(at_s, done) for at_s, done, whole in entry["progress"] if whole == entry["progress"][-1][2]]
-    if len(marks) < 2 or marks[-1][1] == marks[0][1]:
+    longest = max((whole for *_, whole in entry["progress"]), default=0)  # `verify` has a second count
+    marks = [(at_s, done) for at_s, done, whole in entry["progress"] if whole == longest]
+    if len(marks) < 3 or marks[-1][1] == marks[0][1]:  # two lines give no course
         return []
     times, done = np.array(marks, float).T
     done *= entry["count"] / marks[-1][1]  # commands count episodes, shards or steps
@@ -249,6 +250,23 @@ def report(result: Entry, figure: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+def performance(result: Entry) -> list[Entry]:
+    """Return the figures that belong in docs/performance.md."""
+    entries = result["entries"]
+    whole, size = entries["read"]["whole"], f"{result['episodes']:,} demonstrations"
+    rates = [
+        (name, round(entries[name]["count"] / entries[name]["seconds"])) for name in ("generate", "verify")
+    ]
+    figures = [
+        *((f"full size, {name} over the whole command", rate, "episodes/s") for name, rate in rates),
+        ("full size, memory of generate", max(mb for _, mb in entries["generate"]["memory_mb"]), "MB"),
+        (f"opening a data set of {size}", whole["open_s"], "s"),
+        (f"a whole episode at random of {size}", whole["read_ms"], "ms"),
+    ]
+    source = {"command": result["command"], "commit": result["commit"]}
+    return [{"what": what, "value": value, "unit": unit, **source} for what, value, unit in figures]
+
+
 def main() -> None:
     """Run, print the report, and write it, its data and a figure if asked."""
     raw = argparse.RawDescriptionHelpFormatter
@@ -268,6 +286,7 @@ def main() -> None:
         "episodes": entries["read"]["whole"]["episodes"],
         "entries": entries,
     }
+    result["performance"] = performance(result)
     name = options.out.name if options.out else "full_size"
     text = report(result, f"{name}.png")
     print(text)
