@@ -1,4 +1,4 @@
-"""Make docs/reliability.md of the latest results of `faults.py`.
+"""Make docs/reliability.md of the latest results of `faults.py` and `long_day.py`.
 
 python benchmarks/reliability_page.py [--results DIR] [--out FILE]
 """
@@ -116,7 +116,29 @@ def page(results: Path) -> str:
         head
         + "".join(f"{_row(case)}\n" for case in cases)
         + f"\nVerbs that write nothing:\n\n| verb | why |\n|---|---|\n{read_only}\n"
+        + "".join(long_day(file) for file in sorted(results.glob("*_long_day.json"))[-1:])
     )
+
+
+def long_day(file: Path) -> str:
+    """Return the section about hours of a policy server, evaluations and vector environments."""
+    result = json.loads(file.read_text(encoding="utf-8"))
+    rows = [
+        f"| {each['what']} | {'yes' if each['good'] else '**no**'} | {each['found']} |"
+        for each in result["verdicts"]
+    ]
+    lines = [
+        "",
+        "## A long day",
+        "",
+        f"`{result['command']}` keeps a policy server, an evaluation and vector environments busy "
+        f"([record and plots](../results/{file.with_suffix('.md').name})):",
+        "",
+        "| promise | held | found |",
+        "|---|---|---|",
+        *rows,
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def totals(cases: list[dict[str, Any]]) -> str:  # Any: JSON

@@ -118,6 +118,16 @@ def test_a_killed_session_leaves_a_folder_that_the_next_one_finishes(tmp_path: P
     assert verify(tmp_path, ALL).is_clean and len(Dataset(tmp_path)) == 2
 
 
+def test_a_recording_killed_after_its_shard_is_finished_by_the_same_one(tmp_path: Path) -> None:
+    solution = clicked(scene(), random.Random(0))
+    record_demonstration(tmp_path, scene(), solution)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for name in ("dataset.json", "index.parquet"):
+        (tmp_path / name).unlink()
+    assert record_demonstration(tmp_path, scene(), solution) == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_shards_of_users_have_a_largest_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert SHARD_SIZE > 2
     monkeypatch.setattr("openvima.data.user_demonstrations.SHARD_SIZE", 2)

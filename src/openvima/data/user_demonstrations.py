@@ -10,7 +10,7 @@ from pathlib import Path
 
 from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import MANIFEST_NAME, finish_folder, previous_summaries, set_aside
+from openvima.data.manifest import MANIFEST_NAME, ShardSummary, finish_folder, previous_summaries, set_aside
 from openvima.data.reader import read_manifest
 from openvima.data.records import Demonstration, Rollout, package_versions
 from openvima.data.resuming import remove_leftovers, storage_error
@@ -154,8 +154,12 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
     settings = {**env_config.record(), "assets": load_assets(env_config.assets).name}
     info = ShardInfo(demo.task, LEVEL, DOMAIN, 0, SHARD_SIZE, 0, versions=package_versions(), **settings)
     same = [shard for shard in shards if shard.info.task == demo.task]
+    is_complete = (folder / MANIFEST_NAME).is_file()
     for shard in same:
-        if shard.info.env_config == info.env_config and demo.seed in _seeds(shard):
+        seeds = _seeds(shard) if shard.info.env_config == info.env_config else []
+        if demo.seed in seeds:
+            if not is_complete and shard[seeds.index(demo.seed)].content_hash() == demo.content_hash():
+                return _finish(folder, shards, previous_summaries(folder))  # recording it was interrupted
             raise DatasetError(
                 f"{folder} holds a demonstration of this episode already ({demo.task}, seed {demo.seed}); "
                 "go on with another seed or scene."
@@ -173,10 +177,16 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
             assert last is not None  # or there are no rows
             writer.copy(last.batch(row))
         writer.write(demo)
-    paths = sorted({*(shard.path for shard in shards), folder / info.file_name})
+    others = [shard for shard in shards if shard is not last]
+    return _finish(folder, [*others, Shard(folder / info.file_name)], known)
+
+
+def _finish(folder: Path, shards: Sequence[Shard], known: dict[str, ShardSummary]) -> int:
+    """Write index and manifest; return the number of demonstrations."""
     config = {"level": LEVEL, "domain": DOMAIN}
+    paths = sorted(shard.path for shard in shards)
     finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions(), known=known)
-    return sum(len(shard) for shard in shards if shard is not last) + (1 if last is None else len(last) + 1)
+    return sum(map(len, shards))
 
 
 def _own_shards(folder: Path) -> list[Shard]:
