@@ -39,7 +39,7 @@ _MOST_KINDS = 2  # of failures of a task
 
 
 def tables(findings: Findings) -> dict[str, str]:
-    """Return all tables, by the name of their place; those without data are empty."""
+    """Return all tables, by the name of their place; those without data are empty or say so."""
     of, whole = findings.scores, published_models()
     beside = [next(m for m in whole if (m.model, m.size, m.data_fraction) == (*name, 1)) for name in _BESIDE]
     others = [model for model in leading_models() if model not in beside]
@@ -63,7 +63,9 @@ def tables(findings: Findings) -> dict[str, str]:
     written = {
         name: markdown([table]).strip() if table and table.lines else "" for name, table in made.items()
     }
-    return {**written, "ablations": findings.ablations}
+    written["ablations"] = findings.ablations
+    missing = "Not measured for these weights."
+    return written | {name: written[name] or missing for name in ("baselines", "ablations")}
 
 
 def _level_table(

@@ -112,6 +112,10 @@ def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
     kept = {folder.name for folder in (run / "checkpoints").iterdir() if folder.is_dir()}
     assert kept == {"2-cloning-000006", (run / "checkpoints" / "best.txt").read_text()}
     load_policy(str(run))
+    superseded = run / "checkpoints" / "2-cloning-000001"  # killed before it was deleted
+    superseded.mkdir()
+    train(TrainingConfig.of(settings))
+    assert not superseded.exists() and (run / "checkpoints" / "2-cloning-000006").exists()
 
 
 @pytest.mark.slow

@@ -154,11 +154,7 @@ class RunFolder:
             shutil.rmtree(final, ignore_errors=True)
             partial.rename(final)
             sync_folder(self.checkpoints)
-        self._note_best(progress)
-        for other in self.checkpoints.iterdir():
-            is_used = other.name in (name, progress.best_checkpoint) or self._is_kept(other.name)
-            if other.is_dir() and not is_used:
-                shutil.rmtree(other)
+        self._settle(progress)
 
     def resume(self, learner: Learner) -> Progress:
         """Load the weights of the last checkpoint, if there is one.
@@ -196,8 +192,11 @@ class RunFolder:
             lines.write(json.dumps(values) + "\n")
 
     def rewind_to(self, progress: Progress) -> None:
-        """Remove metrics of steps after a checkpoint, which will be repeated."""
-        self._note_best(progress)  # the run may have been killed before
+        """Remove metrics of steps after the last checkpoint, which will be repeated.
+
+        What a kill just after that checkpoint was written left undone is done.
+        """
+        self._settle(progress)
         file = self.path / METRICS_FILE
         if not file.is_file():
             return
@@ -214,9 +213,15 @@ class RunFolder:
         if (self.path / METRICS_FILE).exists():
             sync_file(self.path / METRICS_FILE)
 
-    def _note_best(self, progress: Progress) -> None:
+    def _settle(self, progress: Progress) -> None:
+        """Name the best checkpoint, and delete those that are neither it, the last nor permanent."""
         if progress.best_checkpoint:
             atomic_write_file(self.checkpoints / BEST_FILE, progress.best_checkpoint)
+        last = self.latest()
+        for other in self.checkpoints.iterdir():
+            is_used = other == last or other.name == progress.best_checkpoint or self._is_kept(other.name)
+            if other.is_dir() and not is_used:
+                shutil.rmtree(other)
 
     def _differences(self, settings: dict[str, Any]) -> list[str]:
         file = self.path / CONFIG_FILE
