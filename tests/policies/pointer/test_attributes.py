@@ -1,5 +1,6 @@
 """Comparison by the attributes that a prompt names: which are selected, and what they may change."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -145,3 +146,21 @@ def test_a_checkpoint_keeps_its_attributes(network, tmp_path):
     policy.save_pretrained(tmp_path / "with")
     again = NetworkPolicy.from_pretrained(tmp_path / "with")
     assert again.network.config.attributes == AttributeConfig(16, 8)
+
+
+def test_mixed_precision_takes_the_features_of_a_frozen_crop_encoder(network, demo):
+    network = deepcopy(network).float()
+    processor = Processor.of(network.config.inputs, TOKENIZER)
+    examples, images = examples_of([demo], processor)
+    batch = collate_examples(processor, examples)
+    features = network.encode_images(images).detach()  # in float32, as training precomputes them
+
+    def loss() -> torch.Tensor:
+        prompt = network.encode_prompt(batch.prompts, features)
+        return network.loss(prompt, batch.history, features, batch.targets)[0]
+
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = loss()
+    torch.testing.assert_close(mixed.float(), loss(), rtol=0.05, atol=0.05)
+    mixed.backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in network.parameters())

@@ -122,7 +122,7 @@ class Attributes(nn.Module):
         weights_BP = selected_BP[rows].to(projected.dtype)
         weights_BP = (weights_BP / weights_BP.sum(dim=1, keepdim=True)).sqrt()
         weights_BP1 = weights_BP.view(len(rows), *(1,) * (projected.ndim - 3), weights_BP.shape[1], 1)
-        embedded = objects.features_VNF.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
+        embedded = projected.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
         return embedded.index_put((rows,), (projected * weights_BP1).flatten(-2))
 
 

@@ -131,7 +131,7 @@ class Pointer(PolicyNetwork):
             is_shown_S = is_shown_S.index_put((row_BM[exists_BM],), is_shown_BM[exists_BM])
             features_VSF = features_VSF * is_shown_S[:, None]
         changes_BMD, rotations_BMR = self._changes_in_prompt(objects)
-        changes_SD = features_VSF.new_zeros(prompts.masks_VS.shape[1], self.config.images.width)
+        changes_SD = changes_BMD.new_zeros(prompts.masks_VS.shape[1], self.config.images.width)
         changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
         describes_BL = prompts.names_texture_BL & (self.text_appearance is not None)
         tokens_BLD, masked_BLD = self._encode(prompts, describes_BL, features_VSF, changes_SD, weights_BLL)
