@@ -9,14 +9,14 @@ checkpoint of the same recipe, so that only behaviour cloning differs. The other
 their own, and "short-pretraining" is what those are compared with.
 
 A killed command goes on where it was when repeated. Several may share the work: each takes what no other one
-is at. OUT/NAME.json describes each run (NAME-seed-S from the second seed on), and OUT/ablations.md has the
-differences, with intervals over seeds and episodes; `--table` only writes that.
+is at. OUT/NAME.json holds the outcomes of each run (NAME-seed-S from the second seed on), so what is there
+counts without its training, and OUT/ablations.md has the differences, with intervals over seeds and episodes;
+`--table` only writes that.
 """
 
 import argparse
 import json
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -182,7 +182,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--data", type=Path, required=True, help="folder of demonstrations")
     parser.add_argument("--crops", required=True, help="run of the recipe after pretraining, or a checkpoint")
-    parser.add_argument("--out", type=Path, required=True, help="folder of runs and results")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
+    parser.add_argument("--runs", type=Path, help="folder of trainings and evaluations, if not OUT")
     parser.add_argument("--only", default=",".join(VARIANTS), help="variants, separated by commas")
     parser.add_argument("--recipe", default="small", help="recipe that the variants differ from")
     parser.add_argument("--seeds", default="0,1,2", help="seeds of weights, order and augmentation")
@@ -224,7 +225,7 @@ def settings_of(name: str, recipe: str) -> Settings:
 
 
 def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:  # Any: plain JSON values
-    variant, row = VARIANTS[name], _row_file(given.out, name, seed)
+    variant, row = VARIANTS[name], _row_file(given.runs or given.out, name, seed)
     folder, preset = row.with_suffix(""), f"small-{name}"
     pretrained, stored = load_network(given.crops)
     assert isinstance(pretrained.config, PointerConfig)
@@ -254,7 +255,7 @@ def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
         out=folder / "evaluation",
     )
     with progress_bar(f"evaluation of {row.stem}") as report:
-        evaluate(evaluation, report)
+        results = Results.read(evaluate(evaluation, report))
     return {
         "name": row.stem,
         "what": variant.what,
@@ -264,33 +265,44 @@ def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
         "recipe": given.recipe,
         "parameters": sum(p.numel() for p in network.parameters()),
         "minutes": round(60 * spent(read_lines(run / "timings_log.jsonl"))[0], 1),
-        "evaluation": os.fspath(folder / "evaluation" / "results.json"),
+        "first_episode": evaluation.seed,
+        "solved": solved(results),
     }
+
+
+def solved(results: Results) -> dict[str, dict[str, str]]:
+    """Return which episodes were solved, by level and task: "1" or "0" for each, in the order of seeds."""
+    found: dict[str, dict[str, str]] = {}
+    for row in results.rows:
+        bits = "".join(str(int(outcome.success)) for outcome in row.outcomes)
+        found.setdefault(row.level, {})[row.task] = bits
+    return found
 
 
 def differences_table(out: Path, seeds: Sequence[int]) -> str:
     """Write the success of all variants and their differences from their baselines, of the seeds of both."""
-    found: dict[str, dict[int, Results]] = {}
+    found: dict[str, dict[int, dict[str, dict[str, str]]]] = {}
     for name in VARIANTS:
         for seed in seeds:
             if (row := _row_file(out, name, seed)).exists():
-                found.setdefault(name, {})[seed] = Results.read(row.with_suffix("") / "evaluation")
-    levels = next(iter(next(iter(found.values())).values())).levels() if found else []
+                found.setdefault(name, {})[seed] = json.loads(row.read_text(encoding="utf-8"))["solved"]
+    levels = list(next(iter(next(iter(found.values())).values()))) if found else []
     lines = []
     for name, of_seeds in found.items():
         baseline, cells = found.get(VARIANTS[name].baseline, {}), []
         shared = sorted(of_seeds.keys() & baseline.keys())
         for level in levels:
-            outcomes = {seed: _outcomes(results, level) for seed, results in of_seeds.items()}
-            counts = [[(sum(o.values()), len(o)) for o in tasks.values()] for tasks in outcomes.values()]
+            counts = [
+                [(bits.count("1"), len(bits)) for bits in own[level].values()] for own in of_seeds.values()
+            ]
             score = mean_over_seeds(counts)
             cells.append(Estimate(score.mean, score.interval))
             if not shared or VARIANTS[name].baseline == name:
                 cells.append("")
                 continue
-            pairs = [(outcomes[seed], _outcomes(baseline[seed], level)) for seed in shared]
+            pairs = [(of_seeds[seed][level], baseline[seed][level]) for seed in shared]
             difference, interval = difference_over_seeds(
-                [[PairCounts.of((a[t][e], b[t][e]) for e in a[t]) for t in a] for a, b in pairs]
+                [[PairCounts.of(_outcomes(a[task], b[task])) for task in a] for a, b in pairs]
             )
             mark = "≈" if interval[0] <= 0 <= interval[1] else ""
             cells.append(Estimate(difference, interval, True, mark))
@@ -299,13 +311,8 @@ def differences_table(out: Path, seeds: Sequence[int]) -> str:
     return markdown([Table("ablations", "", columns, tuple(lines))])
 
 
-def _outcomes(results: Results, level: str) -> Mapping[str, Mapping[int, bool]]:
-    """Success by task and seed of the episode."""
-    return {
-        row.task: {outcome.seed: outcome.success for outcome in row.outcomes}
-        for row in results.rows
-        if row.level == level
-    }
+def _outcomes(bits: str, others: str) -> list[tuple[bool, bool]]:
+    return [(one == "1", other == "1") for one, other in zip(bits, others, strict=True)]
 
 
 if __name__ == "__main__":
