@@ -16,7 +16,7 @@ counts without its training, and OUT/ablations.md has the differences, with inte
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,7 @@ _SHORT_PRETRAINING = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000}
 _NO_ATTRIBUTES = {"model.attributes": False, "pretraining.attribute_loss_weight": 0.0}
 
 Settings = dict[str, Any]  # Any: as in `TrainingConfig`
+Rows = dict[str, dict[int, dict[str, dict[str, str]]]]  # outcomes by variant, seed, level and task
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +208,7 @@ def main() -> int:
                     atomic_write_file(row, json.dumps(_measure(given, name, seed), indent=2) + "\n")
             except FolderLockedError:
                 print(f"{name} with seed {seed} is another command's")
-    table = differences_table(given.out, seeds)
+    table = differences_table(read_rows(given.out))
     atomic_write_file(given.out / "ablations.md", table)
     print(table)
     return 0
@@ -257,7 +258,7 @@ def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
     with progress_bar(f"evaluation of {row.stem}") as report:
         results = Results.read(evaluate(evaluation, report))
     return {
-        "name": row.stem,
+        "variant": name,
         "what": variant.what,
         "demonstrations": len(Dataset(given.data)),
         "steps": given.steps,
@@ -279,24 +280,24 @@ def solved(results: Results) -> dict[str, dict[str, str]]:
     return found
 
 
-def differences_table(out: Path, seeds: Sequence[int]) -> str:
+def read_rows(folder: Path) -> Rows:
+    """Read the outcomes of all runs, by variant, seed, level and task."""
+    rows: Rows = {name: {} for name in VARIANTS}
+    for file in sorted(folder.glob("*.json")):
+        row = json.loads(file.read_text(encoding="utf-8"))
+        rows[row["variant"]][row["seed"]] = row["solved"]
+    return {name: of_seeds for name, of_seeds in rows.items() if of_seeds}
+
+
+def differences_table(found: Rows) -> str:
     """Write the success of all variants and their differences from their baselines, of the seeds of both."""
-    found: dict[str, dict[int, dict[str, dict[str, str]]]] = {}
-    for name in VARIANTS:
-        for seed in seeds:
-            if (row := _row_file(out, name, seed)).exists():
-                found.setdefault(name, {})[seed] = json.loads(row.read_text(encoding="utf-8"))["solved"]
     levels = list(next(iter(next(iter(found.values())).values()))) if found else []
     lines = []
     for name, of_seeds in found.items():
         baseline, cells = found.get(VARIANTS[name].baseline, {}), []
         shared = sorted(of_seeds.keys() & baseline.keys())
         for level in levels:
-            counts = [
-                [(bits.count("1"), len(bits)) for bits in own[level].values()] for own in of_seeds.values()
-            ]
-            score = mean_over_seeds(counts)
-            cells.append(Estimate(score.mean, score.interval))
+            cells.append(_score(list(own[level].values()) for own in of_seeds.values()))
             if not shared or VARIANTS[name].baseline == name:
                 cells.append("")
                 continue
@@ -309,6 +310,28 @@ def differences_table(out: Path, seeds: Sequence[int]) -> str:
         lines.append(Line(VARIANTS[name].what, (str(len(of_seeds)), *cells)))
     columns = ("", "seeds", *(column for level in levels for column in (level, "difference")))
     return markdown([Table("ablations", "", columns, tuple(lines))])
+
+
+def attribute_table(found: Rows) -> str:
+    """Write L4 with and without attributes, task by task; empty if one of them was not trained."""
+    pair = [found.get(name, {}) for name in ("full", "no-attributes")]
+    if not all(pair):
+        return ""
+    tasks = list(next(iter(pair[0].values()))["L4"])
+    lines = []
+    for what, of_seeds in zip(("with attributes", "without"), pair, strict=True):
+        rows = list(of_seeds.values())
+        of_tasks = [_score([row["L4"][task]] for row in rows) for task in tasks]
+        means = _score(row["L4"].values() for row in rows), _score([row["L3"]["same_shape"]] for row in rows)
+        lines.append(Line(what, (str(len(rows)), *of_tasks, *means)))
+    columns = ("", "seeds", *tasks, "mean of L4", "same_shape, L3")
+    return markdown([Table("attributes", "", columns, tuple(lines))])
+
+
+def _score(outcomes: Iterable[Iterable[str]]) -> Estimate:
+    """Return the mean success of the tasks of each seed."""
+    score = mean_over_seeds([[(bits.count("1"), len(bits)) for bits in tasks] for tasks in outcomes])
+    return Estimate(score.mean, score.interval)
 
 
 def _outcomes(bits: str, others: str) -> list[tuple[bool, bool]]:

@@ -3,10 +3,11 @@
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from ablations import attribute_table, differences_table, read_rows
 from openvima.errors import ConfigError, DatasetError, OpenVimaError
 from openvima.evaluation.results import EpisodeOutcome, LevelMean, Results, Row
 from openvima.input_files import read_json
@@ -25,7 +26,6 @@ EVALUATIONS = {
     "original_compat": "assets of the original benchmark, compat",
     "detected": "procedural assets, detected boxes",
     "second_seed": "second training seed",
-    "without_attributes": "trained without attributes",
     "without_ears": "trained without containers with ears",
     "previous": "previous weights",
     "previous_original_assets": "previous weights, assets of the original benchmark",
@@ -33,7 +33,6 @@ EVALUATIONS = {
     "previous_detected": "previous weights, detected boxes",
     "controls": "input ablations",
     "text": "text prompts and held-out phrasings",
-    "previous_text": "text prompts and held-out phrasings, previous weights",
 }
 # Folders of SCORES that `examples/score_in_original_benchmark.py` wrote.
 SIMULATORS = {
@@ -79,12 +78,12 @@ class Findings:
 
     Args:
         scores: Evaluations by the names of `EVALUATIONS` and `SIMULATORS`; absent ones are not there.
-        ablations: Table of `ablations.py`, in Markdown; empty if absent.
+        ablations: Tables of `ablations.py`, in Markdown, by name; empty if absent.
         baselines: Other architectures at equal cost.
     """
 
     scores: Mapping[str, Results]
-    ablations: str = ""
+    ablations: Mapping[str, str] = field(default_factory=dict)
     baselines: tuple[Training, ...] = ()
 
     def means(self, name: str = "default") -> dict[str, LevelMean]:
@@ -128,9 +127,10 @@ def find(folder: Path, weights: str) -> Findings:
                 raise ConfigError(
                     f"{folder / name} is of weights {own[:12]}; those bundled are {weights[:12]}."
                 )
-    table = folder / ABLATIONS / "ablations.md"
+    rows = read_rows(folder / ABLATIONS)
+    made = {"ablations": differences_table(rows) if rows else "", "attributes": attribute_table(rows)}
     trainings = read_trainings(sorted((folder / BASELINES).glob("*.json")))
-    return Findings(found, table.read_text(encoding="utf-8").strip() if table.is_file() else "", trainings)
+    return Findings(found, {name: table.strip() for name, table in made.items()}, trainings)
 
 
 def read_simulator(folder: Path) -> Results:

@@ -7,7 +7,8 @@ The first copies the best checkpoint of a training, its settings, metrics and lo
 training data into the package. The second reads the folders of SCORES, which the names in `findings.py` say
 (`default`, `simulator`, `previous`, …), and writes OUT.json, figures, and the tables between
 `<!-- small:NAME -->` and `<!-- /small:NAME -->` in each file of `--fill` and in OUT.md. What is absent leaves
-its tables out, with a line on stderr.
+its tables out, with a line on stderr; but a record that is there already keeps what SCORES does not have: its
+evaluations, which belong together, or its ablations or baselines.
 """
 
 import argparse
@@ -104,12 +105,12 @@ def _training_record(training: Training) -> dict[str, Any]:  # Any: plain JSON v
     }
 
 
-def fill(text: str, fragments: Mapping[str, str], *, where: str) -> str:
+def fill(text: str, fragments: Mapping[str, str | None], *, where: str) -> str:
     """Put fragments between their marks.
 
     Args:
         text: A page in Markdown.
-        fragments: What belongs between the marks of a name.
+        fragments: What belongs between the marks of a name; None leaves what is there.
         where: Name of the page, for errors.
 
     Raises:
@@ -123,7 +124,9 @@ def fill(text: str, fragments: Mapping[str, str], *, where: str) -> str:
             )
         start, end = MARK.format(name=name), END.format(name=name)
         pattern = re.escape(start) + ".*?" + re.escape(end)
-        between = "\n\n".join(filter(None, (start, fragments[name], end)))
+        if (fragment := fragments[name]) is None:
+            continue
+        between = "\n\n".join(filter(None, (start, fragment, end)))
         text = re.sub(pattern, lambda _, between=between: between, text, flags=re.DOTALL)
     return text
 
@@ -145,14 +148,27 @@ def write(
         pages: Markdown files with marks.
         where: Machine, versions and commit, as of `sim.circumstances`.
         evaluation: Folder of an evaluation with recorded actions, whose failures are drawn.
+
+    Raises:
+        ConfigError: The record has evaluations that are not among others that are.
     """
-    content = json.dumps({**record(findings), **where}, indent=2, ensure_ascii=False) + "\n"
-    atomic_write_file(out.with_suffix(".json"), content)
+    kept = out.with_suffix(".json")
+    recorded = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
+    lacking = recorded.get("scores", {}).keys() - findings.scores.keys()
+    if findings.scores and lacking:
+        raise ConfigError(
+            f"{kept} has the evaluations {', '.join(sorted(lacking))}, which are absent here; give all of "
+            "them, none at all, or another --out."
+        )
+    new = {name: found for name, found in record(findings).items() if found or name not in recorded}
+    atomic_write_file(kept, json.dumps({**recorded, **new, **where}, indent=2, ensure_ascii=False) + "\n")
+    absent = None if recorded else "Not measured for these weights."
     drawn = save_all(findings, images)
     drawn |= {name: images / file for name, file in _DRAWN_ELSEWHERE.items() if (images / file).exists()}
     if evaluation and (file := draw_failures(evaluation, images / "openvima_small_failures.png")):
         drawn["failures"] = file
-    made = {**weights_tables(BUNDLED[SMALL].folder), **tables(findings)}
+    made = {name: text or absent for name, text in tables(findings).items()}
+    made |= weights_tables(BUNDLED[SMALL].folder)
     page = out.with_suffix(".md")
     if not page.exists():
         sections = "\n\n".join(
@@ -166,7 +182,7 @@ def write(
             f"{name}-figure": f"![{_FIGURES[name]}]({Path(os.path.relpath(file, path.parent)).as_posix()})"
             for name, file in drawn.items()
         }
-        figures |= {f"{name}-figure": "" for name in _FIGURES if name not in drawn}
+        figures |= {f"{name}-figure": absent and "" for name in _FIGURES if name not in drawn}
         atomic_write_file(path, fill(path.read_text(encoding="utf-8"), made | figures, where=str(path)))
 
 

@@ -28,7 +28,7 @@ from weights import shipped
 _BESIDE = (("MIDAS", "92M"), ("VIMA", "200M"), ("VIMA", "9M"))  # best, best known, of similar size
 _PREVIOUS_SIZE = "8.5M"
 _CHANCE = 1 / 3  # with the other attribute: docs/evaluation.md
-_SETTINGS = tuple(name for name in EVALUATIONS if name not in ("controls", "text", "previous_text"))
+_SETTINGS = tuple(name for name in EVALUATIONS if name not in ("controls", "text"))
 _IN_SIMULATOR = (
     "In the published benchmark itself, served over the network: its PyBullet simulator, assets and order of "
     "objects, none of which any training has seen."
@@ -52,9 +52,7 @@ def tables(findings: Findings) -> dict[str, str]:
         "original_tasks": _task_table(
             of.get("original_assets"), "With the assets of the original benchmark."
         ),
-        "attributes": _attribute_table(findings),
         "text": _text_table(of.get("text")),
-        "previous_text": _text_table(of.get("previous_text"), "The previous weights."),
         "controls": _control_table(of.get("controls")),
         "swapped_attribute": _swapped_table(of.get("controls")),
         "failures": _failure_table(of.get("default")),
@@ -63,9 +61,7 @@ def tables(findings: Findings) -> dict[str, str]:
     written = {
         name: markdown([table]).strip() if table and table.lines else "" for name, table in made.items()
     }
-    written["ablations"] = findings.ablations
-    missing = "Not measured for these weights."
-    return written | {name: written[name] or missing for name in ("baselines", "ablations")}
+    return written | {name: findings.ablations.get(name, "") for name in ("ablations", "attributes")}
 
 
 def _level_table(
@@ -96,29 +92,7 @@ def _task_table(results: Results | None, where: str = "") -> Table | None:
     return replace(found, caption=f"{where} {found.caption}".strip())
 
 
-def _attribute_table(findings: Findings) -> Table | None:
-    """L4 with and without the stage that teaches attributes, task by task."""
-    shown = {"default": "with attributes", "without_attributes": "without", "previous": "previous weights"}
-    found = {what: findings.scores[name] for name, what in shown.items() if name in findings.scores}
-    if "without" not in found:
-        return None
-    tasks = (
-        found["with attributes"].tasks("L4") if "with attributes" in found else found["without"].tasks("L4")
-    )
-    lines = []
-    for what, results in found.items():
-        rows = [results.row(POLICY, task, "L4") for task in tasks]
-        shape = results.row(POLICY, "same_shape", "L3")
-        mean = results.means().get((POLICY, "", "L4"))
-        lines.append(Line(what, (*map(_rate, rows), _estimate(mean), _rate(shape))))
-    columns = ("", *tasks, "mean of L4", "same_shape, L3")
-    counts = (row.episodes for results in found.values() for row in _plain(results))
-    return Table(
-        "attributes", f"L4 with and without the attribute stage. {_caption(counts)}", columns, tuple(lines)
-    )
-
-
-def _text_table(results: Results | None, whose: str = "") -> Table | None:
+def _text_table(results: Results | None) -> Table | None:
     """Tasks, unablated and in other words."""
     if results is None:
         return None
@@ -137,8 +111,7 @@ def _text_table(results: Results | None, whose: str = "") -> Table | None:
         means.append(Estimate(*mean_of_rates(counts), mark=of) if own else "–")
     lines.append(Line("mean", tuple(means), starts_group=True))
     heads = ("task", "multimodal", *(ablation_name(ablation) for ablation in columns[1:]))
-    caption = f"{whose} {_caption(row.episodes for row in results.rows)}".strip()
-    return Table("text", caption, heads, tuple(lines))
+    return Table("text", _caption(row.episodes for row in results.rows), heads, tuple(lines))
 
 
 def _control_table(results: Results | None) -> Table | None:

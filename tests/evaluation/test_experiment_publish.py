@@ -67,7 +67,8 @@ def scores(tmp_path: Path) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"seed": seed, "success": seed > 0, "failure": False, "steps": 2}))
     (tmp_path / "scores" / "ablations").mkdir()
-    (tmp_path / "scores" / "ablations" / "ablations.md").write_text("| no head | −3.0 |\n")
+    row = {"variant": "no-rotation", "seed": 0, "solved": {"L1": {"twist": "1110"}}}
+    (tmp_path / "scores" / "ablations" / "no-rotation.json").write_text(json.dumps(row))
     (tmp_path / "scores" / "baselines").mkdir()
     record = training(tmp_path / "scores" / "baselines", "vima", 1)
     (tmp_path / "scores" / "baselines" / "vima.json").write_text(json.dumps(record))
@@ -108,7 +109,7 @@ def test_tables_show_ours_beside_the_published_and_the_previous(findings: Findin
     swapped = lines_of(made["swapped_attribute"])["same\\_texture, L4"]
     assert [cell.split()[0] for cell in swapped] == ["90.0", "40.0", "33.3"]
     assert lines_of(made["failures"])["rotate, L1"][1] == "missed (1)"
-    assert made["ablations"] == "| no head | −3.0 |"
+    assert lines_of(made["ablations"])["no relative rotation"][1].startswith("75.0 (")
     assert lines_of(made["baselines"])["what is particular to vima"][:3] == ["2.0M", "100", "0.1"]
     assert made["text"] == made["attributes"] == made["original_tasks"] == ""
 
@@ -146,6 +147,13 @@ def test_everything_is_written_and_pages_keep_their_words(tmp_path: Path, findin
     assert json.loads((tmp_path / "out.json").read_text())["machine"] == "a machine"
     result = (tmp_path / "out.md").read_text()
     assert "commit `abc`" in result and "particular to vima" in result
+    write(Findings({}, {"ablations": "| no head | −3.0 |"}), tmp_path / "out", images, [page], WHERE)
+    assert page.read_text() == text
+    after = (tmp_path / "out.md").read_text()
+    assert "particular to vima" in after and "| no head | −3.0 |" in after and "no relative" not in after
+    assert set(json.loads((tmp_path / "out.json").read_text())["scores"]) == set(findings.scores)
+    with pytest.raises(ConfigError, match="has the evaluations controls, previous, simulator, which are abs"):
+        write(Findings({"default": findings.scores["default"]}), tmp_path / "out", images, [page], WHERE)
 
 
 def test_a_run_is_shipped_with_its_record(tmp_path: Path) -> None:
