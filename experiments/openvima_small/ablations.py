@@ -100,6 +100,9 @@ def _probs_of_cloning() -> dict[str, Variant]:
         "no-rerendering": Variant(
             "no demonstrations with random appearance", settings={"loader.rerendered_prob": 0.0}
         ),
+        "text-prompts": Variant(
+            "whole prompts as text with probability 0.25", settings={"augmentation.text_prompt_prob": 0.25}
+        ),
         "no-wording": Variant(
             "no text descriptions, synonyms, paraphrases and unknown words",
             settings={

@@ -20,7 +20,12 @@ from openvima.scene import ObjectRecord  # noqa: E402
 from openvima.tasks.prompts import described, description_of, image_descriptions, synonyms  # noqa: E402
 from openvima.training import sequence_lengths  # noqa: E402
 from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
-from openvima.training.augmentation.describe_objects import text_of, with_descriptions, with_synonyms  # noqa: E402
+from openvima.training.augmentation.describe_objects import (  # noqa: E402
+    DescribeObjects,
+    text_of,
+    with_descriptions,
+    with_synonyms,
+)
 from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
@@ -73,6 +78,15 @@ def test_each_image_is_replaced_with_that_probability_and_the_others_stay(demos)
     for name in rows:
         assert 0.65 < np.mean([name in names for names in shown]) < 0.85
     assert len(set(shown)) == 4  # independently
+
+
+def test_whole_prompts_become_text_with_a_probability_of_their_own(demos) -> None:
+    example = Example(preprocess(demos["visual_manipulation"], "objects"))
+    augment, rng = DescribeObjects(0.25, prompt_prob=0.5), np.random.default_rng(0)
+    shown = [augment(example, rng).episode.prompt.image_names for _ in range(1000)]
+    assert 0.48 < np.mean([names == () for names in shown]) < 0.58  # 0.5 + 0.5 · 0.25²
+    assert len(set(shown)) == 4  # the others one by one
+    assert DescribeObjects(0.0, prompt_prob=0.5).prob and not DescribeObjects(0.0).prob
 
 
 def test_synonyms_are_aliases_of_the_catalogue(demos) -> None:

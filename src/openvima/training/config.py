@@ -225,6 +225,7 @@ class AugmentationConfig:
             whose prompts allow it.
         text_description_prob: Probability for each object image of a task's prompt of the text "red swirl
             letter A" in its place.
+        text_prompt_prob: Probability of such texts in place of all object images of a task's prompt.
         synonym_prob: Probability that such a text names the object by an alias of the catalogue ("cube").
         paraphrase_prob: Probability of another phrasing of a task's prompt, of those in
             `tasks/paraphrases.yaml`.
@@ -241,10 +242,16 @@ class AugmentationConfig:
     shuffle_sentences_prob: Probability = 0.0
     distractor_prob: Probability = 0.0
     text_description_prob: Probability = 0.0
+    text_prompt_prob: Probability = 0.0
     synonym_prob: Probability = 0.0
     paraphrase_prob: Probability = 0.0
     unknown_word_prob: Probability = 0.0
     shuffle_prompt_objects_prob: Probability = 0.0
+
+    @property
+    def describes_objects(self) -> bool:
+        """Whether texts take the place of object images."""
+        return self.text_description_prob > 0 or self.text_prompt_prob > 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,7 +161,7 @@ class _Stages:
         caches, config, learner = [cache for cache, _ in self._caches], self.config, self.learner
         if isinstance(learner, PolicyLearner):
             prob = config.augmentation.inverse_dynamics_prob
-            describes = config.augmentation.text_description_prob > 0
+            describes = config.augmentation.describes_objects
             check_words(caches[0], learner.processor, describes=describes)
             if prob:
                 learner.processor.tokenizer.encode(MOTION_TEXT.format(frames=""))

@@ -36,7 +36,7 @@ def training_texts(
         prompts.update(table.column("prompt").unique().to_pylist())
     if augmentation.inverse_dynamics_prob:
         prompts.add(motion_text(1))
-    if augmentation.text_description_prob:
+    if augmentation.describes_objects:
         descriptions = _descriptions(dataset)
         prompts.update(map(text_of, descriptions))
         if augmentation.synonym_prob:

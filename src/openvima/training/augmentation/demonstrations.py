@@ -91,7 +91,7 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
             Randomly(config.rename_objects_prob, renamed),
             Randomly(config.shuffle_sentences_prob, shuffled),
             # after those that look for images
-            DescribeObjects(config.text_description_prob, config.synonym_prob),
+            DescribeObjects(config.text_description_prob, config.synonym_prob, config.text_prompt_prob),
             UnknownWords(config.unknown_word_prob),
             shuffle_prompt_objects,
         ),

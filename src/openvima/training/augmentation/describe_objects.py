@@ -22,21 +22,29 @@ class DescribeObjects:
     """Replaces object images of task prompts by texture and name of the object.
 
     Args:
-        prob: Probability for each image.
+        image_prob: Probability for each image.
         synonym_prob: Probability that a description names the object by an alias of the catalogue.
+        prompt_prob: Probability for each demonstration that all its images are replaced.
     """
 
-    prob: float
+    image_prob: float
     synonym_prob: float = 0.0
+    prompt_prob: float = 0.0
+
+    @property
+    def prob(self) -> float:
+        """A probability that is 0 if nothing is ever replaced."""
+        return max(self.image_prob, self.prompt_prob)
 
     def __call__(self, example: Example, rng: np.random.Generator) -> Example:
         """Augment a demonstration."""
         if not self.prob:
             return example
+        prob = 1.0 if self.prompt_prob and rng.random() < self.prompt_prob else self.image_prob
         episode = example.episode
         if self.synonym_prob:
             episode = with_synonyms(episode, self.synonym_prob, rng)
-        return replace(example, content=with_descriptions(episode, self.prob, rng))
+        return replace(example, content=with_descriptions(episode, prob, rng))
 
 
 def with_descriptions(
