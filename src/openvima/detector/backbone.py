@@ -57,8 +57,8 @@ class ResidualBlock(nn.Module):
         """Map (B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""
         residual = x if self.shortcut is None else self.shortcut(x)
         for index, layer in enumerate(self.layers):
-            x = layer(x if index == 0 else F.relu(x))
-        return F.relu(x + residual)
+            x = layer(x if index == 0 else F.relu_(x))
+        return F.relu_(x.add_(residual))
 
 
 class Backbone(nn.Module):
@@ -111,7 +111,7 @@ class Backbone(nn.Module):
 
     def forward(self, images: torch.Tensor) -> list[torch.Tensor]:
         """Map images (B, 3, H, W) to the pyramid levels, finest first, each (B, C, h, w)."""
-        x = F.max_pool2d(F.relu(self.stem(images)), kernel_size=3, stride=2, padding=1)
+        x = F.relu_(F.max_pool2d(self.stem(images), kernel_size=3, stride=2, padding=1))
         laterals = []
         for stage, lateral in zip(self.stages, self.lateral, strict=True):
             x = stage(x)
@@ -119,7 +119,7 @@ class Backbone(nn.Module):
         merged = laterals[-1]
         levels = [self.smooth[-1](merged)]
         for lateral, smooth in zip(reversed(laterals[:-1]), reversed(self.smooth[:-1]), strict=True):
-            merged = lateral + F.interpolate(merged, scale_factor=2.0, mode="nearest")
+            merged = F.interpolate(merged, scale_factor=2.0, mode="nearest").add_(lateral)
             levels.insert(0, smooth(merged))
         if self.extra_level:
             levels.append(F.max_pool2d(levels[-1], kernel_size=1, stride=2))

@@ -7,7 +7,7 @@ import math
 
 import torch
 
-from openvima.detector.kernels import suppress
+from openvima.detector.kernels import decode, suppress
 
 MAX_LOG_SCALE = math.log(1000 / 16)  # of one regression step, as in Detectron2; keeps exp from overflowing
 
@@ -59,34 +59,37 @@ def encode_boxes(boxes: torch.Tensor, references: torch.Tensor, weights: Weights
 
 
 def decode_boxes(deltas: torch.Tensor, references: torch.Tensor, weights: Weights) -> torch.Tensor:
-    """Invert `encode_boxes`, with the growth limited to `MAX_LOG_SCALE`.
+    """Invert `encode_boxes`, with the growth limited to `MAX_LOG_SCALE`; without gradients.
 
     Args:
         deltas: Shape (..., 4).
-        references: Broadcastable to the shape of `deltas`.
+        references: Of the same shape.
         weights: As for `encode_boxes`.
     """
-    deltas = deltas / deltas.new_tensor(weights)
-    from_centres, from_sizes = _centres_and_sizes(references)
-    centres = from_centres + deltas[..., :2] * from_sizes
-    halves = from_sizes * deltas[..., 2:].clamp(max=MAX_LOG_SCALE).exp() / 2
-    return torch.cat([centres - halves, centres + halves], dim=-1)
+    boxes = torch.empty(deltas.shape, dtype=references.dtype)
+    flat = (part.detach().cpu().reshape(-1, 4).numpy() for part in (deltas, references))
+    decode(*flat, weights, MAX_LOG_SCALE, boxes.view(-1, 4).numpy())
+    return boxes.to(deltas.device)
 
 
-def nms(boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float) -> torch.Tensor:
+def nms(
+    boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float, groups: torch.Tensor | None = None
+) -> torch.Tensor:
     """Apply greedy non-maximum suppression; of equal scores the first wins.
 
     Args:
         boxes: Shape (N, 4).
         scores: Shape (N,).
         iou_threshold: Largest intersection over union of two boxes that are kept.
+        groups: Shape (N,), int64; boxes of different groups are kept together. None is one group.
 
     Returns:
         Indices of the kept boxes by descending score, shape (K,), int64.
     """
     order = scores.argsort(descending=True, stable=True)
     best_first = boxes.detach()[order].double().cpu().numpy()
-    return order[torch.from_numpy(suppress(best_first, iou_threshold)).to(order.device)]
+    groups = torch.zeros_like(order) if groups is None else groups[order]
+    return order[torch.from_numpy(suppress(best_first, groups.cpu().numpy(), iou_threshold)).to(order.device)]
 
 
 def _centres_and_sizes(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -40,7 +40,7 @@ class BoxHead(nn.Module):
         """Map features (R, C, size, size) to logits (R, classes + 1) and deltas (R, classes, 4)."""
         x = features.flatten(1)
         for layer in self.hidden:
-            x = F.relu(layer(x))
+            x = F.relu_(layer(x))
         return self.class_logits(x), self.deltas(x).unflatten(1, (-1, 4))
 
 
@@ -67,8 +67,20 @@ class MaskHead(nn.Module):
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Map features (R, C, size, size) to logits (R, classes, 2 · size, 2 · size)."""
         for layer in self.convs:
-            features = F.relu(layer(features))
-        return self.mask_logits(F.relu(self.deconv(features)))
+            features = F.relu_(layer(features))
+        if torch.is_grad_enabled() or features.device.type != "cpu":
+            return self.mask_logits(F.relu_(self.deconv(features)))
+        return self._upsampled(features)
+
+    def _upsampled(self, features: torch.Tensor) -> torch.Tensor:
+        """Apply the last two layers as matrix products, which take a third of the time on a CPU."""
+        count, width, size, _ = features.shape
+        kernel = self.deconv.weight.permute(0, 2, 3, 1).reshape(width, -1)  # (C, 2 · 2 · C)
+        assert self.deconv.bias is not None  # it has one
+        cells = F.relu_((features.permute(0, 2, 3, 1) @ kernel).view(-1, width).add_(self.deconv.bias))
+        logits, classes = F.linear(cells, self.mask_logits.weight.flatten(1), self.mask_logits.bias), self.mask_logits.out_channels
+        logits = logits.view(count, size, size, 2, 2, classes).permute(0, 5, 1, 3, 2, 4)
+        return logits.reshape(count, classes, 2 * size, 2 * size)
 
 
 def box_losses(

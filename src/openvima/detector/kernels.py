@@ -1,18 +1,42 @@
-"""Numba kernel of the detector: greedy non-maximum suppression."""
+"""Numba kernels of the detector for inference: normalisation, suppression, RoIAlign, mask pasting."""
 
 import numpy as np
 from numba import njit
 
 
 @njit(cache=True)
-def suppress(boxes, iou_threshold):
-    """Return which boxes (N, 4), float64, best first, are kept, shape (N,), bool."""
+def look_up(images, table, out):
+    """Write `table` (3, 256) at images (B, 3, H, W), uint8, to the beginning of `out` (B, ≥ H, ≥ W, 3)."""
+    for image in range(images.shape[0]):
+        for row in range(images.shape[2]):
+            for column in range(images.shape[3]):
+                for channel in range(3):
+                    out[image, row, column, channel] = table[channel, images[image, channel, row, column]]
+
+
+@njit(cache=True)
+def decode(deltas, references, weights, max_log_scale, boxes):
+    """Fill `boxes` (N, 4) as `decode_boxes` does; `weights` are four floats."""
+    for n in range(len(boxes)):
+        for axis in range(2):
+            low, high = np.float64(references[n, axis]), np.float64(references[n, axis + 2])
+            centre = (low + high) / 2 + deltas[n, axis] / weights[axis] * (high - low)
+            scale = np.exp(min(deltas[n, axis + 2] / weights[axis + 2], max_log_scale))
+            boxes[n, axis] = centre - scale * (high - low) / 2
+            boxes[n, axis + 2] = centre + scale * (high - low) / 2
+
+
+@njit(cache=True)
+def suppress(boxes, groups, iou_threshold):
+    """Return which boxes (N, 4), float64, best first, are kept, shape (N,), bool; groups (N,) are apart."""
     kept = np.ones(len(boxes), np.bool_)
     for i in range(len(boxes)):
         if not kept[i]:
             continue
         area = (boxes[i, 2] - boxes[i, 0]) * (boxes[i, 3] - boxes[i, 1])
         for j in range(i + 1, len(boxes)):
+            if groups[j] != groups[i]:
+                continue
             width = min(boxes[i, 2], boxes[j, 2]) - max(boxes[i, 0], boxes[j, 0])
             height = min(boxes[i, 3], boxes[j, 3]) - max(boxes[i, 1], boxes[j, 1])
             if width > 0 and height > 0:
@@ -20,3 +44,81 @@ def suppress(boxes, iou_threshold):
                 if width * height > iou_threshold * (area + other - width * height):
                     kept[j] = False
     return kept
+
+
+@njit(cache=True)
+def align(features, boxes, images, chosen, stride, sampling_ratio, out):
+    """Average samples of features (B, H, W, C) in the cells of the chosen boxes (R, 4), as `roi_align` does.
+
+    `images` (R,) are the boxes' images and `chosen` (R,) is bool; `out` is (R, C, size, size).
+    """
+    size = out.shape[2]
+    cell = np.empty(out.shape[1], out.dtype)
+    for r in range(len(boxes)):
+        if not chosen[r]:
+            continue
+        x, x_weights = _sample_points(
+            boxes[r, 0], boxes[r, 2], features.shape[2], stride, size, sampling_ratio, out.dtype
+        )
+        y, y_weights = _sample_points(
+            boxes[r, 1], boxes[r, 3], features.shape[1], stride, size, sampling_ratio, out.dtype
+        )
+        num_x, num_y = len(x) // size, len(y) // size
+        frame = features[images[r]]
+        for row in range(size):
+            for column in range(size):
+                cell[:] = 0
+                for i in range(row * num_y, (row + 1) * num_y):
+                    above, below = frame[y[i, 0]], frame[y[i, 1]]
+                    for j in range(column * num_x, (column + 1) * num_x):
+                        a, b = above[x[j, 0]], above[x[j, 1]]
+                        c, d = below[x[j, 0]], below[x[j, 1]]
+                        wa, wb = y_weights[i, 0] * x_weights[j, 0], y_weights[i, 0] * x_weights[j, 1]
+                        wc, wd = y_weights[i, 1] * x_weights[j, 0], y_weights[i, 1] * x_weights[j, 1]
+                        for k in range(len(cell)):
+                            cell[k] += wa * a[k] + wb * b[k] + wc * c[k] + wd * d[k]
+                for k in range(len(cell)):
+                    out[r, k, row, column] = cell[k]
+
+
+@njit(cache=True)
+def _sample_points(low, high, length, stride, size, sampling_ratio, dtype):
+    """Return the features beside each sampling point of an axis and their weights, both (size · samples, 2)."""
+    start, extent = low / stride - 0.5, (high - low) / stride
+    samples = sampling_ratio if sampling_ratio else max(1, int(np.ceil(extent / size)))
+    indices, weights = np.zeros((size * samples, 2), np.int64), np.zeros((size * samples, 2), dtype)
+    for n in range(len(indices)):
+        point = start + extent * (n + 0.5) / (size * samples)
+        if -1 <= point <= length:
+            point = min(max(point, 0.0), length - 1.0)
+            first = min(int(point), max(length - 2, 0))
+            indices[n, 0], indices[n, 1] = first, min(first + 1, length - 1)
+            weights[n, 0], weights[n, 1] = (first + 1 - point) / samples, (point - first) / samples
+    return indices, weights
+
+
+@njit(cache=True)
+def paste(probabilities, boxes, out):
+    """Write where masks (N, S, S) inside boxes (N, 4) reach 0.5 to `out` (N, H, W), bool, which is False."""
+    size = probabilities.shape[1]
+    _, height, width = out.shape
+    for n in range(len(boxes)):
+        left, upper, right, lower = boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3]
+        across, down = size / max(right - left, 1e-6), size / max(lower - upper, 1e-6)
+        # Cells reach half a cell beyond the box, with decreasing weights.
+        for row in range(max(0, int(upper - 0.5 / down - 1)), min(height, int(lower + 0.5 / down + 1))):
+            y = (row + 0.5 - upper) * down - 0.5
+            for column in range(max(0, int(left - 0.5 / across - 1)), min(width, int(right + 0.5 / across + 1))):
+                x = (column + 0.5 - left) * across - 0.5
+                out[n, row, column] = _read(probabilities[n], y, x) >= 0.5
+
+
+@njit(cache=True)
+def _read(plane, y, x):
+    """Interpolate a plane (S, S) at a point; it is zero outside."""
+    row, column = int(np.floor(y)), int(np.floor(x))
+    total = 0.0
+    for i in range(max(row, 0), min(row + 2, plane.shape[0])):
+        for j in range(max(column, 0), min(column + 2, plane.shape[1])):
+            total += (1 - abs(y - i)) * (1 - abs(x - j)) * plane[i, j]
+    return total

@@ -1,7 +1,9 @@
 """Instance masks: from image pixels to the grid of a box, and back."""
 
+import numpy as np
 import torch
 
+from openvima.detector.kernels import paste
 from openvima.detector.roi_align import roi_align
 
 
@@ -26,7 +28,7 @@ def crop_masks(masks: torch.Tensor, boxes: torch.Tensor, *, size: int) -> torch.
 def paste_masks(probabilities: torch.Tensor, boxes: torch.Tensor, *, height: int, width: int) -> torch.Tensor:
     """Resample mask probabilities at the pixels of an image and threshold them at 0.5.
 
-    Bilinear interpolation is separable, hence two matrix products.
+    Bilinear interpolation between the centres of cells; outside of the box everything is zero.
 
     Args:
         probabilities: Of the cells inside each box, shape (N, size, size).
@@ -37,15 +39,6 @@ def paste_masks(probabilities: torch.Tensor, boxes: torch.Tensor, *, height: int
     Returns:
         Shape (N, height, width), bool.
     """
-    rows = _interpolation(boxes[:, 1], boxes[:, 3], probabilities.shape[1], height)
-    columns = _interpolation(boxes[:, 0], boxes[:, 2], probabilities.shape[2], width)
-    return rows @ probabilities @ columns.transpose(1, 2) >= 0.5
-
-
-def _interpolation(low: torch.Tensor, high: torch.Tensor, size: int, length: int) -> torch.Tensor:
-    """Weight of each cell for each pixel along one axis, shape (N, length, size); zero outside the box."""
-    pixels = torch.arange(length, device=low.device, dtype=low.dtype) + 0.5
-    extent = (high - low).clamp(min=1e-6)[:, None]
-    positions = (pixels - low[:, None]) / extent * size - 0.5  # in cells, 0 at the centre of the first
-    cells = torch.arange(size, device=low.device, dtype=low.dtype)
-    return (1 - (positions[..., None] - cells).abs()).clamp(min=0)
+    masks = np.zeros((len(boxes), height, width), np.bool_)
+    paste(probabilities.cpu().numpy(), boxes.cpu().double().numpy(), masks)
+    return torch.from_numpy(masks).to(boxes.device)

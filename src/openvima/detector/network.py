@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from openvima.detector.backbone import Backbone
 from openvima.detector.boxes import clip_boxes, decode_boxes, is_solid, nms
 from openvima.detector.config import FIRST_STRIDE, DetectorConfig
+from openvima.detector.kernels import look_up
 from openvima.detector.heads import WEIGHTS, BoxHead, MaskHead, box_losses, mask_loss
 from openvima.detector.masks import paste_masks
 from openvima.detector.matching import match, subsample
@@ -74,16 +75,15 @@ class MaskRCNN(nn.Module):
         inputs, scale, size = self._preprocess(images)
         levels = self.backbone(inputs)
         proposals = self.rpn.propose(self.rpn(levels), height=size[0], width=size[1])
-        found = []
-        for index, boxes in enumerate(proposals):
-            own = [level[index : index + 1] for level in levels]
-            boxes, scores, classes = self._detect_boxes(own, boxes, size)
-            probabilities = self._predict_masks(own, boxes, classes)
-            boxes = clip_boxes(boxes / scale, height=height, width=width)
-            found.append(
-                Instances(boxes, paste_masks(probabilities, boxes, height=height, width=width), scores)
-            )
-        return found
+        boxes, scores, classes, owners = self._detect_boxes(levels, proposals, size)
+        probabilities = self._predict_masks(levels, boxes, classes, owners)
+        counts = owners.bincount(minlength=len(images)).tolist()
+        boxes = clip_boxes(boxes / scale, height=height, width=width)
+        masks = paste_masks(probabilities, boxes, height=height, width=width)
+        return [
+            Instances(*own)
+            for own in zip(boxes.split(counts), masks.split(counts), scores.split(counts), strict=True)
+        ]
 
     def losses(
         self, images: torch.Tensor, targets: Sequence[Instances], *, sampled: int, generator: torch.Generator
@@ -124,42 +124,57 @@ class MaskRCNN(nn.Module):
     def _preprocess(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, tuple[int, int]]:
         """Return resized, normalised and padded images, the scale of boxes (4,), and the unpadded size."""
         config = self.config
-        pixels = images.to(self.pixel_mean.dtype)
-        if config.channel_order == "bgr":
-            pixels = pixels.flip(1)
+        pixels = images.flip(1) if config.channel_order == "bgr" else images
         before = pixels.shape[2:]
         height, width = resized_shape(config, *before)
         if (height, width) != before:
             # Antialiased and rounded, as Pillow does it.
+            pixels = pixels.to(self.pixel_mean.dtype)
             pixels = F.interpolate(pixels, (height, width), mode="bilinear", antialias=True).round()
-        scale = pixels.new_tensor([width / before[1], height / before[0]]).repeat(2)
-        pixels = (pixels - self.pixel_mean) / self.pixel_std
+        scale = self.pixel_mean.new_tensor([width / before[1], height / before[0]]).repeat(2)
         divisor = self.backbone.size_divisor
-        return F.pad(pixels, (0, -width % divisor, 0, -height % divisor)), scale, (height, width)
+        padded = height + -height % divisor, width + -width % divisor
+        return self._normalised(pixels, *padded), scale, (height, width)
+
+    def _normalised(self, pixels: torch.Tensor, height: int, width: int) -> torch.Tensor:
+        """Normalise pixels, and pad them with zeros."""
+        if pixels.dtype != torch.uint8 or pixels.device.type != "cpu":
+            padding = (0, width - pixels.shape[3], 0, height - pixels.shape[2])
+            return F.pad((pixels - self.pixel_mean) / self.pixel_std, padding)
+        table = (torch.arange(256) - self.pixel_mean[:, 0]) / self.pixel_std[:, 0]
+        normalised = torch.zeros(len(pixels), height, width, 3)
+        look_up(pixels.numpy(), table.numpy(), normalised.numpy())  # in a fifth of the time, channels last
+        return normalised.permute(0, 3, 1, 2)
 
     def _detect_boxes(
-        self, levels: Sequence[torch.Tensor], proposals: torch.Tensor, size: tuple[int, int]
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return boxes, scores and classes of one image; each proposal counts for its best class only."""
-        config = self.config
-        indices = torch.zeros(len(proposals), dtype=torch.int64, device=proposals.device)
-        logits, deltas = self.box_head(self._pool(levels, proposals, indices, config.box_pool_size))
+        self, levels: Sequence[torch.Tensor], proposals: Sequence[torch.Tensor], size: tuple[int, int]
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return boxes, scores, classes and images' indices; each proposal counts for its best class only."""
+        config, references = self.config, torch.cat(list(proposals))
+        counts = torch.tensor([len(boxes) for boxes in proposals])
+        owners = torch.arange(len(proposals)).repeat_interleave(counts).to(references.device)
+        logits, deltas = self.box_head(self._pool(levels, references, owners, config.box_pool_size))
         scores, classes = logits.softmax(dim=1)[:, :-1].max(dim=1)
         rows = (scores >= config.score_threshold).nonzero()[:, 0]
-        boxes = decode_boxes(deltas[rows, classes[rows]], proposals[rows], WEIGHTS)
+        boxes = decode_boxes(deltas[rows, classes[rows]], references[rows], WEIGHTS)
         boxes = clip_boxes(boxes, height=size[0], width=size[1])
         solid = is_solid(boxes)
         rows, boxes = rows[solid], boxes[solid]
-        kept = nms(boxes, scores[rows], config.nms_iou)[: config.max_detections]
+        kept = nms(boxes, scores[rows], config.nms_iou, owners[rows])
+        of_images = (kept[owners[rows[kept]] == image] for image in range(len(proposals)))
+        kept = torch.cat([own[: config.max_detections] for own in of_images])
         rows = rows[kept]
-        return boxes[kept], scores[rows], classes[rows]
+        return boxes[kept], scores[rows], classes[rows], owners[rows]
 
     def _predict_masks(
-        self, levels: Sequence[torch.Tensor], boxes: torch.Tensor, classes: torch.Tensor
+        self,
+        levels: Sequence[torch.Tensor],
+        boxes: torch.Tensor,
+        classes: torch.Tensor,
+        images: torch.Tensor,
     ) -> torch.Tensor:
-        """Return mask probabilities inside the boxes of one image, (N, 2 · size, 2 · size)."""
-        indices = torch.zeros(len(boxes), dtype=torch.int64, device=boxes.device)
-        logits = self.mask_head(self._pool(levels, boxes, indices, self.config.mask_pool_size))
+        """Return mask probabilities inside the boxes, (N, 2 · size, 2 · size)."""
+        logits = self.mask_head(self._pool(levels, boxes, images, self.config.mask_pool_size))
         return logits[torch.arange(len(boxes), device=boxes.device), classes].sigmoid()
 
     def _pool(

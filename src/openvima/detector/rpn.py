@@ -58,40 +58,35 @@ class RegionProposalNetwork(nn.Module):
         shapes = [(level.shape[2], level.shape[3]) for level in levels]
         anchors = pyramid_anchors(self.config.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
         objectness, deltas = [], []
+        # Both 1 × 1 convolutions as one matrix product, in the order of the anchors: (3 · 5, C)
+        weight = _interleaved(self.objectness.weight, self.deltas.weight)
+        bias = _interleaved(self.objectness.bias, self.deltas.bias)
         for level in levels:
-            hidden = F.relu(self.conv(level))
-            objectness.append(self.objectness(hidden).permute(0, 2, 3, 1).flatten(1))  # (B, h · w · 3)
-            # (B, 3 · 4, h, w) to (B, h · w · 3, 4), in the order of the anchors
-            deltas.append(self.deltas(hidden).permute(0, 2, 3, 1).reshape(len(level), -1, 4))
+            hidden = F.relu_(self.conv(level)).permute(0, 2, 3, 1)
+            outputs = F.linear(hidden, weight, bias).view(len(level), -1, 5)  # (B, h · w · 3, 5)
+            objectness.append(outputs[..., 0])
+            deltas.append(outputs[..., 1:])
         device, dtype = levels[0].device, levels[0].dtype
         return AnchorPredictions([a.to(device, dtype) for a in anchors], objectness, deltas)
 
     @torch.no_grad()
     def propose(self, predictions: AnchorPredictions, *, height: int, width: int) -> list[torch.Tensor]:
         """Return the proposals of each image, shape (P, 4), by descending objectness; NMS acts per level."""
-        return [
-            self._propose(predictions, image, height=height, width=width)
-            for image in range(len(predictions.objectness[0]))
-        ]
-
-    def _propose(
-        self, predictions: AnchorPredictions, image: int, *, height: int, width: int
-    ) -> torch.Tensor:
         config = self.config
-        kept_boxes, kept_scores = [], []
+        all_scores, all_boxes, groups = [], [], []
         levels = zip(predictions.anchors, predictions.objectness, predictions.deltas, strict=True)
-        for anchors, objectness, deltas in levels:
-            scores, rows = objectness[image].topk(min(config.rpn_pre_nms_top_n, len(anchors)))
-            boxes = decode_boxes(deltas[image, rows], anchors[rows], WEIGHTS)
-            boxes = clip_boxes(boxes, height=height, width=width)
-            solid = is_solid(boxes)
-            boxes, scores = boxes[solid], scores[solid]
-            # Per level: comparing the boxes of all levels at once takes twice as long.
-            kept = nms(boxes, scores, config.rpn_nms_iou)
-            kept_boxes.append(boxes[kept])
-            kept_scores.append(scores[kept])
-        order = torch.cat(kept_scores).argsort(descending=True, stable=True)
-        return torch.cat(kept_boxes)[order[: config.rpn_post_nms_top_n]]
+        for level, (anchors, objectness, deltas) in enumerate(levels):
+            scores, rows = objectness.topk(min(config.rpn_pre_nms_top_n, len(anchors)))
+            chosen = deltas.gather(1, rows[..., None].expand(-1, -1, 4))
+            all_boxes.append(decode_boxes(chosen, anchors[rows], WEIGHTS))
+            all_scores.append(scores)
+            groups += [level] * scores.shape[1]
+        boxes = clip_boxes(torch.cat(all_boxes, dim=1), height=height, width=width)
+        return [
+            own[kept[is_solid(own[kept])][: config.rpn_post_nms_top_n]]
+            for own, scores in zip(boxes, torch.cat(all_scores, dim=1), strict=True)
+            for kept in [nms(own, scores, config.rpn_nms_iou, torch.tensor(groups))]
+        ]
 
     def losses(
         self, predictions: AnchorPredictions, objects: Sequence[torch.Tensor], generator: torch.Generator
@@ -129,3 +124,12 @@ class RegionProposalNetwork(nn.Module):
                 box_loss = box_loss + F.l1_loss(deltas[positive], targets, reduction="sum")
         count = ANCHORS_PER_IMAGE * len(objects)
         return {"rpn_objectness": objectness_loss / count, "rpn_box": box_loss / count}
+
+
+def _interleaved(objectness: torch.Tensor | None, deltas: torch.Tensor | None) -> torch.Tensor:
+    """Join parameters of both convolutions, anchor by anchor: shape (3 · 5, …) without the kernel's axes."""
+    assert objectness is not None and deltas is not None  # both have a bias
+    ratios = len(ASPECT_RATIOS)
+    parts = objectness.view(ratios, 1, -1), deltas.view(ratios, 4, -1)
+    joined = torch.cat(parts, dim=1).flatten(0, 1)
+    return joined if objectness.ndim > 1 else joined[:, 0]

@@ -1,8 +1,8 @@
 """Objects from a detector on RGB images, in place of the simulator's segmentation."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -150,15 +150,24 @@ class Detector(Protocol):
         ...
 
 
+@runtime_checkable
+class ViewsDetector(Detector, Protocol):
+    """Detects objects in both views of a time step at once."""
+
+    def detect_views(self, frames: Sequence[np.ndarray]) -> Sequence[Detections]:
+        """Detect objects in the front view and the top view, as `detect` does."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedObjects:
     """An `ObjectExtractor` that uses a detector instead of the segmentation.
 
-    The detector runs on each view separately. Boxes of the two views are then matched by table position and
-    colour; an unmatched box is an object hidden in the other view. All ids are -1.
+    The boxes of the two views are matched by table position and colour; an unmatched box is an object hidden
+    in the other view. All ids are -1.
 
     Args:
-        detector: The detector.
+        detector: The detector; a `ViewsDetector` gets both views at once.
         min_score: Detections with a lower score are dropped. The default is low, since a missed object
             costs a policy more than a false one: docs/detector.md has measurements.
         prompt_extractor: Extractor of prompt images, for detectors that are not trained on them;
@@ -178,7 +187,7 @@ class DetectedObjects:
             DetectionError: A detection lies outside the image.
         """
         frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
-        front, top = (self._detect(frames[view], view) for view in VIEWS)
+        front, top = self._detect(frames)
         return _merge_views(front, top, _match_views(front, top)).left_to_right()
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
@@ -196,18 +205,25 @@ class DetectedObjects:
             return self.prompt_extractor.in_prompt_image(image)
         single = image.kind == "object"
         frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
-        front, top = (self._detect(frames[view], view, single=single) for view in VIEWS)
+        front, top = self._detect(frames, single=single)
         both = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
         return _merge_views(front, top, both if single else _match_views(front, top)).left_to_right()
 
-    def _detect(self, rgb: np.ndarray, view: View, *, single: bool = False) -> "_ViewDetections":
-        found = self.detector.detect(rgb, view)
+    def _detect(self, frames: Mapping[View, np.ndarray], *, single: bool = False) -> list["_ViewDetections"]:
+        if isinstance(self.detector, ViewsDetector):
+            both = self.detector.detect_views([frames[view] for view in VIEWS])
+        else:
+            both = [self.detector.detect(frames[view], view) for view in VIEWS]
+        return [
+            _crop_objects(frames[view], self._chosen(found, frames[view], view, single=single), view)
+            for view, found in zip(VIEWS, both, strict=True)
+        ]
+
+    def _chosen(self, found: Detections, rgb: np.ndarray, view: View, *, single: bool) -> Detections:
         _check_within(found, rgb.shape[1:], view)
         if single and len(found):
-            found = found.select(np.array([0 if found.scores is None else found.scores.argmax()]))
-        elif found.scores is not None:
-            found = found.select(found.scores >= self.min_score)
-        return _crop_objects(rgb, found, view)
+            return found.select(np.array([0 if found.scores is None else found.scores.argmax()]))
+        return found if found.scores is None else found.select(found.scores >= self.min_score)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
