@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from openvima.policies.detection import DetectedObjects
 
 BUNDLED = Path(__file__).parent / "trained"  # the small detector for the default assets
+CACHE_SIZE = 1024  # of extractors, in pairs of images; 30 MB, and a larger one is hardly hit more often
 
 
 def detector_folder(folder: str | Path | None = None) -> Path:
@@ -58,7 +59,7 @@ def load_extractor(folder: str | Path | None = None, **options: Any) -> "Detecte
     """
     from openvima.policies.detection import DetectedObjects
 
-    return DetectedObjects(load_detector(folder, **options))
+    return DetectedObjects(load_detector(folder, **options), cache_size=CACHE_SIZE)
 
 
 __all__ = [

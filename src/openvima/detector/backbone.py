@@ -7,6 +7,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from openvima.detector.cpu_inference import is_cpu_inference, rectify_and_pool
 from openvima.detector.config import BackboneConfig
 
 
@@ -111,7 +112,11 @@ class Backbone(nn.Module):
 
     def forward(self, images: torch.Tensor) -> list[torch.Tensor]:
         """Map images (B, 3, H, W) to the pyramid levels, finest first, each (B, C, h, w)."""
-        x = F.relu_(F.max_pool2d(self.stem(images), kernel_size=3, stride=2, padding=1))
+        x = self.stem(images)
+        if is_cpu_inference(x):
+            x = rectify_and_pool(x)
+        else:
+            x = F.max_pool2d(F.relu_(x), kernel_size=3, stride=2, padding=1)
         laterals = []
         for stage, lateral in zip(self.stages, self.lateral, strict=True):
             x = stage(x)

@@ -15,6 +15,25 @@ def look_up(images, table, out):
 
 
 @njit(cache=True)
+def relu_and_pool(x, out):
+    """Write maxima of 0 and 3 × 3 pixels of `x` (B, H, W, C) with stride 2 to `out` (B, ⌈H / 2⌉, ⌈W / 2⌉, C)."""
+    _, height, width, channels = x.shape
+    highest = np.empty(width * channels, x.dtype)  # of three rows, where one at the border counts twice
+    for image in range(len(out)):
+        for i in range(out.shape[1]):
+            upper, middle = x[image, max(2 * i - 1, 0)].reshape(-1), x[image, 2 * i].reshape(-1)
+            lower = x[image, min(2 * i + 1, height - 1)].reshape(-1)
+            for k in range(len(highest)):
+                highest[k] = max(max(upper[k], middle[k]), max(lower[k], 0))
+            for j in range(out.shape[2]):
+                left, centre = max(2 * j - 1, 0) * channels, 2 * j * channels
+                right = min(2 * j + 1, width - 1) * channels
+                cell = out[image, i, j]
+                for k in range(channels):
+                    cell[k] = max(max(highest[left + k], highest[centre + k]), highest[right + k])
+
+
+@njit(cache=True)
 def decode(deltas, references, weights, max_log_scale, boxes):
     """Fill `boxes` (N, 4) as `decode_boxes` does; `weights` are four floats."""
     for n in range(len(boxes)):
@@ -47,37 +66,45 @@ def suppress(boxes, groups, iou_threshold):
 
 
 @njit(cache=True)
-def align(features, boxes, images, chosen, stride, sampling_ratio, out):
-    """Average samples of features (B, H, W, C) in the cells of the chosen boxes (R, 4), as `roi_align` does.
+def align(features, boxes, images, levels, level, stride, sampling_ratio, out):
+    """Average samples of features (B, H, W, C) in the cells of boxes (R, 4) of one level, as `roi_align` does.
 
-    `images` (R,) are the boxes' images and `chosen` (R,) is bool; `out` is (R, C, size, size).
+    `images` (R,) and `levels` (R,) are those of the boxes; `out` is (R, C, size, size). Bilinear weights are
+    products of one for the row and one for the column, so features are summed over rows first. Indices are
+    unsigned, since the check for negative ones keeps loops from being vectorised: three times as fast.
     """
-    size = out.shape[2]
-    cell = np.empty(out.shape[1], out.dtype)
+    _, height, width, _ = features.shape
+    size, channels, pitch = out.shape[2], np.uint64(out.shape[1]), np.uint64(width * out.shape[1])
+    strip, cell = np.empty(pitch, out.dtype), np.empty(channels, out.dtype)  # sums of a row of cells, of one
     for r in range(len(boxes)):
-        if not chosen[r]:
+        if levels[r] != level:
             continue
-        x, x_weights = _sample_points(
-            boxes[r, 0], boxes[r, 2], features.shape[2], stride, size, sampling_ratio, out.dtype
-        )
-        y, y_weights = _sample_points(
-            boxes[r, 1], boxes[r, 3], features.shape[1], stride, size, sampling_ratio, out.dtype
-        )
+        left, upper, right, lower = boxes[r, 0], boxes[r, 1], boxes[r, 2], boxes[r, 3]
+        x, x_weights = _sample_points(left, right, width, stride, size, sampling_ratio, out.dtype)
+        y, y_weights = _sample_points(upper, lower, height, stride, size, sampling_ratio, out.dtype)
         num_x, num_y = len(x) // size, len(y) // size
-        frame = features[images[r]]
+        first, last = x.min() * channels, (x.max() + np.uint64(1)) * channels
+        frame = features[images[r]].reshape(-1)
         for row in range(size):
+            for k in range(first, last):
+                strip[k] = 0
+            for i in range(row * num_y, (row + 1) * num_y):
+                a, b, a_weight, b_weight = y[i, 0] * pitch, y[i, 1] * pitch, y_weights[i, 0], y_weights[i, 1]
+                for k in range(first, last):
+                    strip[k] += a_weight * frame[a + k] + b_weight * frame[b + k]
             for column in range(size):
-                cell[:] = 0
-                for i in range(row * num_y, (row + 1) * num_y):
-                    above, below = frame[y[i, 0]], frame[y[i, 1]]
-                    for j in range(column * num_x, (column + 1) * num_x):
-                        a, b = above[x[j, 0]], above[x[j, 1]]
-                        c, d = below[x[j, 0]], below[x[j, 1]]
-                        wa, wb = y_weights[i, 0] * x_weights[j, 0], y_weights[i, 0] * x_weights[j, 1]
-                        wc, wd = y_weights[i, 1] * x_weights[j, 0], y_weights[i, 1] * x_weights[j, 1]
-                        for k in range(len(cell)):
-                            cell[k] += wa * a[k] + wb * b[k] + wc * c[k] + wd * d[k]
-                for k in range(len(cell)):
+                for k in range(channels):
+                    cell[k] = 0
+                for j in range(column * num_x, (column + 1) * num_x):
+                    a, b, a_weight, b_weight = (
+                        x[j, 0] * channels,
+                        x[j, 1] * channels,
+                        x_weights[j, 0],
+                        x_weights[j, 1],
+                    )
+                    for k in range(channels):
+                        cell[k] += a_weight * strip[a + k] + b_weight * strip[b + k]
+                for k in range(channels):
                     out[r, k, row, column] = cell[k]
 
 
@@ -86,7 +113,7 @@ def _sample_points(low, high, length, stride, size, sampling_ratio, dtype):
     """Return the features beside each sampling point of an axis and their weights, both (size · samples, 2)."""
     start, extent = low / stride - 0.5, (high - low) / stride
     samples = sampling_ratio if sampling_ratio else max(1, int(np.ceil(extent / size)))
-    indices, weights = np.zeros((size * samples, 2), np.int64), np.zeros((size * samples, 2), dtype)
+    indices, weights = np.zeros((size * samples, 2), np.uint64), np.zeros((size * samples, 2), dtype)
     for n in range(len(indices)):
         point = start + extent * (n + 0.5) / (size * samples)
         if -1 <= point <= length:
@@ -103,12 +130,12 @@ def paste(probabilities, boxes, out):
     size = probabilities.shape[1]
     _, height, width = out.shape
     for n in range(len(boxes)):
-        left, upper, right, lower = boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3]
+        left, upper, right, lower = boxes[n]
         across, down = size / max(right - left, 1e-6), size / max(lower - upper, 1e-6)
         # Cells reach half a cell beyond the box, with decreasing weights.
-        for row in range(max(0, int(upper - 0.5 / down - 1)), min(height, int(lower + 0.5 / down + 1))):
+        for row in range(max(0, int(upper - 0.5 / down)), min(height, int(lower + 0.5 / down) + 1)):
             y = (row + 0.5 - upper) * down - 0.5
-            for column in range(max(0, int(left - 0.5 / across - 1)), min(width, int(right + 0.5 / across + 1))):
+            for column in range(max(0, int(left - 0.5 / across)), min(width, int(right + 0.5 / across) + 1)):
                 x = (column + 0.5 - left) * across - 0.5
                 out[n, row, column] = _read(probabilities[n], y, x) >= 0.5
 

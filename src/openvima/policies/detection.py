@@ -1,5 +1,6 @@
 """Objects from a detector on RGB images, in place of the simulator's segmentation."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -172,11 +173,15 @@ class DetectedObjects:
             costs a policy more than a false one: docs/detector.md has measurements.
         prompt_extractor: Extractor of prompt images, for detectors that are not trained on them;
             `GROUND_TRUTH`, for example.
+        cache_size: Pairs of images whose objects are kept for when they come again, such as an object that
+            many prompts show. Only for a detector that finds the same in equal images.
     """
 
     detector: Detector
     min_score: float = field(default=0.1, kw_only=True)
     prompt_extractor: ObjectExtractor | None = field(default=None, kw_only=True)
+    cache_size: int = field(default=0, kw_only=True)
+    _cache: dict[bytes, ObjectViews] = field(default_factory=dict, init=False, repr=False)
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
         """Extract the objects of an observation, from left to right.
@@ -187,8 +192,7 @@ class DetectedObjects:
             DetectionError: A detection lies outside the image.
         """
         frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
-        front, top = self._detect(frames)
-        return _merge_views(front, top, _match_views(front, top)).left_to_right()
+        return self._extract(frames)
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Extract the objects of a prompt image, from left to right.
@@ -205,11 +209,29 @@ class DetectedObjects:
             return self.prompt_extractor.in_prompt_image(image)
         single = image.kind == "object"
         frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
+        return self._extract(frames, single=single)
+
+    def _extract(self, frames: Mapping[View, np.ndarray], *, single: bool = False) -> ObjectViews:
+        if not self.cache_size:
+            return self._detect_objects(frames, single=single)
+        digest = hashlib.sha256(bytes([single]))  # half of the time of blake2b: CPUs have instructions for it
+        for view in VIEWS:
+            digest.update(np.ascontiguousarray(frames[view]))
+        key = digest.digest()
+        found = self._cache.pop(key, None)
+        if found is None:
+            found = self._detect_objects(frames, single=single)
+        self._cache[key] = found  # the latest is last
+        if len(self._cache) > self.cache_size:
+            del self._cache[next(iter(self._cache))]
+        return found
+
+    def _detect_objects(self, frames: Mapping[View, np.ndarray], *, single: bool) -> ObjectViews:
         front, top = self._detect(frames, single=single)
         both = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
         return _merge_views(front, top, both if single else _match_views(front, top)).left_to_right()
 
-    def _detect(self, frames: Mapping[View, np.ndarray], *, single: bool = False) -> list["_ViewDetections"]:
+    def _detect(self, frames: Mapping[View, np.ndarray], *, single: bool) -> list["_ViewDetections"]:
         if isinstance(self.detector, ViewsDetector):
             both = self.detector.detect_views([frames[view] for view in VIEWS])
         else:
