@@ -45,12 +45,18 @@ def test_coding_agrees_with_the_naive_twin_and_is_undone_by_decoding():
     deltas = encode_boxes(boxes, references, ROI_WEIGHTS)
     pairs = zip(boxes.tolist(), references.tolist(), strict=True)
     assert np.allclose(deltas, [naive.encode(a, b, ROI_WEIGHTS) for a, b in pairs], atol=1e-9)
-    assert torch.allclose(decode_boxes(deltas, references, ROI_WEIGHTS), boxes)
+    assert torch.allclose(decode_boxes(deltas, references, ROI_WEIGHTS, height=200, width=200), boxes)
 
 
 def test_the_growth_of_a_box_is_limited():
-    grown = decode_boxes(torch.tensor([0.0, 0, 500, 0]), torch.tensor([0.0, 0, 16, 16]), (1.0,) * 4)
+    deltas, box = torch.tensor([0.0, 0, 500, 0]), torch.tensor([600.0, 0, 616, 16])
+    grown = decode_boxes(deltas, box, (1.0,) * 4, height=2000, width=2000)
     assert float(grown[2] - grown[0]) == pytest.approx(1000)
+
+
+def test_decoded_boxes_are_clipped_to_the_image():
+    deltas, box = torch.tensor([[0.0, 0, 1, 0]]), torch.tensor([[0.0, 2, 16, 18]])
+    assert decode_boxes(deltas, box, (1.0,) * 4, height=10, width=20).tolist() == [[0, 2, 20, 10]]
 
 
 def test_boxes_are_clipped_to_the_image():
@@ -72,6 +78,12 @@ def test_nms_agrees_with_the_naive_twin(limit, seed):
     scores = rng.integers(0, 20, 80) / 20  # with ties
     kept = nms(boxes, torch.from_numpy(scores), limit)
     assert kept.tolist() == naive.nms(boxes.tolist(), scores.tolist(), limit, [0] * 80)
+
+
+def test_nms_acts_in_each_group_alone_and_drops_boxes_without_area():
+    boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 10], [0, 0, 10, 10], [5, 5, 5, 9]])
+    scores, groups = torch.tensor([0.7, 0.8, 0.9, 1.0]), torch.tensor([0, 1, 0, 1])
+    assert nms(boxes, scores, 0.5, groups).tolist() == [2, 1]
 
 
 def test_nms_of_no_boxes_is_empty():

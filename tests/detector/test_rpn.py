@@ -7,7 +7,7 @@ import pytest
 import naive_detection as naive
 
 torch = pytest.importorskip("torch")
-from openvima.detector.boxes import clip_boxes, decode_boxes  # noqa: E402
+from openvima.detector.boxes import decode_boxes  # noqa: E402
 from openvima.detector.rpn import WEIGHTS, AnchorPredictions, RegionProposalNetwork  # noqa: E402
 
 HEIGHT, WIDTH = 64, 96
@@ -36,8 +36,8 @@ def test_proposals_agree_with_sequential_nms_per_level(tiny, seed):
         boxes, scores, levels = [], [], []
         for level, anchors in enumerate(given.anchors):
             best, rows = given.objectness[level][image].topk(40)
-            decoded = decode_boxes(given.deltas[level][image, rows], anchors[rows], WEIGHTS)
-            boxes += clip_boxes(decoded, height=HEIGHT, width=WIDTH).tolist()
+            deltas = given.deltas[level][image, rows]
+            boxes += decode_boxes(deltas, anchors[rows], WEIGHTS, height=HEIGHT, width=WIDTH).tolist()
             scores += best.tolist()
             levels += [level] * 40
         solid = [n for n, box in enumerate(boxes) if box[2] > box[0] and box[3] > box[1]]

@@ -5,6 +5,7 @@ A box is (left, upper, right, lower) in pixels; pixel 0 covers 0 to 1.
 
 import math
 
+import numpy as np
 import torch
 
 from openvima.detector.kernels import decode, suppress
@@ -34,11 +35,6 @@ def clip_boxes(boxes: torch.Tensor, *, height: float, width: float) -> torch.Ten
     return torch.minimum(boxes.clamp(min=0), limits)
 
 
-def is_solid(boxes: torch.Tensor) -> torch.Tensor:
-    """Return which boxes (..., 4) have a positive width and height, shape (...), bool."""
-    return (boxes[..., 2:] > boxes[..., :2]).all(dim=-1)
-
-
 def encode_boxes(boxes: torch.Tensor, references: torch.Tensor, weights: Weights) -> torch.Tensor:
     """Return the regression targets that move reference boxes to boxes.
 
@@ -58,24 +54,28 @@ def encode_boxes(boxes: torch.Tensor, references: torch.Tensor, weights: Weights
     return deltas * deltas.new_tensor(weights)
 
 
-def decode_boxes(deltas: torch.Tensor, references: torch.Tensor, weights: Weights) -> torch.Tensor:
-    """Invert `encode_boxes`, with the growth limited to `MAX_LOG_SCALE`; without gradients.
+def decode_boxes(
+    deltas: torch.Tensor, references: torch.Tensor, weights: Weights, *, height: float, width: float
+) -> torch.Tensor:
+    """Invert `encode_boxes`, with the growth limited to `MAX_LOG_SCALE`, and clip the boxes; without gradients.
 
     Args:
         deltas: Shape (..., 4).
-        references: Of the same shape.
+        references: Shape (..., 4).
         weights: As for `encode_boxes`.
+        height: Of the image.
+        width: Of the image.
     """
     boxes = torch.empty(deltas.shape, dtype=references.dtype)
     flat = (part.detach().cpu().reshape(-1, 4).numpy() for part in (deltas, references))
-    decode(*flat, weights, MAX_LOG_SCALE, boxes.view(-1, 4).numpy())
+    decode(*flat, weights, MAX_LOG_SCALE, (float(width), float(height)), boxes.view(-1, 4).numpy())
     return boxes.to(deltas.device)
 
 
 def nms(
     boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float, groups: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Apply greedy non-maximum suppression; of equal scores the first wins.
+    """Apply greedy non-maximum suppression; of equal scores the first wins. Boxes without area are dropped.
 
     Args:
         boxes: Shape (N, 4).
@@ -86,10 +86,10 @@ def nms(
     Returns:
         Indices of the kept boxes by descending score, shape (K,), int64.
     """
-    order = scores.argsort(descending=True, stable=True)
-    best_first = boxes.detach()[order].double().cpu().numpy()
-    groups = torch.zeros_like(order) if groups is None else groups[order]
-    return order[torch.from_numpy(suppress(best_first, groups.cpu().numpy(), iou_threshold)).to(order.device)]
+    order = np.argsort(-scores.cpu().numpy(), kind="stable")
+    groups = torch.zeros(len(order), dtype=torch.int64) if groups is None else groups
+    kept = suppress(boxes.detach().cpu().numpy(), order, groups.cpu().numpy(), iou_threshold)
+    return torch.from_numpy(order[kept]).to(boxes.device)
 
 
 def _centres_and_sizes(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

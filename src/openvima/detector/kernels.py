@@ -34,32 +34,36 @@ def relu_and_pool(x, out):
 
 
 @njit(cache=True)
-def decode(deltas, references, weights, max_log_scale, boxes):
-    """Fill `boxes` (N, 4) as `decode_boxes` does; `weights` are four floats."""
+def decode(deltas, references, weights, max_log_scale, limits, boxes):
+    """Fill `boxes` (N, 4) as `decode_boxes` does; `weights` are four floats, `limits` width and height."""
     for n in range(len(boxes)):
         for axis in range(2):
             low, high = np.float64(references[n, axis]), np.float64(references[n, axis + 2])
             centre = (low + high) / 2 + deltas[n, axis] / weights[axis] * (high - low)
-            scale = np.exp(min(deltas[n, axis + 2] / weights[axis + 2], max_log_scale))
-            boxes[n, axis] = centre - scale * (high - low) / 2
-            boxes[n, axis + 2] = centre + scale * (high - low) / 2
+            half = np.exp(min(deltas[n, axis + 2] / weights[axis + 2], max_log_scale)) * (high - low) / 2
+            boxes[n, axis] = min(max(centre - half, 0.0), limits[axis])
+            boxes[n, axis + 2] = min(max(centre + half, 0.0), limits[axis])
 
 
 @njit(cache=True)
-def suppress(boxes, groups, iou_threshold):
-    """Return which boxes (N, 4), float64, best first, are kept, shape (N,), bool; groups (N,) are apart."""
-    kept = np.ones(len(boxes), np.bool_)
-    for i in range(len(boxes)):
+def suppress(boxes, order, groups, iou_threshold):
+    """Return which boxes (N, 4) are kept, shape (N,), bool, in the order of their indices `order` (N,).
+
+    Boxes without area are dropped. Boxes of different groups (N,) do not suppress each other.
+    """
+    left, upper, right, lower = boxes.astype(np.float64)[order].T
+    kept = (right > left) & (lower > upper)
+    for i in range(len(order)):
         if not kept[i]:
             continue
-        area = (boxes[i, 2] - boxes[i, 0]) * (boxes[i, 3] - boxes[i, 1])
-        for j in range(i + 1, len(boxes)):
-            if groups[j] != groups[i]:
+        area = (right[i] - left[i]) * (lower[i] - upper[i])
+        for j in range(i + 1, len(order)):
+            if not kept[j] or groups[order[j]] != groups[order[i]]:
                 continue
-            width = min(boxes[i, 2], boxes[j, 2]) - max(boxes[i, 0], boxes[j, 0])
-            height = min(boxes[i, 3], boxes[j, 3]) - max(boxes[i, 1], boxes[j, 1])
+            width = min(right[i], right[j]) - max(left[i], left[j])
+            height = min(lower[i], lower[j]) - max(upper[i], upper[j])
             if width > 0 and height > 0:
-                other = (boxes[j, 2] - boxes[j, 0]) * (boxes[j, 3] - boxes[j, 1])
+                other = (right[j] - left[j]) * (lower[j] - upper[j])
                 if width * height > iou_threshold * (area + other - width * height):
                     kept[j] = False
     return kept

@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.detector.backbone import Backbone
-from openvima.detector.boxes import clip_boxes, decode_boxes, is_solid, nms
+from openvima.detector.boxes import clip_boxes, decode_boxes, nms
 from openvima.detector.config import FIRST_STRIDE, DetectorConfig
 from openvima.detector.cpu_inference import is_cpu_inference, normalise
 from openvima.detector.heads import WEIGHTS, BoxHead, MaskHead, box_losses, mask_loss
@@ -154,10 +154,8 @@ class MaskRCNN(nn.Module):
         logits, deltas = self.box_head(self._pool(levels, references, owners, config.box_pool_size))
         scores, classes = logits.softmax(dim=1)[:, :-1].max(dim=1)
         rows = (scores >= config.score_threshold).nonzero()[:, 0]
-        boxes = decode_boxes(deltas[rows, classes[rows]], references[rows], WEIGHTS)
-        boxes = clip_boxes(boxes, height=size[0], width=size[1])
-        solid = is_solid(boxes)
-        rows, boxes = rows[solid], boxes[solid]
+        deltas = deltas[rows, classes[rows]]
+        boxes = decode_boxes(deltas, references[rows], WEIGHTS, height=size[0], width=size[1])
         kept = nms(boxes, scores[rows], config.nms_iou, owners[rows])
         of_images = (kept[owners[rows[kept]] == image] for image in range(len(proposals)))
         kept = torch.cat([own[: config.max_detections] for own in of_images])

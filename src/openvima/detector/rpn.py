@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.detector.anchors import ASPECT_RATIOS, pyramid_anchors
-from openvima.detector.boxes import clip_boxes, decode_boxes, encode_boxes, is_solid, nms
+from openvima.detector.boxes import decode_boxes, encode_boxes, nms
 from openvima.detector.config import FIRST_STRIDE, DetectorConfig
 from openvima.detector.matching import match, subsample
 
@@ -73,19 +73,19 @@ class RegionProposalNetwork(nn.Module):
     def propose(self, predictions: AnchorPredictions, *, height: int, width: int) -> list[torch.Tensor]:
         """Return the proposals of each image, shape (P, 4), by descending objectness; NMS acts per level."""
         config = self.config
-        all_scores, all_boxes, groups = [], [], []
+        all_scores, all_deltas, all_anchors, groups = [], [], [], []
         levels = zip(predictions.anchors, predictions.objectness, predictions.deltas, strict=True)
         for level, (anchors, objectness, deltas) in enumerate(levels):
             scores, rows = objectness.topk(min(config.rpn_pre_nms_top_n, len(anchors)))
-            chosen = deltas.gather(1, rows[..., None].expand(-1, -1, 4))
-            all_boxes.append(decode_boxes(chosen, anchors[rows], WEIGHTS))
             all_scores.append(scores)
+            all_deltas.append(deltas.gather(1, rows[..., None].expand(-1, -1, 4)))
+            all_anchors.append(anchors[rows])
             groups += [level] * scores.shape[1]
-        boxes = clip_boxes(torch.cat(all_boxes, dim=1), height=height, width=width)
+        deltas, anchors = torch.cat(all_deltas, dim=1), torch.cat(all_anchors, dim=1)
+        all_boxes = decode_boxes(deltas, anchors, WEIGHTS, height=height, width=width)
         return [
-            own[kept[is_solid(own[kept])][: config.rpn_post_nms_top_n]]
-            for own, scores in zip(boxes, torch.cat(all_scores, dim=1), strict=True)
-            for kept in [nms(own, scores, config.rpn_nms_iou, torch.tensor(groups))]
+            boxes[nms(boxes, scores, config.rpn_nms_iou, torch.tensor(groups))[: config.rpn_post_nms_top_n]]
+            for boxes, scores in zip(all_boxes, torch.cat(all_scores, dim=1), strict=True)
         ]
 
     def losses(
