@@ -18,8 +18,8 @@ from openvima.policies.devices import usable_device
 class FrameDetector:
     """Detects the objects of frames by a Mask R-CNN.
 
-    Both views of a time step are processed together, which takes less time, and nothing else is, so that
-    detections do not depend on a batch.
+    Images are processed in pairs or several pairs, whose detections do not depend on each other; see
+    `detect_batch`.
 
     Args:
         network: The network; it is copied, with batch normalisation fused into the convolutions.
@@ -46,14 +46,15 @@ class FrameDetector:
         Raises:
             ShapeError: The image has another shape or dtype.
         """
-        return self.detect_views([rgb])[0]
+        return self.detect_batch([rgb])[0]
 
     @torch.inference_mode()
-    def detect_views(self, frames: Sequence[np.ndarray]) -> list[Detections]:
-        """Detect the objects in images of equal size, such as both views of a time step.
+    def detect_batch(self, frames: Sequence[np.ndarray]) -> list[Detections]:
+        """Detect the objects in each of several images of equal size.
 
         Args:
-            frames: Shape (3, H, W), uint8, each.
+            frames: Shape (3, H, W), uint8, each. On a CPU detections in an even number of images are the same,
+                bit by bit, however many there are; those in a single image differ by rounding.
 
         Raises:
             ShapeError: An image has another shape or dtype.
@@ -64,7 +65,9 @@ class FrameDetector:
                     f"the image is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W)."
                 )
         images = torch.from_numpy(np.stack(frames)).to(self.device)
-        return [to_detections(found) for found in self.network(images)]
+        # Networks that enlarge their images have large features.
+        size = len(images) if self.network.config.min_size is None else 1
+        return [to_detections(found) for part in images.split(size) for found in self.network(part)]
 
 
 def to_detections(found: Instances) -> Detections:

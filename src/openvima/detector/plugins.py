@@ -8,7 +8,7 @@ FILE.py:FUNCTION               the same, from a Python file
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +19,7 @@ from openvima.data.object_cache.cache import Boxes, ObjectCache, Report, open_ob
 from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.errors import ConfigError
-from openvima.perception.objects import ObjectExtractor, ObjectViews, see_nothing
+from openvima.perception.objects import AheadExtractor, ObjectExtractor, ObjectViews, see_nothing
 from openvima.policies.detection import MATCHING_VERSION, DetectedObjects
 from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.sources import checkpoint_folder
@@ -153,6 +153,11 @@ class PluggedExtractor:
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Extract the objects of a prompt image; there may be none."""
         return _visible(self.extractor.in_prompt_image(image))
+
+    def extract_ahead(self, observations: Sequence[Mapping], images: Sequence[PromptImage]) -> None:
+        """Pass on images to an extractor that can process them together."""
+        if isinstance(self.extractor, AheadExtractor):
+            self.extractor.extract_ahead(observations, images)
 
 
 def _visible(found: ObjectViews) -> ObjectViews:

@@ -7,7 +7,7 @@ pixels around the object, and the resize is OpenCV's area interpolation bit for 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -142,6 +142,15 @@ class ObjectExtractor(Protocol):
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Find the objects that a prompt's image shows."""
+        ...
+
+
+@runtime_checkable
+class AheadExtractor(ObjectExtractor, Protocol):
+    """Takes less time for several images together, and keeps their objects until it is asked for them."""
+
+    def extract_ahead(self, observations: Sequence[Mapping], images: Sequence[PromptImage]) -> None:
+        """Find the objects of observations and prompt images that will be asked for."""
         ...
 
 

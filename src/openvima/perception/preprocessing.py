@@ -16,6 +16,7 @@ from openvima.perception.image_stack import ImageStack
 from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import (
     GROUND_TRUTH,
+    AheadExtractor,
     ObjectExtractor,
     ObjectViews,
     part_of,
@@ -210,6 +211,29 @@ def extract_observation(
     if extractor is None:
         return GROUND_TRUTH.in_observation(observation)
     return _numbered(extractor.in_observation(observation))
+
+
+def extract_ahead(
+    kind: InputKind,
+    extractor: ObjectExtractor | None,
+    *,
+    observations: Sequence[Mapping] = (),
+    prompts: Sequence[RenderedPrompt] = (),
+) -> None:
+    """Let an extractor find the objects of several observations or prompts together, if it can.
+
+    Args:
+        kind: As for `extract_observation`.
+        extractor: As for `extract_observation`, which is to be called after this.
+        observations: Its arguments.
+        prompts: Those of `preprocess_prompt`.
+    """
+    if kind == "objects" and isinstance(extractor, AheadExtractor):
+        images = [prompt.images[name] for prompt in prompts for name in image_names(prompt.text)]
+        extractor.extract_ahead(
+            [each for each in observations if FOUND not in each],
+            [each for each in images if not isinstance(each, FoundImage)],
+        )
 
 
 def offset_index(crop_index: np.ndarray, offset: int | np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ MAX_DISTANCE_M = 0.1
 DEPTH_WEIGHT = 0.5  # the front camera is tilted by 45 degrees, so height appears as distance
 COLOUR_WEIGHT_M = 0.3  # metres for histograms of colours without overlap
 NUM_BINS = 4  # of each colour channel
+JOINT_PAIRS = 4  # pairs of images in a batch: 20 % faster than each alone, and larger batches are no faster
 MATCHING_VERSION = 2  # grows whenever the same detections give other objects
 
 
@@ -152,11 +153,11 @@ class Detector(Protocol):
 
 
 @runtime_checkable
-class ViewsDetector(Detector, Protocol):
-    """Detects objects in both views of a time step at once."""
+class BatchDetector(Detector, Protocol):
+    """Detects objects in several images at once."""
 
-    def detect_views(self, frames: Sequence[np.ndarray]) -> Sequence[Detections]:
-        """Detect objects in the front view and the top view, as `detect` does."""
+    def detect_batch(self, frames: Sequence[np.ndarray]) -> Sequence[Detections]:
+        """Detect objects in pairs of a front view and a top view, as `detect` does."""
         ...
 
 
@@ -168,7 +169,7 @@ class DetectedObjects:
     in the other view. All ids are -1.
 
     Args:
-        detector: The detector; a `ViewsDetector` gets both views at once.
+        detector: The detector; a `BatchDetector` gets both views at once.
         min_score: Detections with a lower score are dropped. The default is low, since a missed object
             costs a policy more than a false one: docs/detector.md has measurements.
         prompt_extractor: Extractor of prompt images, for detectors that are not trained on them;
@@ -191,8 +192,7 @@ class DetectedObjects:
             ShapeError: An image or a detection has another shape or dtype.
             DetectionError: A detection lies outside the image.
         """
-        frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
-        return self._extract(frames)
+        return self._extract(_Pair.of_observation(observation))
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Extract the objects of a prompt image, from left to right.
@@ -207,38 +207,57 @@ class DetectedObjects:
         """
         if self.prompt_extractor is not None:
             return self.prompt_extractor.in_prompt_image(image)
-        single = image.kind == "object"
-        frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
-        return self._extract(frames, single=single)
+        return self._extract(_Pair.of_prompt_image(image))
 
-    def _extract(self, frames: Mapping[View, np.ndarray], *, single: bool = False) -> ObjectViews:
+    def extract_ahead(self, observations: Sequence[Mapping], images: Sequence[PromptImage]) -> None:
+        """Detect the objects of new images in batches, which takes less time, if there is a cache for them.
+
+        Args:
+            observations: What `in_observation` will be asked for.
+            images: What `in_prompt_image` will be asked for.
+
+        Raises:
+            PolicyError, ShapeError, DetectionError: As those methods.
+        """
+        pairs = [_Pair.of_observation(each) for each in observations]
+        if self.prompt_extractor is None:
+            pairs += [_Pair.of_prompt_image(each) for each in images]
+        new = [(key, pair) for key, pair in {each.key: each for each in pairs}.items() if key not in self._cache]
+        new = new[: self.cache_size]
+        for start in range(0, len(new), JOINT_PAIRS):
+            keys, chunk = zip(*new[start : start + JOINT_PAIRS], strict=True)
+            for key, found in zip(keys, self._detect(chunk), strict=True):
+                self._keep(key, found)
+
+    def _extract(self, pair: "_Pair") -> ObjectViews:
         if not self.cache_size:
-            return self._detect_objects(frames, single=single)
-        digest = hashlib.sha256(bytes([single]))  # half of the time of blake2b: CPUs have instructions for it
-        for view in VIEWS:
-            digest.update(np.ascontiguousarray(frames[view]))
-        key = digest.digest()
-        found = self._cache.pop(key, None)
+            return self._detect([pair])[0]
+        found = self._cache.pop(pair.key, None)
         if found is None:
-            found = self._detect_objects(frames, single=single)
+            (found,) = self._detect([pair])
+        self._keep(pair.key, found)
+        return found
+
+    def _keep(self, key: bytes, found: ObjectViews) -> None:
         self._cache[key] = found  # the latest is last
         if len(self._cache) > self.cache_size:
             del self._cache[next(iter(self._cache))]
-        return found
 
-    def _detect_objects(self, frames: Mapping[View, np.ndarray], *, single: bool) -> ObjectViews:
-        front, top = self._detect(frames, single=single)
-        both = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
-        return _merge_views(front, top, both if single else _match_views(front, top)).left_to_right()
-
-    def _detect(self, frames: Mapping[View, np.ndarray], *, single: bool) -> list["_ViewDetections"]:
-        if isinstance(self.detector, ViewsDetector):
-            both = self.detector.detect_views([frames[view] for view in VIEWS])
+    def _detect(self, pairs: Sequence["_Pair"]) -> list[ObjectViews]:
+        frames = [pair.frames[view] for pair in pairs for view in VIEWS]
+        views = VIEWS * len(pairs)
+        if isinstance(self.detector, BatchDetector):
+            detected = self.detector.detect_batch(frames)
         else:
-            both = [self.detector.detect(frames[view], view) for view in VIEWS]
+            detected = [self.detector.detect(rgb, view) for rgb, view in zip(frames, views, strict=True)]
+        singles = [pair.single for pair in pairs for _ in VIEWS]
+        crops = [
+            _crop_objects(rgb, self._chosen(found, rgb, view, single=single), view)
+            for rgb, view, found, single in zip(frames, views, detected, singles, strict=True)
+        ]
         return [
-            _crop_objects(frames[view], self._chosen(found, frames[view], view, single=single), view)
-            for view, found in zip(VIEWS, both, strict=True)
+            _joined(front, top, single=pair.single)
+            for pair, front, top in zip(pairs, crops[::2], crops[1::2], strict=True)
         ]
 
     def _chosen(self, found: Detections, rgb: np.ndarray, view: View, *, single: bool) -> Detections:
@@ -246,6 +265,31 @@ class DetectedObjects:
         if single and len(found):
             return found.select(np.array([0 if found.scores is None else found.scores.argmax()]))
         return found if found.scores is None else found.select(found.scores >= self.min_score)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Both views of an observation or a prompt image; `single` if it is of a single object."""
+
+    frames: Mapping[View, np.ndarray]
+    single: bool
+
+    @staticmethod
+    def of_observation(observation: Mapping) -> "_Pair":
+        return _Pair(camera_frames(part_of(observation, "rgb"), "the observation's rgb"), False)
+
+    @staticmethod
+    def of_prompt_image(image: PromptImage) -> "_Pair":
+        frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
+        return _Pair(frames, image.kind == "object")
+
+    @property
+    def key(self) -> bytes:
+        """Digest of the content, which takes half of the time with SHA-256: CPUs have instructions for it."""
+        digest = hashlib.sha256(bytes([self.single]))
+        for view in VIEWS:
+            digest.update(np.ascontiguousarray(self.frames[view]))
+        return digest.digest()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,6 +335,15 @@ def _histogram(pixels: np.ndarray) -> np.ndarray:
     """Return which fraction of pixels (3, K), uint8, is in each bin of RGB, shape (64,)."""
     bins = np.ravel_multi_index(tuple(pixels // (256 // NUM_BINS)), (NUM_BINS,) * 3)
     return np.bincount(bins, minlength=NUM_BINS**3) / pixels.shape[1]
+
+
+def _joined(front: _ViewDetections, top: _ViewDetections, *, single: bool) -> ObjectViews:
+    """Match the detections of both views, all of them or those of a single object."""
+    if single:
+        pairs = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
+    else:
+        pairs = _match_views(front, top)
+    return _merge_views(front, top, pairs).left_to_right()
 
 
 def _match_views(front: _ViewDetections, top: _ViewDetections) -> list[tuple[int, int]]:

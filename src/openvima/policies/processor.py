@@ -23,6 +23,7 @@ from openvima.perception.preprocessing import (
     InputKind,
     ObjectTable,
     PreprocessedPrompts,
+    extract_ahead,
     extract_observation,
     preprocess_prompt,
     split_prompt,
@@ -118,6 +119,7 @@ class Processor:
         if not all(prompt.sequence() for prompt in prompts):
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
         stack = stack or ImageStack(self.image_size)
+        extract_ahead(self.input_kind, self.extractor, prompts=prompts)
         preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
         return self.batch_prompts(PreprocessedPrompts.of(preprocessed)), stack
 
@@ -149,6 +151,7 @@ class Processor:
         stack = stack or ImageStack(self.image_size)
         if num_slots is None or self.layout != "views":
             num_slots = [0] * len(histories)
+        extract_ahead(self.input_kind, self.extractor, observations=[each for own in histories for each in own])
         found: list[ObjectViews] = []
         end_effectors: list[int] = []
         for history, slots in zip(histories, num_slots, strict=True):

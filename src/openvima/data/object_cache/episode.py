@@ -15,6 +15,7 @@ from openvima.perception.preprocessing import (
     InputKind,
     ObjectTable,
     PreprocessedPrompt,
+    extract_ahead,
     extract_observation,
     offset_index,
     preprocess_prompt,
@@ -112,8 +113,9 @@ def preprocess(
         PolicyError: A view is missing, or objects have impossible ids.
     """
     stack = ImageStack(IMAGE_SIZES[kind])
-    prompt = preprocess_prompt(demo.prompt, kind, extractor, stack)
     observations = [demo.observation(t) for t in range(demo.num_steps)]
+    extract_ahead(kind, extractor, observations=observations, prompts=[demo.prompt])
+    prompt = preprocess_prompt(demo.prompt, kind, extractor, stack)
     views = [extract_observation(observation, kind, extractor) for observation in observations]
     objects = ObjectTable.from_views(ObjectViews.concatenated(views), stack)
     pick_ids, place_ids = np.array(demo.pick_ids, np.int16), np.array(demo.place_ids, np.int16)
