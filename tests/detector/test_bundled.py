@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from openvima.detector import load_extractor
+from openvima.detector import load_detector, load_extractor
 from openvima.env import TabletopEnv
 from openvima.perception.iou import match_ids_to_slots
 from openvima.perception.objects import GROUND_TRUTH
@@ -34,3 +34,36 @@ def test_it_finds_the_objects_of_scenes_and_prompts(task: str) -> None:
             num_found += len(found)
     assert num_right >= 0.95 * num_true
     assert num_found <= 1.5 * num_true  # split objects and false positives
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[np.ndarray]:
+    """Both views of the first moment of twelve episodes."""
+    env = TabletopEnv("rearrange")
+    observations = [env.reset(seed=seed)[0] for seed in range(12)]
+    return [observation["rgb"][view] for observation in observations for view in ("front", "top")]
+
+
+@pytest.mark.parametrize("count", [8, pytest.param(24, marks=pytest.mark.slow)])
+def test_detections_of_several_pairs_of_images_are_those_of_each_pair_bit_by_bit(frames, count) -> None:
+    detector = load_detector()
+    swapped, expected, together = [], [], []
+    for k in range(0, len(frames), 2):
+        expected += detector.detect_batch(frames[k : k + 2])
+        swapped += detector.detect_batch(frames[k : k + 2][::-1])[::-1]
+    for k in range(0, len(frames), count):
+        together += detector.detect_batch(frames[k : k + count])
+    for found in (swapped, together):
+        for one, other in zip(found, expected, strict=True):
+            assert len(one)
+            for name in ("scores", "boxes", "masks"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_an_image_alone_shows_the_same_objects(frames) -> None:
+    detector = load_detector()
+    for alone, other in zip(
+        map(detector.detect, frames[:4], "ftft"), detector.detect_batch(frames[:4]), strict=True
+    ):
+        np.testing.assert_array_equal(alone.boxes, other.boxes)
+        np.testing.assert_allclose(alone.scores, other.scores, atol=1e-4)

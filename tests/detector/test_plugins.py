@@ -12,7 +12,12 @@ import pytest
 from object_rows import rows_of
 from openvima.data import Dataset
 from openvima.data.object_cache.episode import preprocess
-from openvima.detector.plugins import detected_object_cache, plugged_boxes, plugged_extractor
+from openvima.detector.plugins import (
+    PluggedExtractor,
+    detected_object_cache,
+    plugged_boxes,
+    plugged_extractor,
+)
 from openvima.env import TabletopEnv
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth
@@ -68,6 +73,17 @@ def test_only_what_a_view_shows_is_found_and_one_hidden_object_stands_for_nothin
     assert len(found) == 1
     assert not found.masks.any()
     assert len(extractor.in_prompt_image(next(iter(env.prompt.images.values())))) == 0
+
+
+def test_images_are_announced_only_to_an_extractor_that_takes_several():
+    class Ahead(GroundTruth):
+        def extract_ahead(self, observations, images):
+            announced.append((observations, images))
+
+    announced = []
+    for extractor in (GROUND_TRUTH, Ahead()):
+        PluggedExtractor(extractor).extract_ahead([{}], [])
+    assert announced == [([{}], [])]
 
 
 def test_the_name_of_a_function_follows_from_its_file(tmp_path):

@@ -17,7 +17,7 @@ from openvima.perception.objects import (
     observe_prompt_image,
 )
 from openvima.policies.detection import DetectedObjects, Detections
-from openvima.scene import ObjectRecord, PromptImage
+from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 from openvima.tasks import list_tasks
 
 SHAPE = (128, 256)
@@ -211,6 +211,78 @@ def test_prompt_images_can_be_left_to_another_extractor(starts) -> None:
     extractor = DetectedObjects(Fixed(plain(), plain()), prompt_extractor=GROUND_TRUTH)
     for image in env.prompt.images.values():
         assert_same(extractor.in_prompt_image(image), observe_prompt_image(image))
+
+
+class Bright:
+    """Detects one box as far from the left border as the image is bright, in several images at once."""
+
+    def __init__(self) -> None:
+        self.batches: list[int] = []
+
+    def detect(self, rgb: np.ndarray, view: str) -> Detections:
+        raise AssertionError("both views are detected together")
+
+    def detect_batch(self, frames: list[np.ndarray]) -> list[Detections]:
+        self.batches.append(len(frames))
+        return [plain((int(rgb[0, 0, 0]), 60, int(rgb[0, 0, 0]) + 20, 80)) for rgb in frames]
+
+
+def bright(level: int) -> dict[str, np.ndarray]:
+    return {view: np.full((3, *SHAPE), level, np.uint8) for view in VIEWS}
+
+
+def test_images_announced_ahead_are_detected_in_batches_and_give_the_same_objects() -> None:
+    observations = [observation(bright(level)) for level in (0, 10, 20, 30, 10)]
+    images = [prompt_image(kind, bright(level)) for kind, level in (("object", 40), ("scene", 20))]
+    detector = Bright()
+    ahead, alone = DetectedObjects(detector, cache_size=9), DetectedObjects(Bright())
+    ahead.extract_ahead(observations, images)
+    assert detector.batches == [8, 2]  # the equal observations and the scene like one of them count once
+    for each in observations:
+        assert_same(ahead.in_observation(each), alone.in_observation(each))
+    for image in images:
+        assert_same(ahead.in_prompt_image(image), alone.in_prompt_image(image))
+    assert detector.batches == [8, 2]
+
+
+def test_only_the_latest_images_are_kept() -> None:
+    detector = Bright()
+    extractor = DetectedObjects(detector, cache_size=2)
+    for level in (0, 10, 0, 20, 0, 10):  # 10 is dropped for 20
+        extractor.in_observation(observation(bright(level)))
+    assert len(detector.batches) == 4
+    extractor.extract_ahead([observation(bright(level)) for level in (30, 40, 50, 60)], [])
+    assert detector.batches[4:] == [4]  # no more than are kept
+
+
+def test_a_single_object_and_a_scene_of_equal_pixels_are_kept_apart() -> None:
+    extractor = DetectedObjects(Fixed(plain((0, 0, 9, 9), (200, 9, 220, 30)), plain()), cache_size=2)
+    assert len(extractor.in_prompt_image(prompt_image("object"))) == 1
+    assert len(extractor.in_prompt_image(prompt_image("scene"))) == 2
+
+
+def test_without_a_cache_nothing_is_detected_ahead_and_equal_images_again() -> None:
+    detector = Bright()
+    extractor = DetectedObjects(detector)
+    extractor.extract_ahead([observation(bright(10))] * 2, [])
+    assert detector.batches == []
+    for _ in range(2):
+        extractor.in_observation(observation(bright(10)))
+    assert detector.batches == [2, 2]
+
+
+def test_an_extractor_is_told_ahead_of_the_images_of_a_batch() -> None:
+    pytest.importorskip("torch")
+    from openvima.policies.processor import Processor
+
+    detector = Bright()
+    processor = Processor("objects", extractor=DetectedObjects(detector, cache_size=9))
+    text = "Put the {thing} into the {thing}."
+    prompts = [RenderedPrompt(text, {"thing": prompt_image("object", bright(level))}) for level in (10, 20)]
+    _, stack = processor.encode_prompts(prompts)
+    assert detector.batches == [4]
+    processor.encode_observations([[observation(bright(level))] for level in (30, 40, 50)], stack=stack)
+    assert detector.batches == [4, 6]
 
 
 def test_boxes_in_real_numbers_take_in_every_pixel_they_touch() -> None:

@@ -7,8 +7,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.detector.cpu_inference import is_cpu_inference, rectify_and_pool
 from openvima.detector.config import BackboneConfig
+from openvima.detector.cpu_inference import is_cpu_inference, rectify_and_pool
 
 
 class ConvNorm(nn.Module):

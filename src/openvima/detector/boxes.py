@@ -57,7 +57,7 @@ def encode_boxes(boxes: torch.Tensor, references: torch.Tensor, weights: Weights
 def decode_boxes(
     deltas: torch.Tensor, references: torch.Tensor, weights: Weights, *, height: float, width: float
 ) -> torch.Tensor:
-    """Invert `encode_boxes`, with the growth limited to `MAX_LOG_SCALE`, and clip the boxes; without gradients.
+    """Invert `encode_boxes`, with the growth limited to `MAX_LOG_SCALE`, and clip; without gradients.
 
     Args:
         deltas: Shape (..., 4).
@@ -67,8 +67,9 @@ def decode_boxes(
         width: Of the image.
     """
     boxes = torch.empty(deltas.shape, dtype=references.dtype)
-    flat = (part.detach().cpu().reshape(-1, 4).numpy() for part in (deltas, references))
-    decode(*flat, weights, MAX_LOG_SCALE, (float(width), float(height)), boxes.view(-1, 4).numpy())
+    rows, anchors = (part.detach().cpu().reshape(-1, 4).numpy() for part in (deltas, references))
+    limits = float(width), float(height)
+    decode(rows, anchors, weights, MAX_LOG_SCALE, limits, boxes.view(-1, 4).numpy())
     return boxes.to(deltas.device)
 
 

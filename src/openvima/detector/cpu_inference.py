@@ -16,7 +16,7 @@ def normalise(
     pixels: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, *, height: int, width: int
 ) -> torch.Tensor:
     """Normalise images (B, 3, H, W), uint8, and pad them with zeros to (B, 3, height, width)."""
-    table = (torch.arange(256) - mean) / std
+    table = (torch.arange(256) - mean.view(3, 1)) / std.view(3, 1)
     normalised = torch.zeros(len(pixels), height, width, 3)
     look_up(pixels.numpy(), table.numpy(), normalised.numpy())
     return normalised.permute(0, 3, 1, 2)

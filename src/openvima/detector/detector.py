@@ -53,8 +53,8 @@ class FrameDetector:
         """Detect the objects in each of several images of equal size.
 
         Args:
-            frames: Shape (3, H, W), uint8, each. On a CPU detections in an even number of images are the same,
-                bit by bit, however many there are; those in a single image differ by rounding.
+            frames: Shape (3, H, W), uint8, each. Detections are the same, bit by bit, whatever the even
+                number of images; those in a single image differ by rounding.
 
         Raises:
             ShapeError: An image has another shape or dtype.

@@ -16,7 +16,7 @@ def look_up(images, table, out):
 
 @njit(cache=True)
 def relu_and_pool(x, out):
-    """Write maxima of 0 and 3 × 3 pixels of `x` (B, H, W, C) with stride 2 to `out` (B, ⌈H / 2⌉, ⌈W / 2⌉, C)."""
+    """Write maxima of 0 and 3 × 3 pixels of `x` (B, H, W, C), with stride 2, to `out`, half as large."""
     _, height, width, channels = x.shape
     highest = np.empty(width * channels, x.dtype)  # of three rows, where one at the border counts twice
     for image in range(len(out)):
@@ -71,7 +71,7 @@ def suppress(boxes, order, groups, iou_threshold):
 
 @njit(cache=True)
 def align(features, boxes, images, levels, level, stride, sampling_ratio, out):
-    """Average samples of features (B, H, W, C) in the cells of boxes (R, 4) of one level, as `roi_align` does.
+    """Average samples of features (B, H, W, C) in cells of the boxes (R, 4) of a level, as `roi_align` does.
 
     `images` (R,) and `levels` (R,) are those of the boxes; `out` is (R, C, size, size). Bilinear weights are
     products of one for the row and one for the column, so features are summed over rows first. Indices are
@@ -114,7 +114,7 @@ def align(features, boxes, images, levels, level, stride, sampling_ratio, out):
 
 @njit(cache=True)
 def _sample_points(low, high, length, stride, size, sampling_ratio, dtype):
-    """Return the features beside each sampling point of an axis and their weights, both (size · samples, 2)."""
+    """Return the features beside each sampling point of an axis and their weights, (size · samples, 2)."""
     start, extent = low / stride - 0.5, (high - low) / stride
     samples = sampling_ratio if sampling_ratio else max(1, int(np.ceil(extent / size)))
     indices, weights = np.zeros((size * samples, 2), np.uint64), np.zeros((size * samples, 2), dtype)

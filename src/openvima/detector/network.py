@@ -139,8 +139,7 @@ class MaskRCNN(nn.Module):
     def _normalised(self, pixels: torch.Tensor, height: int, width: int) -> torch.Tensor:
         """Normalise pixels, and pad them with zeros."""
         if pixels.dtype == torch.uint8 and is_cpu_inference(pixels):
-            mean, std = self.pixel_mean[:, 0], self.pixel_std[:, 0]
-            return normalise(pixels, mean, std, height=height, width=width)
+            return normalise(pixels, self.pixel_mean, self.pixel_std, height=height, width=width)
         padding = (0, width - pixels.shape[3], 0, height - pixels.shape[2])
         return F.pad((pixels - self.pixel_mean) / self.pixel_std, padding)
 

@@ -222,7 +222,9 @@ class DetectedObjects:
         pairs = [_Pair.of_observation(each) for each in observations]
         if self.prompt_extractor is None:
             pairs += [_Pair.of_prompt_image(each) for each in images]
-        new = [(key, pair) for key, pair in {each.key: each for each in pairs}.items() if key not in self._cache]
+        new = [
+            (key, pair) for key, pair in {each.key: each for each in pairs}.items() if key not in self._cache
+        ]
         new = new[: self.cache_size]
         for start in range(0, len(new), JOINT_PAIRS):
             keys, chunk = zip(*new[start : start + JOINT_PAIRS], strict=True)
@@ -271,7 +273,7 @@ class DetectedObjects:
 class _Pair:
     """Both views of an observation or a prompt image; `single` if it is of a single object."""
 
-    frames: Mapping[View, np.ndarray]
+    frames: Mapping[str, np.ndarray]
     single: bool
 
     @staticmethod
@@ -288,7 +290,7 @@ class _Pair:
         """Digest of the content, which takes half of the time with SHA-256: CPUs have instructions for it."""
         digest = hashlib.sha256(bytes([self.single]))
         for view in VIEWS:
-            digest.update(np.ascontiguousarray(self.frames[view]))
+            digest.update(np.ascontiguousarray(self.frames[view]).data)
         return digest.digest()
 
 
@@ -339,11 +341,8 @@ def _histogram(pixels: np.ndarray) -> np.ndarray:
 
 def _joined(front: _ViewDetections, top: _ViewDetections, *, single: bool) -> ObjectViews:
     """Match the detections of both views, all of them or those of a single object."""
-    if single:
-        pairs = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
-    else:
-        pairs = _match_views(front, top)
-    return _merge_views(front, top, pairs).left_to_right()
+    both = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
+    return _merge_views(front, top, both if single else _match_views(front, top)).left_to_right()
 
 
 def _match_views(front: _ViewDetections, top: _ViewDetections) -> list[tuple[int, int]]:

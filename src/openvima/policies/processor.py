@@ -151,7 +151,9 @@ class Processor:
         stack = stack or ImageStack(self.image_size)
         if num_slots is None or self.layout != "views":
             num_slots = [0] * len(histories)
-        extract_ahead(self.input_kind, self.extractor, observations=[each for own in histories for each in own])
+        extract_ahead(
+            self.input_kind, self.extractor, observations=[each for own in histories for each in own]
+        )
         found: list[ObjectViews] = []
         end_effectors: list[int] = []
         for history, slots in zip(histories, num_slots, strict=True):
