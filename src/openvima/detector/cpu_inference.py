@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from openvima.detector.kernels import align, look_up, relu_and_pool
@@ -50,5 +51,6 @@ def align_levels(
     return pooled
 
 
-def _channels_last(x: torch.Tensor):
+def _channels_last(x: torch.Tensor) -> np.ndarray:
+    """Map (B, C, H, W) to (B, H, W, C)."""
     return x.permute(0, 2, 3, 1).contiguous().numpy()

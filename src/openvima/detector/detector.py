@@ -18,8 +18,7 @@ from openvima.policies.devices import usable_device
 class FrameDetector:
     """Detects the objects of frames by a Mask R-CNN.
 
-    Images are processed in pairs or several pairs, whose detections do not depend on each other; see
-    `detect_batch`.
+    Images are processed in pairs or several pairs, whose detections do not depend on the batch.
 
     Args:
         network: The network; it is copied, with batch normalisation fused into the convolutions.

@@ -79,12 +79,9 @@ class MaskHead(nn.Module):
         kernel = self.deconv.weight.permute(0, 2, 3, 1).reshape(width, -1)  # (C, 2 · 2 · C)
         assert self.deconv.bias is not None  # it has one
         cells = F.relu_((features.permute(0, 2, 3, 1) @ kernel).view(-1, width).add_(self.deconv.bias))
-        logits, classes = (
-            F.linear(cells, self.mask_logits.weight.flatten(1), self.mask_logits.bias),
-            self.mask_logits.out_channels,
-        )
-        logits = logits.view(count, size, size, 2, 2, classes).permute(0, 5, 1, 3, 2, 4)
-        return logits.reshape(count, classes, 2 * size, 2 * size)
+        logits = F.linear(cells, self.mask_logits.weight.flatten(1), self.mask_logits.bias)
+        logits = logits.view(count, size, size, 2, 2, logits.shape[1]).permute(0, 5, 1, 3, 2, 4)
+        return logits.reshape(count, logits.shape[1], 2 * size, 2 * size)
 
 
 def box_losses(

@@ -1,4 +1,4 @@
-"""Numba kernels of the detector for inference: normalisation, suppression, RoIAlign, mask pasting."""
+"""Numba kernels of the detector: normalisation, pooling, box decoding, suppression, RoIAlign, pasting."""
 
 import numpy as np
 from numba import njit
@@ -93,19 +93,16 @@ def align(features, boxes, images, levels, level, stride, sampling_ratio, out):
             for k in range(first, last):
                 strip[k] = 0
             for i in range(row * num_y, (row + 1) * num_y):
-                a, b, a_weight, b_weight = y[i, 0] * pitch, y[i, 1] * pitch, y_weights[i, 0], y_weights[i, 1]
+                a, b = y[i, 0] * pitch, y[i, 1] * pitch
+                a_weight, b_weight = y_weights[i, 0], y_weights[i, 1]
                 for k in range(first, last):
                     strip[k] += a_weight * frame[a + k] + b_weight * frame[b + k]
             for column in range(size):
                 for k in range(channels):
                     cell[k] = 0
                 for j in range(column * num_x, (column + 1) * num_x):
-                    a, b, a_weight, b_weight = (
-                        x[j, 0] * channels,
-                        x[j, 1] * channels,
-                        x_weights[j, 0],
-                        x_weights[j, 1],
-                    )
+                    a, b = x[j, 0] * channels, x[j, 1] * channels
+                    a_weight, b_weight = x_weights[j, 0], x_weights[j, 1]
                     for k in range(channels):
                         cell[k] += a_weight * strip[a + k] + b_weight * strip[b + k]
                 for k in range(channels):

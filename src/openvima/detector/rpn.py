@@ -63,7 +63,7 @@ class RegionProposalNetwork(nn.Module):
         bias = _interleaved(self.objectness.bias, self.deltas.bias)
         for level in levels:
             hidden = F.relu_(self.conv(level)).permute(0, 2, 3, 1)
-            outputs = F.linear(hidden, weight, bias).view(len(level), -1, 5)  # (B, h · w · 3, 5)
+            outputs = F.linear(hidden, weight, bias).reshape(len(level), -1, 5)  # (B, h · w · 3, 5)
             objectness.append(outputs[..., 0])
             deltas.append(outputs[..., 1:])
         device, dtype = levels[0].device, levels[0].dtype
