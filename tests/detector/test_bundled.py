@@ -45,7 +45,8 @@ def frames() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("count", [8, pytest.param(24, marks=pytest.mark.slow)])
-def test_detections_of_several_pairs_of_images_are_those_of_each_pair_bit_by_bit(frames, count) -> None:
+def test_detections_of_several_pairs_of_images_are_those_of_each_pair(frames, count) -> None:
+    # To the bit on the processors at hand; another one may take other kernels for other sizes.
     detector = load_detector()
     swapped, expected, together = [], [], []
     for k in range(0, len(frames), 2):
@@ -56,8 +57,9 @@ def test_detections_of_several_pairs_of_images_are_those_of_each_pair_bit_by_bit
     for found in (swapped, together):
         for one, other in zip(found, expected, strict=True):
             assert len(one)
-            for name in ("scores", "boxes", "masks"):
-                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+            np.testing.assert_array_equal(one.boxes, other.boxes)
+            np.testing.assert_allclose(one.scores, other.scores, atol=1e-4)
+            assert np.count_nonzero(one.masks != other.masks) <= len(one)
 
 
 def test_an_image_alone_shows_the_same_objects(frames) -> None:
