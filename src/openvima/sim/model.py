@@ -133,6 +133,7 @@ def build_model(bodies: Sequence[BodyShape], *, with_spatula: bool) -> mujoco.Mj
 def _compile(bodies: Sequence[BodyShape], with_spatula: bool) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.memory = _MEMORY_BYTES
+    spec.compiler.usethread = False  # a scene has a few small hulls: threads take longer to start
     spec.option.timestep = TICK_S
     spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
     spec.option.tolerance = 1e-10  # relative to the mean inertia before 4.0; the spatula dominates it
