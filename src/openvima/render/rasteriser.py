@@ -1,6 +1,7 @@
 """Rasteriser of scenes and prompts: colours, object ids and heights, bit-identical on every machine."""
 
 import math
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -82,7 +83,6 @@ class Rasteriser:
     """Draws scenes and prompts with one asset pack.
 
     Directional light, no shadows, no anti-aliasing: with the original asset pack, the pixels of VIMA-Bench.
-    Not thread-safe.
 
     Args:
         assets: Asset pack.
@@ -90,11 +90,6 @@ class Rasteriser:
 
     def __init__(self, assets: Assets) -> None:
         self.assets = assets
-        self._buffers = KernelBuffers()
-        self._depth: dict[tuple[int, int], np.ndarray] = {}
-
-    def __reduce__(self) -> tuple[type["Rasteriser"], tuple[Assets]]:
-        return Rasteriser, (self.assets,)  # without the working memory
 
     def scene(
         self,
@@ -184,12 +179,12 @@ class Rasteriser:
         images: dict[View, Image] = {}
         for view in views:
             empty = _empty_canvas(CAMERAS[view].enlarged(enlarge), table)
-            buffer = self._depth.setdefault(empty.segm.shape, np.empty(empty.segm.shape))
+            buffer = _MEMORY.depth(empty.segm.shape)
             np.copyto(buffer, empty.depth)
             heights = empty.height.copy() if height else _NO_HEIGHTS
             canvas = _Canvas(empty.camera, empty.rgb.copy(), empty.segm.copy(), heights, buffer)
             for body in prepared:
-                _draw_body(body, canvas, self._buffers)
+                _draw_body(body, canvas)
             distances = _distances(buffer, CAMERAS[view]) if depth else None
             images[view] = Image(canvas.rgb, canvas.segm, heights if height else None, distances)
         return images
@@ -208,6 +203,22 @@ class _Canvas:
     height: np.ndarray
     depth: np.ndarray
 
+
+class _WorkingMemory(threading.local):
+    """Buffers of all rasterisers of a thread: shared, they stay in the CPU's cache where these take turns."""
+
+    def __init__(self) -> None:
+        self.buffers = KernelBuffers()
+        self._depth: dict[tuple[int, ...], np.ndarray] = {}
+
+    def depth(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Return the depth buffer of a shape, float64."""
+        if shape not in self._depth:
+            self._depth[shape] = np.empty(shape)
+        return self._depth[shape]
+
+
+_MEMORY = _WorkingMemory()
 
 _Prepared = tuple[IndexedMesh, np.ndarray, np.ndarray, int]  # mesh, pose, texture, id
 
@@ -232,7 +243,7 @@ def _prepared(body: Drawable) -> _Prepared:
     return indexed(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id)
 
 
-def _draw_body(body: _Prepared, canvas: _Canvas, buffers: KernelBuffers) -> None:
+def _draw_body(body: _Prepared, canvas: _Canvas) -> None:
     mesh, pose, texture, object_id = body
     draw_triangles(
         mesh.vertices,
@@ -244,7 +255,7 @@ def _draw_body(body: _Prepared, canvas: _Canvas, buffers: KernelBuffers) -> None
         canvas.camera,
         texture,
         object_id,
-        *buffers.arrays(mesh),
+        *_MEMORY.buffers.arrays(mesh),
         canvas.depth,
         canvas.rgb,
         canvas.segm,
@@ -266,7 +277,7 @@ def _empty_canvas(camera: Camera, table: bool) -> _Canvas:
         floor = Drawable(_rectangle(200.0, 200.0), Pose((0.0, 0.0, FLOOR_Z)), FLOOR_ID, FLOOR_RGB)
         sheet = Drawable(_rectangle(*SHEET_SIZE), Pose((0.5, 0.0, 0.0)), SHEET_ID, SHEET_RGB)
         for body in (floor, sheet):
-            _draw_body(_prepared(body), canvas, KernelBuffers())
+            _draw_body(_prepared(body), canvas)
     return canvas
 
 
