@@ -4,6 +4,7 @@ Both have Gymnasium's interface, spaces and autoreset modes, and validate calls 
 `workers` for the second kind.
 """
 
+import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast  # Any: actions, observations and infos are nested dictionaries
@@ -12,8 +13,9 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from openvima.env.action_validation import ActionValidator
+from openvima.env.action_validation import RESET_MASK, ActionValidator
 from openvima.env.registration import make
+from openvima.env.sub_environments import SubEnvironments, batch_infos
 from openvima.env.tabletop import TabletopEnv
 from openvima.env.workers import AsyncTabletopEnvs
 from openvima.errors import ConfigError, unknown_name
@@ -94,6 +96,7 @@ class SyncTabletopEnvs(SyncVectorEnv):
     ) -> None:
         super().__init__(env_fns, autoreset_mode=autoreset_mode)
         self._validator = validator
+        self._played = SubEnvironments(self.envs, autoreset_mode, self._observations)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in all sub-environments, or in those of `options["reset_mask"]`.
@@ -110,9 +113,9 @@ class SyncTabletopEnvs(SyncVectorEnv):
             SamplingError: A task finds no start for its seed.
         """
         seeds = self._validator.check_reset(seed, options)
-        result = super().reset(seed=seeds, options=dict(options or {}))
+        infos = self._played.reset(seeds, (options or {}).get(RESET_MASK))
         self._validator.record_reset()
-        return result
+        return copy.deepcopy(self._observations), batch_infos(infos)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take a step in every sub-environment.
@@ -129,9 +132,9 @@ class SyncTabletopEnvs(SyncVectorEnv):
             ActionError: An action is invalid. No sub-environment moved.
         """
         self._validator.check_step(actions)
-        result = super().step(actions)
-        self._validator.record_step(result[2] | result[3])
-        return result
+        rewards, terminated, truncated, infos = self._played.step(actions)
+        self._validator.record_step(self._played.is_over)
+        return copy.deepcopy(self._observations), rewards, terminated, truncated, batch_infos(infos)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,13 @@ an action, terminates none.
 import atexit
 import contextlib
 import copy
-import functools
 import itertools
 import multiprocessing
 import pickle
 import time
 import traceback
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -25,10 +24,11 @@ from typing import Any  # actions, observations and infos are nested dictionarie
 import gymnasium
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory, read_from_shared_memory
 
 from openvima.env.action_validation import RESET_MASK, ActionValidator
+from openvima.env.sub_environments import Info, SubEnvironments, batch_infos, rows
 from openvima.errors import WorkerError
 from openvima.multiprocess import defer_sigint, exit_with_parent, init_worker, single_threaded_workers
 
@@ -105,7 +105,7 @@ class AsyncTabletopEnvs(VectorEnv):
         """Wait for the reset, for `timeout` seconds at most."""
         infos = self._wait("reset", timeout)
         self._validator.record_reset()
-        return copy.deepcopy(self._observations), self._join_infos(infos)
+        return copy.deepcopy(self._observations), _join_infos(infos)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take a step in every sub-environment, as `SyncTabletopEnvs.step` does."""
@@ -115,7 +115,7 @@ class AsyncTabletopEnvs(VectorEnv):
     def step_async(self, actions: Any) -> None:
         """Send a step to the workers; arguments as in `SyncTabletopEnvs.step`."""
         self._validator.check_step(actions)
-        self._send("step", [(_rows(actions, part),) for part in self._parts])
+        self._send("step", [(rows(actions, part),) for part in self._parts])
 
     def step_wait(
         self, timeout: float | None = None
@@ -126,7 +126,7 @@ class AsyncTabletopEnvs(VectorEnv):
         rewards, terminated, truncated = (np.concatenate(values) for values in ends)
         self._validator.record_step(terminated | truncated)
         observations = copy.deepcopy(self._observations)
-        return observations, rewards, terminated, truncated, self._join_infos(infos)
+        return observations, rewards, terminated, truncated, _join_infos(infos)
 
     def call(self, name: str, /, *args: object, **kwargs: object) -> tuple[Any, ...]:
         """Return an attribute, or the result of a method, of every sub-environment."""
@@ -239,9 +239,6 @@ class AsyncTabletopEnvs(VectorEnv):
             '`if __name__ == "__main__":`, because workers import them.'
         )
 
-    def _join_infos(self, infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        return _joined(infos, [part.stop - part.start for part in self._parts])
-
 
 _OPEN: weakref.WeakSet[AsyncTabletopEnvs] = weakref.WeakSet()
 
@@ -253,23 +250,9 @@ def _end_all_workers() -> None:
         envs.close(terminate=True)
 
 
-def _joined(infos: Sequence[Mapping[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:
-    """Join the infos of all workers, with blanks where one lacks a key."""
-    joined: dict[str, Any] = {}
-    for key in dict.fromkeys(key for info in infos for key in info):
-        values = [info.get(key) for info in infos]
-        some = next(value for value in values if value is not None)
-        if isinstance(some, dict):
-            joined[key] = _joined([value or {} for value in values], sizes)
-            continue
-        blank = None if some.dtype == object else 0
-        joined[key] = np.concatenate(
-            [
-                np.full((size, *some.shape[1:]), blank, some.dtype) if value is None else value
-                for value, size in zip(values, sizes, strict=True)
-            ]
-        )
-    return joined
+def _join_infos(infos: Iterable[Sequence[Info | None]]) -> dict[str, Any]:
+    """Join the infos of all workers."""
+    return batch_infos(list(itertools.chain.from_iterable(infos)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,24 +321,16 @@ class _Worker:
         num_envs: int,
     ) -> None:
         self._numbered = [_Numbered(env_fn(), index) for index, env_fn in enumerate(env_fns, part.start)]
-        built = [functools.partial(lambda env: env, env) for env in self._numbered]
-        self.envs = SyncVectorEnv(built, copy=False, autoreset_mode=autoreset_mode)
-        self._part = part
-        self._shared = read_from_shared_memory(self.envs.single_observation_space, memory, num_envs)
+        shared = read_from_shared_memory(self._numbered[0].observation_space, memory, num_envs)
+        self._played = SubEnvironments(self._numbered, autoreset_mode, rows(shared, part))
 
-    def reset(self, seeds: list[int | None], mask: np.ndarray | None) -> dict[str, Any]:
+    def reset(self, seeds: list[int | None], mask: np.ndarray | None) -> list[Info | None]:
         """Start episodes where the mask is true; return the infos."""
-        if mask is not None and not mask.any():
-            return {}
-        observations, infos = self.envs.reset(seed=seeds, options={} if mask is None else {RESET_MASK: mask})
-        _copy(observations, self._shared, self._part)
-        return infos
+        return self._played.reset(seeds, mask)
 
-    def step(self, actions: Sequence[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info | None]]:
         """Take a step; return rewards, terminated, truncated and infos."""
-        observations, rewards, terminated, truncated, infos = self.envs.step(actions)
-        _copy(observations, self._shared, self._part)
-        return rewards, terminated, truncated, infos
+        return self._played.step(actions)
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
         """Return results, or what was raised instead."""
@@ -363,21 +338,13 @@ class _Worker:
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
         """Set an attribute."""
-        self.envs.set_attr(name, values)
+        for env, value in zip(self._numbered, values, strict=True):
+            env.set_wrapper_attr(name, value)
 
-
-def _rows(batch: Any, part: slice) -> Any:
-    """Return consecutive rows of a batch of actions, an array or a mapping of them."""
-    return {key: values[part] for key, values in batch.items()} if isinstance(batch, Mapping) else batch[part]
-
-
-def _copy(batch: Any, shared: Any, part: slice) -> None:
-    """Copy a batch of observations to its part of shared memory."""
-    if isinstance(batch, dict):
-        for key, values in batch.items():
-            _copy(values, shared[key], part)
-    else:
-        shared[part] = batch
+    def close(self) -> None:
+        """Close them."""
+        for env in self._numbered:
+            env.close()
 
 
 def _work(pipe: Connection, *arguments: Any) -> None:
@@ -394,7 +361,7 @@ def _work(pipe: Connection, *arguments: Any) -> None:
                 raise
             except Exception as error:
                 _send_failure(pipe, error)
-        worker.envs.close()
+        worker.close()
     except (EOFError, ConnectionError):  # the parent has died: exit without a traceback
         exit_with_parent()
 
