@@ -4,6 +4,7 @@ Gymnasium's `SyncVectorEnv` gathers all observations after a step and copies the
 once, to its row of a batch, while it is in the CPU's cache.
 """
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any  # actions, observations and infos are nested dictionaries
 
@@ -30,6 +31,8 @@ class SubEnvironments:
         self._mode = autoreset_mode
         self._observations = observations
         self.is_over = np.zeros(len(envs), dtype=bool)
+        self._was_seeded = np.ones(len(envs), dtype=bool)  # the last reset; the next one may be as well
+        self._is_prepared = np.zeros(len(envs), dtype=bool)
 
     def reset(self, seeds: Sequence[int | None], mask: np.ndarray | None) -> list[Info | None]:
         """Start episodes where the mask is true, or in all; return the infos of these."""
@@ -62,7 +65,24 @@ class SubEnvironments:
         self.is_over = terminated | truncated
         return rewards, terminated, truncated, infos
 
+    def prepare(self) -> bool:
+        """Build one episode ahead of a reset without a seed that is certain or likely to come.
+
+        Returns:
+            Whether there was one to build.
+        """
+        is_certain = self.is_over & (self._mode is AutoresetMode.NEXT_STEP)
+        is_wanted = (is_certain | ~self._was_seeded) & ~self._is_prepared
+        if not is_wanted.any():
+            return False
+        index = int(np.argmax(is_wanted * (1 + is_certain)))
+        self._is_prepared[index] = True
+        with contextlib.suppress(Exception):  # the reset will raise it, or the environment is of another kind
+            self.envs[index].get_wrapper_attr("prepare")()
+        return True
+
     def _reset(self, index: int, seed: int | None) -> Info:
+        self._was_seeded[index], self._is_prepared[index] = seed is not None, False
         observation, info = self.envs[index].reset(seed=seed)
         _write(observation, self._observations, index)
         self.is_over[index] = False

@@ -1,5 +1,6 @@
 """The Gymnasium environment: one task, one arm, one table."""
 
+import copy
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -175,6 +176,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         self.action_space = _action_space(control)
         self._rasteriser = Rasteriser(self.assets)
         self._run: PrimitiveRun | None = None
+        self._prepared: tuple[tuple[Any, ...], PrimitiveRun] | None = None  # what it depends on, and itself
         if task_options:
             with suppress(SamplingError):  # another seed may succeed
                 self._sample(0)  # the task checks its options
@@ -216,9 +218,29 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         given = _episode_option(options, self.assets)
         super().reset(seed=seed)
         self._run = None  # no running episode should the rest fail
-        episode = given or self._sample(seed)
-        self._run = RUNS[self.control](episode, self.assets, self.compat)
+        prepared, self._prepared = self._prepared, None
+        if given is None:
+            seed = _draw_seed(self.np_random) if seed is None else seed
+            self._run = prepared[1] if prepared and prepared[0] == self._settings(seed) else self._build(seed)
+        else:
+            self._run = RUNS[self.control](given, self.assets, self.compat)
         return self._observe(), self._info()
+
+    def prepare(self, seed: int | None = None) -> None:
+        """Build an episode ahead of the `reset` that starts it, for use of idle time.
+
+        Only the duration of that `reset` changes. If the next one starts another episode, or settings of
+        the environment are assigned in between, the episode is discarded.
+
+        Args:
+            seed: The seed that `reset` will get.
+
+        Raises:
+            SamplingError: The task finds no start for this seed.
+            ConfigError: The seed is not an integer from 0 to 2**63 - 1.
+        """
+        seed = _draw_seed(copy.deepcopy(self.np_random)) if seed is None else checked_seed(seed)
+        self._prepared = self._settings(seed), self._build(seed)
 
     def step(
         self, action: Mapping[str, Any] | Action | np.ndarray | ToolCommand
@@ -289,7 +311,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
 
     def close(self) -> None:
         """Free the simulation; `reset` starts it again."""
-        self._run = None
+        self._run = self._prepared = None
 
     def oracle_decision(self) -> OracleDecision:
         """Return the next action of the scripted oracle, from the scene when it was last at rest.
@@ -399,11 +421,22 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             raise ConfigError(f"control is {self.control!r}; commands need control {END_EFFECTOR!r}.")
         return run
 
-    def _sample(self, seed: int | None) -> Episode:
+    def _settings(self, seed: int) -> tuple[Any, ...]:
+        """All that the start of an episode depends on."""
+        options = copy.deepcopy(self.task_options)
+        return (
+            *(seed, self.task, self.level, self.domain, self.assets, self.compat),
+            *(self.prompts, self.control, options),
+        )
+
+    def _build(self, seed: int) -> PrimitiveRun:
+        return RUNS[self.control](self._sample(seed), self.assets, self.compat)
+
+    def _sample(self, seed: int) -> Episode:
         return sample_episode(
             self.task,
             level=self.level,
-            seed=int(self.np_random.integers(_LARGEST_SEED)) if seed is None else seed,
+            seed=seed,
             domain=self.domain,
             assets=self.assets,
             compat=self.compat,
@@ -484,6 +517,10 @@ def _check_render_mode(render_mode: str | None) -> None:
     modes = TabletopEnv.metadata["render_modes"]
     if render_mode is not None and render_mode not in modes:
         raise ConfigError(f"render_mode is {render_mode!r}; allowed are None and {', '.join(modes)}.")
+
+
+def _draw_seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(_LARGEST_SEED))
 
 
 def _episode_option(options: Mapping[str, Any] | None, assets: Assets) -> Episode | None:

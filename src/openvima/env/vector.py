@@ -172,9 +172,17 @@ class FixedSeeds(gymnasium.Wrapper):
         """Start the next episode of the list, or the requested one."""
         if seed is not None or options:
             return self.env.reset(seed=seed, options=options)
-        seed = self._seeds[self._num_started % len(self._seeds)]
+        seed = self._next_seed
         self._num_started += 1
         return self.env.reset(seed=seed)
+
+    def prepare(self) -> None:
+        """Build the next episode of the list ahead; see `TabletopEnv.prepare`."""
+        cast(TabletopEnv, self.unwrapped).prepare(self._next_seed)
+
+    @property
+    def _next_seed(self) -> int:
+        return self._seeds[self._num_started % len(self._seeds)]
 
 
 def _env_factory(

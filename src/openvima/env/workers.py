@@ -332,6 +332,10 @@ class _Worker:
         """Take a step; return rewards, terminated, truncated and infos."""
         return self._played.step(actions)
 
+    def prepare(self) -> bool:
+        """Build one episode ahead; return whether there was one to build."""
+        return self._played.prepare()
+
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
         """Return results, or what was raised instead."""
         return [env.attempt(name, args, kwargs) for env in self._numbered]
@@ -353,7 +357,7 @@ def _work(pipe: Connection, *arguments: Any) -> None:
     try:
         worker = _Worker(*arguments)
         pipe.send(None)
-        while (message := pipe.recv())[0] != _CLOSE:
+        while (message := _receive_or_prepare(pipe, worker))[0] != _CLOSE:
             name, given = message
             try:
                 pipe.send(getattr(worker, name)(*given))
@@ -364,6 +368,13 @@ def _work(pipe: Connection, *arguments: Any) -> None:
         worker.close()
     except (EOFError, ConnectionError):  # the parent has died: exit without a traceback
         exit_with_parent()
+
+
+def _receive_or_prepare(pipe: Connection, worker: _Worker) -> Any:
+    """Wait for a message, and build episodes ahead until one is there."""
+    while not pipe.poll() and worker.prepare():
+        pass
+    return pipe.recv()
 
 
 def _send_failure(pipe: Connection, error: Exception) -> None:
