@@ -117,8 +117,7 @@ def batch_infos(infos: Sequence[Info | None]) -> dict[str, Any]:
     """
     batch: dict[str, Any] = {}
     for key in dict.fromkeys(key for info in infos if info for key in info):
-        has = np.array([info is not None and key in info for info in infos])
-        values = {index: infos[index][key] for index in np.flatnonzero(has).tolist()}
+        values = {index: info[key] for index, info in enumerate(infos) if info is not None and key in info}
         some = next(iter(values.values()))
         if isinstance(some, dict) and key != "final_obs":
             batch[key] = batch_infos([values.get(index) for index in range(len(infos))])
@@ -126,7 +125,7 @@ def batch_infos(infos: Sequence[Info | None]) -> dict[str, Any]:
             batch[key] = _blank(some, len(infos))
             for index, value in values.items():
                 batch[key][index] = value
-        batch[f"_{key}"] = has
+        batch[f"_{key}"] = np.isin(np.arange(len(infos)), list(values))
     return batch
 
 
