@@ -5,7 +5,8 @@
 Sub-environment i plays one task with seeds of its own, by actions of the oracle that were recorded before; an
 ended episode is followed by the next, whose start counts as a step. The single environments play the same
 episodes, one sub-environment after the other, so that the work is the same to the step. The first half of the
-steps is not timed: workers load textures and compiled code in it.
+steps is not timed: workers load textures and compiled code in it. This process forgets the models of earlier
+rounds, which play the same episodes: workers are new processes and have none.
 """
 
 import argparse
@@ -21,6 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import openvima
 from openvima.env import stack_actions
 from openvima.scene import Action
+from openvima.sim.model import _model_cache
 from sim import circumstances
 
 
@@ -44,6 +46,7 @@ def record(task: str, index: int, num_envs: int, steps: int) -> list[Action | No
 
 def time_single(tasks: Sequence[str], plans: Sequence[Sequence[Action | None]]) -> float:
     """Return the seconds that single environments take for the second half of the steps."""
+    _model_cache.cache_clear()
     envs = [openvima.make(tasks[index % len(tasks)]) for index in range(len(plans))]
     for index, env in enumerate(envs):
         env.reset(seed=index)
@@ -62,6 +65,7 @@ def time_single(tasks: Sequence[str], plans: Sequence[Sequence[Action | None]]) 
 
 def time_batch(tasks: Sequence[str], plans: Sequence[Sequence[Action | None]], num_workers: int) -> float:
     """Return the seconds that a vector environment takes for the second half of the steps."""
+    _model_cache.cache_clear()
     num_seeds = len(plans) * (len(plans[0]) + 1)
     envs = openvima.make_vec(list(tasks), len(plans), num_workers=num_workers, seeds=range(num_seeds))
     try:
