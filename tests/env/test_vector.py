@@ -88,6 +88,16 @@ def test_a_batch_holds_the_bytes_of_single_environments(pair: VectorEnv) -> None
         assert [frozen(info_of(infos, i)) for i in range(2)] == [frozen(result[4]) for result in results]
 
 
+def test_returned_observations_stay_as_they_were(pair: VectorEnv) -> None:
+    results = [pair.reset(seed=[4, 9])[0]]
+    before = [frozen(results[0])]
+    for actions in (oracle_actions(pair), stack_actions([CORNER, CORNER])):  # the second starts episodes
+        results.append(pair.step(actions)[0])
+        before.append(frozen(results[-1]))
+    assert [frozen(result) for result in results] == before
+    assert len({str(result) for result in before}) == 3
+
+
 def with_row(key: str, value: object) -> dict[str, np.ndarray]:
     """Two idle actions, of which the second is changed."""
     actions = stack_actions([CORNER, CORNER])
