@@ -224,7 +224,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             self._run = prepared[1] if prepared and prepared[0] == self._settings(seed) else self._build(seed)
         else:
             self._run = RUNS[self.control](given, self.assets, self.compat)
-        return self._observe(), self._info()
+        return self.observe(), self._info()
 
     def prepare(self, seed: int | None = None) -> None:
         """Build an episode ahead of the `reset` that starts it, for use of idle time.
@@ -258,6 +258,23 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             EpisodeError: No episode is running.
             ActionError: The action is invalid; nothing was moved.
         """
+        after = self.advance(action)
+        return self.observe(), *after
+
+    def advance(
+        self, action: Mapping[str, Any] | Action | np.ndarray | ToolCommand
+    ) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Step without rendering, where nobody reads the observation; `observe` returns it.
+
+        Args:
+            action: As for `step`.
+
+        Returns:
+            Reward, terminated, truncated, info.
+
+        Raises:
+            EpisodeError, ActionError: As for `step`.
+        """
         run = self._going_on()
         run.step(run.checked(action), realtime=self.realtime)
         return self._after_step(run)
@@ -276,7 +293,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         """
         run = self._going_on()
         run.perform(action, realtime=self.realtime)
-        return self._after_step(run)
+        return self.observe(), *self._after_step(run)
 
     def commands(self, action: Action) -> Iterator[ToolCommand]:
         """Yield the commands of a primitive, each to be executed by `step` before the next; none at the end.
@@ -293,11 +310,26 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             raise EpisodeError(f"the episode ended after {run.num_steps} steps; reset() starts the next one.")
         return run
 
-    def _after_step(self, run: PrimitiveRun) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def _after_step(self, run: PrimitiveRun) -> tuple[float, bool, bool, dict[str, Any]]:
         terminated = run.outcome.is_over
         truncated = run.is_out_of_steps and not terminated
         reward = 1.0 if run.outcome.success else 0.0
-        return self._observe(), reward, terminated, truncated, self._info()
+        return reward, terminated, truncated, self._info()
+
+    def observe(self) -> dict[str, Any]:
+        """Return the current observation, rendered anew.
+
+        Raises:
+            EpisodeError: There is no episode yet.
+        """
+        seen = {name for name in self._modalities if name != "joints"}
+        images = self._images(depth="depth" in seen) if seen else {}
+        values = {
+            name: {view: getattr(images[view], name) for view in VIEWS} if name in seen else self.joints
+            for name in self._modalities
+        }
+        tool = self._running().observed_tool()
+        return {**values, **tool, "ee": END_EFFECTORS.index(self.scene.end_effector)}
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]  # Gymnasium leaves the type open
         """Return both views, front above top, shape (256, 256, 3), uint8; None without a render mode.
@@ -453,16 +485,6 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
 
         arm = arm_drawables(world.joints, scene.end_effector)
         return self._rasteriser.scene(scene, extra=arm, depth=depth)
-
-    def _observe(self) -> dict[str, Any]:
-        seen = {name for name in self._modalities if name != "joints"}
-        images = self._images(depth="depth" in seen) if seen else {}
-        values = {
-            name: {view: getattr(images[view], name) for view in VIEWS} if name in seen else self.joints
-            for name in self._modalities
-        }
-        tool = self._running().observed_tool()
-        return {**values, **tool, "ee": END_EFFECTORS.index(self.scene.end_effector)}
 
     def _info(self) -> dict[str, Any]:
         run = self._running()

@@ -40,7 +40,7 @@ class EpisodeSlot:
             return self._end(str(decision), NO_ORACLE_ACTION)
         assert decision is not None  # rollout policies have checked it
         try:
-            self.observation, _, terminated, truncated, info = self.env.step(decision)
+            _, terminated, truncated, info = self.env.advance(decision)
         except ActionError as error:
             return self._end(str(error), BAD_ACTION)
         self.steps += 1
@@ -51,6 +51,8 @@ class EpisodeSlot:
             self._end(info["reason"], failure_kind(info["reason"]))
         elif truncated:
             self._end(*self._why_not_done(info["end_effector"] == "suction"))
+        else:
+            self.observation = self.env.observe()
         return None
 
     def _why_not_done(self, picks: bool) -> tuple[str, str]:

@@ -58,7 +58,7 @@ def test_the_oracle_solves_an_episode_by_commands_with_a_prompt_of_text(make: An
         command = env._env.oracle_command().to_array()
         seen, _, terminated, truncated, info = env.step(command)
         assert not truncated
-    np.testing.assert_array_equal(seen["agent_pos"][6:11], env._env._observe()["tool"])
+    np.testing.assert_array_equal(seen["agent_pos"][6:11], env._env.observe()["tool"])
     assert info["is_success"]
 
 
