@@ -15,7 +15,7 @@ from typing import Any
 
 from openvima.errors import ConfigError, WorkerError
 from openvima.extras import import_extra
-from openvima.multiprocess import THREAD_VARIABLES, Counts, Job
+from openvima.multiprocess import WORKER_VARIABLES, Counts, Job
 
 POLL_S = 0.5
 COUNT_INTERVAL_S = 1.0  # one message per job and second
@@ -195,7 +195,7 @@ def _stop(ray: ModuleType, references: list[Any]) -> None:  # Any: Ray's referen
 def _environment() -> dict[str, str]:
     """Environment of the workers: one thread each, and this package's variables."""
     own = {name: value for name, value in os.environ.items() if name.startswith("OPENVIMA_")}
-    return {**own, **dict.fromkeys(THREAD_VARIABLES, "1")}
+    return {**own, **WORKER_VARIABLES}
 
 
 def _first_line(error: Exception) -> str:

@@ -44,7 +44,7 @@ DEFAULT_EPISODES = 200  # as in the published tables
 PRECISIONS = ("float64", "float32", "bfloat16")
 Engine = Literal["processes", "ray"]
 DEFAULT_DEVICE = "cpu"
-DEFAULT_BATCH = 16  # larger ones hardly save time: the simulation dominates
+DEFAULT_BATCH = 40  # 16 take a tenth longer; divides 200 and fits the limit of 64 of policy servers
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
+from openvima.evaluation.config import DEFAULT_BATCH
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
@@ -33,7 +34,7 @@ _OPTIONS = {  # settings that a command names where they are not these
     "prompts": "multimodal",
     "task_options": "",
     "control": "primitives",
-    "batch": 16,
+    "batch": DEFAULT_BATCH,
     "boxes": "",
     "device": "cpu",
     "precision": "",

@@ -219,9 +219,9 @@ class PickPointer(ObjectPointer):
             super().similarity(inputs, scale_BTH) + scale_BTH.sum(dim=-1, keepdim=True) * described_BTN
         )
         selected_BP, attributes_BLX = inputs.prompt.selected_BP, inputs.prompt.attributes_BLX
-        if self.appearance_weight is None or selected_BP is None or attributes_BLX is None:
+        if self.appearance_weight is None or inputs.attributes_BTNX is None:
             return similarity_BTN
-        assert inputs.attributes_BTNX is not None
+        assert selected_BP is not None and attributes_BLX is not None
         attended_BTHX = torch.softmax(self._attention_scores(inputs), dim=-1) @ attributes_BLX[:, None]
         attended_BTX = (scale_BTH[..., None] * attended_BTHX).sum(dim=2)
         attribute_similarity_BTN = (inputs.attributes_BTNX @ attended_BTX[..., None]).squeeze(-1)

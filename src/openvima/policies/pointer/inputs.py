@@ -106,7 +106,8 @@ class HeadInputs:
         rotations_BTNR: Probabilities of the rotation that brings each object in view to the heading in which
             the prompt shows it, counter-clockwise; zero for those it does not show; R is 0 if rotations are
             not estimated.
-        attributes_BTNX: Projections of the objects in view, as `PointerPrompt.attributes_BLX`.
+        attributes_BTNX: Projections of the objects in view, as `PointerPrompt.attributes_BLX`; None where no
+            prompt selects any.
     """
 
     query_BTD: torch.Tensor

@@ -220,10 +220,12 @@ class Pointer(PolicyNetwork):
         features_BTVNF = features_KF[history.crop_index_BTVN]
         appearance_BTNA = self.embed_appearance(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
         objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
-        attributes_BTNX = None
-        if self.attributes is not None and prompt.selected_BP is not None:
-            attributes_BTNX = self.attributes.embed(objects, prompt.selected_BP)
-            objects = without_crops(objects, prompt.selected_BP)
+        attributes_BTNX, selected_BP = None, prompt.selected_BP
+        # Most prompts select none; in training their gradients are zero, which is not the same as none.
+        has_selected = selected_BP is not None and (self.training or bool(selected_BP.any()))
+        if self.attributes is not None and selected_BP is not None and has_selected:
+            attributes_BTNX = self.attributes.embed(objects, selected_BP)
+            objects = without_crops(objects, selected_BP)
         changes_BTND, rotations_BTNR = self._changes_in_view(objects, prompt)
         tokens = self._observation_tokens(history, objects.features_VNF, changes_BTND)
         previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
