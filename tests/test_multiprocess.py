@@ -33,12 +33,14 @@ def is_alive(pid: int) -> bool:
 
 def test_all_jobs_run_on_one_thread_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
     counts = []
     paths = [tmp_path / str(k) for k in range(3)]
     list(imap_unordered(worker_jobs.write_number, paths, 2, report=counts.append))
     assert [path.read_text() for path in paths] == ["1"] * 3
     assert counts[-1] == 9
     assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MALLOC_TRIM_THRESHOLD_" not in os.environ
 
 
 def test_an_error_of_a_job_reaches_the_caller() -> None:

@@ -158,6 +158,20 @@ def test_a_step_after_the_end_is_refused(rotate: TabletopEnv) -> None:
         rotate.step(idle_action())
 
 
+def test_a_step_in_two_parts_is_the_same_and_renders_in_the_second_alone(
+    rotate: TabletopEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rotate.reset(seed=0)
+    action = rotate.oracle_decision().action
+    observation, *whole = rotate.step(action)
+    rotate.reset(seed=0)
+    with monkeypatch.context() as patch:
+        patch.setattr(rotate, "observe", None)
+        parts = rotate.advance(action)
+    assert frozen(parts) == frozen(whole)
+    assert frozen(rotate.observe()) == frozen(observation)
+
+
 def wrong(**changes: object) -> dict[str, object]:
     return {**idle_action(), **changes}
 

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import PolicyError, PromptError, ShapeError, UnknownWordWarning  # noqa: E402
 from openvima.perception.objects import GroundTruth, observe  # noqa: E402
-from openvima.policies import preset  # noqa: E402
+from openvima.policies import inference, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
@@ -190,6 +190,12 @@ def test_images_that_did_not_change_are_encoded_once(policy, prompts, pool, monk
     assert counts[1] == 0
     policy.reset([prompts[0], prompts[1]])
     np.testing.assert_array_equal(first, [vector(action) for action in policy.act([pool[0], pool[0]])])
+
+
+def test_images_encoded_in_pieces_give_the_same_actions(policy, prompts, pool, monkeypatch) -> None:
+    at_once = played(policy, prompts, pool, (2, 0))
+    monkeypatch.setattr(inference, "MAX_CROPS_ON_CPU", 1)
+    assert_same_actions(played(policy, prompts, pool, (2, 0)), at_once)
 
 
 def test_a_reset_forgets(policy, prompts, pool) -> None:

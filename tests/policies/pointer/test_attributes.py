@@ -98,7 +98,18 @@ def test_crops_reach_the_decoder_only_without_attributes(network, demo):
     plain = SAME.replace("same ", "")
     shown, shifted = read(network, demo, plain), read(network, demo, plain, shift=0.5)
     assert not torch.allclose(shown.prompt.tokens_BLD, shifted.prompt.tokens_BLD)
-    assert not shown.attributes_BTNX.any()
+    assert shown.attributes_BTNX is None
+
+
+def test_a_prompt_that_selects_none_reads_the_same_beside_one_that_does(network, demo):
+    policy = NetworkPolicy(network, tokenizer=TOKENIZER)
+    plain = replace(demo.prompt, text=SAME.replace("same ", ""))
+    policy.reset([plain])
+    (alone,) = policy.act([demo.observation(0)])
+    policy.reset([plain, replace(demo.prompt, text=SAME)])
+    together, _ = policy.act([demo.observation(0)] * 2)
+    for name, value in alone.items():
+        assert value.tolist() == together[name].tolist()
 
 
 def test_appearance_is_compared_with_texture_and_shape(network, demo):
