@@ -37,7 +37,7 @@ def main(
     ablations: str = "",
     in_context: bool = False,
     boxes: str | None = None,
-    batch: int = 16,
+    batch: int = 40,
     shard_range: str | None = None,
     list_shards: bool = False,
     engine: Literal["processes", "ray"] = "processes",
@@ -71,7 +71,7 @@ def main(
         levels: Levels with commas in between: train, L1, L2, L3, L4.
         episodes: Episodes for each policy, task and level; 200 as in published tables.
         seed: Number of the first episode; evaluation episodes never occur in training.
-        workers: Processes; by default one for each CPU, fewer for less than four batches each, and one with
+        workers: Processes; by default one for each CPU, fewer for less than two batches each, and one with
             --device cuda. With --address, all CPUs of the Ray cluster.
         out: Folder to write to.
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
@@ -151,7 +151,7 @@ def main(
         python=python,
     )
     if workers is None and engine == "processes" and device == "cpu":
-        config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 4)))
+        config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
     selection = VideoSelection(videos, parse_list(record_video))
     if record_video and not report:
         raise ConfigError("--record-video needs the report; drop --no-report.")
