@@ -31,7 +31,7 @@ from openvima.scene.explanation import Explanation
 # take memory for each.
 MAX_PROMPT_PAIRS = 2**20
 MAX_CACHED_TOKENS = 2**15  # of the histories of a padded batch: 64 of 512, as long as any may be
-# Images that are encoded at once. On an accelerator that bounds the memory of a large batch; on a CPU all that is
+# Images that are encoded at once. On an accelerator that bounds the memory of a large batch; on a CPU what is
 # computed of them stays in the cache of a core, and the crops of 16 episodes take four fifths of the time.
 MAX_CROPS, MAX_CROPS_ON_CPU = 1024, 16
 NEAR_TIE = 1e-4  # difference of two logits below which float32 rounding may swap their order
