@@ -19,7 +19,7 @@ PARENT_END_S = 5.0  # grace period for the parent to exit
 MAX_WORKERS = 1024
 WORKER_VARIABLES = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
-    # By default glibc returns the memory of freed arrays to the system, which clears the pages of the next ones
+    # By default glibc returns the memory of freed arrays to the system, which clears that of the next ones
     # anew: 4 % of an evaluation.
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
