@@ -1,6 +1,6 @@
 """Demonstrations in memory as a network in training takes them."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
@@ -50,6 +50,15 @@ def rngs_of(examples: list[Example], seed: int = 0) -> list[np.random.Generator]
 
 class Killed(BaseException):
     """Stands for a kill signal."""
+
+
+def check_mixed_precision(network: torch.nn.Module, loss: Callable[[], torch.Tensor]) -> None:
+    """A loss in mixed precision is nearly that in float32, and its gradients are finite."""
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = loss()
+    torch.testing.assert_close(mixed.float(), loss(), rtol=0.05, atol=0.05)
+    mixed.backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in network.parameters())
 
 
 def train_until(config: TrainingConfig, step: int) -> None:

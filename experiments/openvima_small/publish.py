@@ -182,7 +182,7 @@ def write(
             f"{name}-figure": f"![{_FIGURES[name]}]({Path(os.path.relpath(file, path.parent)).as_posix()})"
             for name, file in drawn.items()
         }
-        figures |= {f"{name}-figure": absent and "" for name in _FIGURES if name not in drawn}
+        figures |= {f"{name}-figure": None if recorded else "" for name in _FIGURES if name not in drawn}
         atomic_write_file(path, fill(path.read_text(encoding="utf-8"), made | figures, where=str(path)))
 
 

@@ -12,7 +12,7 @@ from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn.actions import from_unit_range, to_unit_range  # noqa: E402
 from openvima.policies.pointer.geometry import yaw_to_bin  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from training_examples import collate_examples, examples_of  # noqa: E402
+from training_examples import check_mixed_precision, collate_examples, examples_of  # noqa: E402
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):
@@ -59,8 +59,4 @@ def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, d
         prompt = network.encode_prompt(batch.prompts, features)
         return network.loss(prompt, batch.history, features, batch.targets)[0]
 
-    with torch.autocast("cpu", torch.bfloat16):
-        mixed = loss()
-    torch.testing.assert_close(mixed.float(), loss(), rtol=0.05, atol=0.05)
-    mixed.backward()
-    assert all(p.grad is None or p.grad.isfinite().all() for p in network.parameters())
+    check_mixed_precision(network, loss)
