@@ -206,7 +206,7 @@ def test_the_joint_loss_decreases():
     encoder = _encoder()
     optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
     losses = []
-    for step in range(30):
+    for step in range(60):
         generator = step_generator(0, "test", step)
         batch = with_horizontal_flips(pairs, generator)
         loss, metrics = contrastive_loss(encoder, batch, temperature=0.1, generator=generator)
@@ -222,7 +222,7 @@ def test_the_joint_loss_decreases():
         "loss/rotation",
     }
     assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
-    assert rotation_accuracy(encoder, pairs) > 0.25  # 0.1 at random
+    assert rotation_accuracy(encoder, pairs) > 0.35  # 0.1 at random
 
 
 def test_without_rotation_bins_there_is_no_rotation_loss(pairs):
