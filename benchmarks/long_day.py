@@ -172,6 +172,21 @@ def verdicts(result: dict[str, Any]) -> list[dict[str, Any]]:  # Any: plain valu
     return lines
 
 
+def performance(result: dict[str, Any]) -> list[dict[str, Any]]:  # Any: plain values
+    """Return the figures for docs/performance.md."""
+    server = [statistics.median(quarter(result["samples"]["server"], n, "memory_mb") or [0]) for n in (1, 3)]
+    clients = result["records"]["clients"]
+    seconds = clients[-1]["at_s"] if clients else 1.0
+    rate = sum(each["observations"] for each in clients) / seconds
+    about = {"command": result["command"], "commit": result["commit"]}
+    load = "policy server beside an evaluation and vector environments"
+    return [
+        {"what": f"{load}, memory, second quarter to last", "value": f"{server[0]:,.0f} to {server[1]:,.0f}"}
+        | {"unit": "MB", **about},
+        {"what": f"{load}, 16 clients", "value": round(rate, 1), "unit": "observations/s", **about},
+    ]
+
+
 def verdict(what: str, good: bool, found: str) -> dict[str, Any]:  # Any: plain values
     """Make a line of the verdicts."""
     return {"what": what, "good": bool(good), "found": found}
@@ -283,6 +298,7 @@ def main() -> int:
         "totals": totals(result["records"]),
         **result,
     }
+    result["performance"] = performance(result)
     name = options.out.name if options.out else "long_day"
     text = report(result, f"{name}.png")
     print(text)

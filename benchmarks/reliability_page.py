@@ -51,6 +51,11 @@ PROMISES = (
         "Damage to data, caches and checkpoints is found when they are read.",
         ("benchmarks/damage_data.py", "benchmarks/damage_cache.py", "benchmarks/attack_checkpoints.py"),
     ),
+    (
+        "A policy server, evaluations and vector environments run for hours: no answer is lost or wrong, and "
+        "memory, handles and threads stay the same.",
+        ("benchmarks/long_day.py", "tests/serving/test_batching.py"),
+    ),
 )
 HEAD = """# Reliability
 
