@@ -214,6 +214,34 @@ def test_clients_that_are_gone_harm_no_other() -> None:
     run(policy, script)
 
 
+def test_requests_that_wait_leave_no_tasks_behind() -> None:
+    """Under constant load the batcher never ends, and a task for each request would stay in the queue."""
+    policy = Batched()
+
+    class Counting(ThreadPoolExecutor):
+        submitted = 0
+
+        def submit(self, *arguments, **options):  # type: ignore[no-untyped-def, override]
+            self.submitted += 1
+            return super().submit(*arguments, **options)
+
+    async def script(batcher: DynamicBatcher, computing: Counting) -> None:
+        sessions = await begun(batcher, policy, [1] * 4)
+        before = computing.submitted
+        replies = [await submitted(batcher, sessions[0], act(1))]
+        await asyncio.to_thread(policy.started.wait)
+        replies += [await submitted(batcher, each, act(2)) for each in sessions[1:]]
+        after = computing.submitted
+        policy.free.set()
+        await asyncio.gather(*replies)
+        assert after == before + 1
+        assert answers(await (await submitted(batcher, sessions[0], act(3)))) == [(1, 3, 2)]
+
+    with ThreadPoolExecutor(2) as readers, Counting(1) as computing:
+        batcher = DynamicBatcher(readers, computing, 16)
+        asyncio.run(asyncio.wait_for(script(batcher, computing), 20))
+
+
 def test_one_client_alone_does_not_wait_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("openvima.serving.batching.WINDOW_S", 3600.0)
     policy = Batched()

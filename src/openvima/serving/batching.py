@@ -42,6 +42,7 @@ class DynamicBatcher:
         self._changed = threading.Condition()
         self._last_asked_s: WeakKeyDictionary[Session, float] = WeakKeyDictionary()
         self._arrived: list[WaitingRequest] = []
+        self._is_running = False
         self._waiting: list[WaitingRequest] = []  # those that have waited longest come first
 
     async def submit(self, session: Session, data: bytes | str) -> Awaitable[bytes | str] | str:
@@ -60,14 +61,26 @@ class DynamicBatcher:
         with self._changed:
             self._arrived.append(request)
             self._changed.notify()
-        self._computing.submit(self._run)
+            was_running, self._is_running = self._is_running, True
+        if not was_running:
+            self._computing.submit(self._run)
         return asyncio.wrap_future(request.reply)
 
     def _run(self) -> None:
-        """Compute batches until no request waits. It runs for each request, and may find none."""
-        self._gather([])
-        while self._waiting:
-            self._gather(self._compute_batch())
+        """Compute batches until no request waits."""
+        try:
+            while self._is_needed():
+                self._gather(self._compute_batch() if self._waiting else [])
+        except BaseException:  # the next request runs it again
+            with self._changed:
+                self._is_running = False
+            raise
+
+    def _is_needed(self) -> bool:
+        """Whether a request waits; if not, the next one will run the batcher again."""
+        with self._changed:
+            self._is_running = bool(self._waiting or self._arrived)
+            return self._is_running
 
     def _gather(self, unfinished: "Sequence[WaitingRequest]") -> None:
         """Take the requests that have arrived, and some behind them; wait a little for other clients."""
