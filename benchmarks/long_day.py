@@ -7,11 +7,12 @@ several at once, and leave: with a goodbye, while an answer is computed, or with
 process evaluates the policy again and again, directly and through the server, and one steps vector
 environments, whose workers are killed at random.
 
-Sampled are memory, open handles, threads and children of the four processes, and the latency of the server's
-answers. The first quarter warms up; memory is flat if its median over the last quarter exceeds that over the
-second by 5 % at most. Nothing is lost if every answer is that of the policy in process, to the bit, every
-evaluation has the outcomes of the first, and every step of a vector environment the bytes of one without
-workers. `--out` writes PATH.json, PATH.md and PATH.png. Exit status 1 if a verdict is bad.
+Sampled are memory (without that of mapped files, which the system takes back as it likes), open handles,
+threads and children of the four processes, and the latency of the server's answers. The first quarter warms
+up; memory is flat if its median over the last quarter exceeds that over the second by 5 % at most. Nothing
+is lost if every answer is that of the policy in process, to the bit,
+every evaluation has the outcomes of the first, and every step of a vector environment the bytes of one
+without workers. `--out` writes PATH.json, PATH.md and PATH.png. Exit status 1 if a verdict is bad.
 """
 
 import argparse
@@ -75,7 +76,7 @@ def sample(pid: int) -> dict[str, float] | None:
         )
         children = [(task / "children").read_text().split() for task in (folder / "task").iterdir()]
         return {
-            "memory_mb": int(status["VmRSS"].split()[0]) / 1024,
+            "memory_mb": sum(int(status[name].split()[0]) for name in ("RssAnon", "RssShmem")) / 1024,
             "handles": len(os.listdir(folder / "fd")),
             "threads": int(status["Threads"]),
             "children": sum(map(len, children)),
@@ -248,8 +249,9 @@ def report(result: dict[str, Any], figure: str) -> str:  # Any: plain values
             for each in result["verdicts"]
         ),
         "",
-        "The first quarter warms up. Memory: median of the last quarter over that of the second. Handles, "
-        "threads, children: largest number in the last quarter over that in the second.",
+        "The first quarter warms up. Memory, without that of mapped files: median of the last quarter over "
+        "that of the second. Handles, threads, children: largest number in the last quarter over that in the "
+        "second.",
         "",
         "| process | memory MB, second quarter | last | handles | threads | children |",
         "|---|---|---|---|---|---|",
