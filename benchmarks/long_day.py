@@ -10,9 +10,9 @@ environments, whose workers are killed at random.
 Sampled are memory (without that of mapped files, which the system takes back as it likes), open handles,
 threads and children of the four processes, and the latency of the server's answers. The first quarter warms
 up; memory is flat if its median over the last quarter exceeds that over the second by 5 % at most. Nothing
-is lost if every answer is that of the policy in process, to the bit,
-every evaluation has the outcomes of the first, and every step of a vector environment the bytes of one
-without workers. `--out` writes PATH.json, PATH.md and PATH.png. Exit status 1 if a verdict is bad.
+is lost if every answer is that of the policy in process, to the bit, every evaluation has the outcomes of the
+first, and every step of a vector environment the bytes of one without workers. `--out` writes PATH.json,
+PATH.md and PATH.png. Exit status 1 if a verdict is bad.
 """
 
 import argparse
@@ -150,14 +150,18 @@ def quarter(values: Sequence[dict[str, Any]], number: int, name: str) -> list[fl
     ]
 
 
+def memory_mb(samples: Sequence[dict[str, float]]) -> tuple[float, float]:
+    """Return the medians of memory over the second and the last quarter; NaN without samples."""
+    second, last = (quarter(samples, number, "memory_mb") or [float("nan")] for number in (1, 3))
+    return statistics.median(second), statistics.median(last)
+
+
 def verdicts(result: dict[str, Any]) -> list[dict[str, Any]]:  # Any: plain values
     """Say of each process and each load whether it is as it must be."""
     lines = []
     for name, samples in result["samples"].items():
-        before, after = (quarter(samples, number, "memory_mb") for number in (1, 3))
-        growth = (
-            statistics.median(after) / statistics.median(before) - 1 if before and after else float("nan")
-        )
+        before_mb, after_mb = memory_mb(samples)
+        growth = after_mb / before_mb - 1
         lines.append(verdict(f"memory of the {name} is flat", growth <= MAX_GROWTH, f"{100 * growth:+.1f} %"))
         for resource in RESOURCES[1:]:
             before, after = (quarter(samples, number, resource) for number in (1, 3))
@@ -175,12 +179,13 @@ def verdicts(result: dict[str, Any]) -> list[dict[str, Any]]:  # Any: plain valu
 
 def performance(result: dict[str, Any]) -> list[dict[str, Any]]:  # Any: plain values
     """Return the figure for docs/performance.md."""
-    server = [statistics.median(quarter(result["samples"]["server"], n, "memory_mb") or [0]) for n in (1, 3)]
-    figure = {"value": f"{server[0]:,.0f} to {server[1]:,.0f}", "unit": "MB"}
-    about = {"command": result["command"], "commit": result["commit"]}
-    return [
-        {"what": "policy server under 16 clients for hours, memory, second quarter to last"} | figure | about
-    ]
+    before_mb, after_mb = memory_mb(result["samples"]["server"])
+    figure = {
+        "what": "policy server kept busy for hours, memory, second quarter to last",
+        "value": f"{before_mb:,.0f} to {after_mb:,.0f}",
+        "unit": "MB",
+    }
+    return [figure | {name: result[name] for name in ("command", "commit")}]
 
 
 def verdict(what: str, good: bool, found: str) -> dict[str, Any]:  # Any: plain values
@@ -252,7 +257,7 @@ def report(result: dict[str, Any], figure: str) -> str:  # Any: plain values
         "|---|---|---|---|---|---|",
     ]
     for name, samples in result["samples"].items():
-        memory = [f"{statistics.median(quarter(samples, n, 'memory_mb') or [0]):,.0f}" for n in (1, 3)]
+        memory = [f"{median_mb:,.0f}" for median_mb in memory_mb(samples)]
         most = [f"{max((each[r] for each in samples), default=0):.0f}" for r in RESOURCES[1:]]
         lines.append(f"| {name} | {' | '.join([*memory, *most])} |")
     lines += ["", "| latency of an answer | p50 ms | p95 ms | p99 ms |", "|---|---|---|---|"]

@@ -95,9 +95,14 @@ def answers(reply: bytes | str) -> list[tuple[int, int, int]]:
     return [told(action) for action in unpack(reply)["actions"]]  # type: ignore[index]
 
 
-def run(policy: Batched, script: Callable[..., Awaitable[None]], max_batch: int = 16) -> None:
+def run(
+    policy: Batched,
+    script: Callable[..., Awaitable[None]],
+    max_batch: int = 16,
+    executor: ThreadPoolExecutor | None = None,
+) -> None:
     """Run a script with a batcher; whatever it waits for comes in time."""
-    with ThreadPoolExecutor(2) as readers, ThreadPoolExecutor(1) as computing:
+    with ThreadPoolExecutor(2) as readers, executor or ThreadPoolExecutor(1) as computing:
         batcher = DynamicBatcher(readers, computing, max_batch)
         asyncio.run(asyncio.wait_for(script(batcher), 20))  # type: ignore[arg-type]
     assert policy.free.is_set()
@@ -225,7 +230,9 @@ def test_requests_that_wait_leave_no_tasks_behind() -> None:
             self.submitted += 1
             return super().submit(*arguments, **options)
 
-    async def script(batcher: DynamicBatcher, computing: Counting) -> None:
+    computing = Counting(1)
+
+    async def script(batcher: DynamicBatcher) -> None:
         sessions = await begun(batcher, policy, [1] * 4)
         before = computing.submitted
         replies = [await submitted(batcher, sessions[0], act(1))]
@@ -237,9 +244,7 @@ def test_requests_that_wait_leave_no_tasks_behind() -> None:
         assert after == before + 1
         assert answers(await (await submitted(batcher, sessions[0], act(3)))) == [(1, 3, 2)]
 
-    with ThreadPoolExecutor(2) as readers, Counting(1) as computing:
-        batcher = DynamicBatcher(readers, computing, 16)
-        asyncio.run(asyncio.wait_for(script(batcher, computing), 20))
+    run(policy, script, executor=computing)
 
 
 def test_one_client_alone_does_not_wait_for_others(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,7 +42,7 @@ class DynamicBatcher:
         self._changed = threading.Condition()
         self._last_asked_s: WeakKeyDictionary[Session, float] = WeakKeyDictionary()
         self._arrived: list[WaitingRequest] = []
-        self._is_running = False
+        self._is_running = False  # or about to: `_run` is submitted once, however many requests wait
         self._waiting: list[WaitingRequest] = []  # those that have waited longest come first
 
     async def submit(self, session: Session, data: bytes | str) -> Awaitable[bytes | str] | str:
