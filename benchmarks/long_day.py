@@ -8,8 +8,9 @@ process evaluates the policy again and again, directly and through the server, a
 environments, whose workers are killed at random.
 
 Sampled are memory (without that of mapped files, which the system takes back as it likes), open handles,
-threads and children of the four processes, and the latency of the server's answers. The first quarter warms
-up; memory is flat if its median over the last quarter exceeds that over the second by 5 % at most. Nothing
+threads and children of these processes except the clients', and the latency of the server's answers. The
+first quarter warms up; memory is flat if its median over the last quarter exceeds that over the second by 5 %
+at most. Nothing
 is lost if every answer is that of the policy in process, to the bit, every evaluation has the outcomes of the
 first, and every step of a vector environment the bytes of one without workers. `--out` writes PATH.json,
 PATH.md and PATH.png. Exit status 1 if a verdict is bad.
@@ -43,6 +44,12 @@ NUM_PLANS = 24
 NUM_SAMPLES = 240
 MAX_GROWTH = 0.05  # of memory
 MORE_HANDLES = 4  # that a process may hold open for a moment: connections that come and go
+VECTOR = "vector environments"
+COUNTED = {  # by load; the first is what can be lost
+    "clients": ("answers", "observations", "visits", "abrupt", "full"),
+    "evaluation": ("episodes",),
+    VECTOR: ("steps", "killed"),
+}
 RESOURCES = ("memory_mb", "handles", "threads", "children")
 
 
@@ -99,7 +106,7 @@ def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:  # Any: pl
     interval_s = max(1.0, 3600 * options.hours / NUM_SAMPLES)
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
-    logs = {name: folder / f"{name}.jsonl" for name in ("clients", "evaluation", "vector")}
+    logs = {name: folder / f"{name}.jsonl" for name in ("clients", "evaluation", VECTOR)}
     with served(options.policy, "--max-connections", str(2 * options.clients)) as (url, server):
         own = (interval_s, options.seed, logs["clients"], stop)
         loads = {
@@ -107,11 +114,11 @@ def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:  # Any: pl
             "evaluation": context.Process(
                 target=evaluate_again, args=(url, options.policy, folder, logs["evaluation"], stop)
             ),
-            "vector": context.Process(target=step_vectors, args=(options.seed, logs["vector"], stop)),
+            VECTOR: context.Process(target=step_vectors, args=(options.seed, logs[VECTOR], stop)),
         }
         for process in loads.values():
             process.start()
-        pids = {"server": server.pid} | {name: process.pid or 0 for name, process in loads.items()}
+        pids = {"server": server.pid} | {name: loads[name].pid or 0 for name in ("evaluation", VECTOR)}
         started_s = time.time()
         samples: dict[str, list[dict[str, float]]] = {name: [] for name in pids}
         while time.time() < started_s + 3600 * options.hours and server.poll() is None:
@@ -162,17 +169,19 @@ def verdicts(result: dict[str, Any]) -> list[dict[str, Any]]:  # Any: plain valu
     for name, samples in result["samples"].items():
         before_mb, after_mb = memory_mb(samples)
         growth = after_mb / before_mb - 1
-        lines.append(verdict(f"memory of the {name} is flat", growth <= MAX_GROWTH, f"{100 * growth:+.1f} %"))
+        good, found = growth <= MAX_GROWTH, [f"memory {100 * growth:+.1f} %"]
         for resource in RESOURCES[1:]:
             before, after = (quarter(samples, number, resource) for number in (1, 3))
             more = max(after, default=0) - max(before, default=0)
-            lines.append(verdict(f"{resource} of the {name} are flat", more <= MORE_HANDLES, f"{more:+.0f}"))
+            good, found = good and more <= MORE_HANDLES, [*found, f"{resource} {more:+.0f}"]
+        lines.append(verdict(f"{name}: nothing grows", good, ", ".join(found)))
     for name, records in result["records"].items():
         lost = [text for each in records for text in each["lost"]]
-        done = sum(each.get("answers", each.get("episodes", each.get("steps", 0))) for each in records)
+        counted = COUNTED[name][0]
+        done = sum(each[counted] for each in records)
         good = not lost and done > 0
-        found = f"{len(lost)} of {done:,}" + "".join(f"; {text}" for text in lost[:1])
-        lines.append(verdict(f"nothing of the {name} is lost", good, found))
+        found = f"{len(lost)} of {done:,} {counted}" + "".join(f"; {text}" for text in lost[:1])
+        lines.append(verdict(f"{name}: nothing is lost or wrong", good, found))
     lines.append(verdict("all ran to the end", not result["ended"], "; ".join(result["ended"]) or "yes"))
     return lines
 
@@ -195,15 +204,10 @@ def verdict(what: str, good: bool, found: str) -> dict[str, Any]:  # Any: plain 
 
 def totals(records: dict[str, list[dict[str, Any]]]) -> dict[str, dict[str, float]]:  # Any: plain values
     """Sum up what each load did."""
-    names = {
-        "clients": ("visits", "abrupt", "full", "answers", "observations"),
-        "evaluation": ("episodes",),
-        "vector": ("steps", "killed"),
-    }
     return {
         load: {"records": len(records[load])}
         | {name: sum(each[name] for each in records[load]) for name in counted}
-        for load, counted in names.items()
+        for load, counted in COUNTED.items()
     }
 
 
@@ -264,7 +268,7 @@ def report(result: dict[str, Any], figure: str) -> str:  # Any: plain values
     for number, name in enumerate(("first quarter", "second", "third", "last")):
         spans = [quarter(result["records"]["clients"], number, f"p{q}_ms") for q in QUANTILES]
         lines.append(f"| {name} | {' | '.join(f'{statistics.median(each or [0]):.0f}' for each in spans)} |")
-    clients, evaluation, vector = (result["totals"][name] for name in ("clients", "evaluation", "vector"))
+    clients, evaluation, vector = (result["totals"][name] for name in COUNTED)
     lines += [
         "",
         f"- Clients: {clients['visits']:,} visits, {clients['abrupt']:,} of them ended without a goodbye, "
