@@ -206,7 +206,7 @@ def section(text: str, name: str) -> str:
     return found[0] if found else ""
 
 
-def test_trained_policies_are_compared_unasked_and_noise_is_marked(text):
+def test_trained_policies_are_compared_unasked(text):
     comparison = section(text, "comparison")
     assert "<h3>mine against random</h3>" in comparison
     assert "On all levels together, mine is better than random: +56.7 points" in comparison
@@ -215,13 +215,15 @@ def test_trained_policies_are_compared_unasked_and_noise_is_marked(text):
     assert stack[1].split()[0] == "+50.0" and stack[5].strip() == "5 : 0"
 
 
-def test_a_difference_inside_the_noise_is_said_to_be_so(results, tmp_path):
-    twin = tuple(replace(row, policy="twin") for row in results.rows if row.policy == "mine")
+def test_a_difference_that_is_not_significant_is_said_to_be_so(results, tmp_path):
+    mine = [row for row in results.rows if row.policy == "mine"]
+    worse = replace(mine[0], outcomes=outcomes(mine[0].successes - 1))
+    twin = tuple(replace(row, policy="twin") for row in (worse, *mine[1:]))
     both = replace(results, rows=(*results.rows, *twin))
-    path = write_report(both, tmp_path / "a.html", comparisons=[compare(both, "mine", "twin")])
+    path = write_report(both, tmp_path / "a.html", comparisons=[compare(both, "twin", "mine")])
     comparison = section(path.read_text(encoding="utf-8"), "comparison")
-    assert "inside the noise, it may well be chance" in comparison
-    assert comparison.count("≈ inside the noise") == 6  # three tasks, two levels, all
+    assert "On all levels together, twin − mine is −" in comparison  # as the table has it
+    assert comparison.count("≈ not significant") == 6  # three tasks, two levels, all
 
 
 def test_ablations_stand_beside_the_score_with_what_they_change(results, tmp_path):
@@ -354,14 +356,15 @@ def test_curves_are_grouped_by_kind(metrics):
 def test_stages_have_charts_of_their_own_and_many_curves_are_thinned(tmp_path):
     kinds = ("accuracy", "pick_accuracy", "yaw_accuracy")
     lines = [
-        {"step": 5, "name": "1-pretraining", "loss": 2.0, "stage": 0},
+        {"step": 5, "name": "1-pretraining", "loss": 2.0, "loss/contrastive": 1.5, "stage": 0},
         {"step": 5, "name": "cloning", **dict.fromkeys(kinds, 0.5)},
         {"step": 5, "name": "cloning", **{f"validation_{kind}": 0.4 for kind in kinds}},
     ]
     path = tmp_path / "metrics.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     matching, cloning = read_charts(path)
-    assert (matching.title, matching.curves) == ("Pretraining: loss", {"training data": [(5.0, 2.0)]})
+    losses = {"training data": [(5.0, 2.0)], "contrastive, training data": [(5.0, 1.5)]}
+    assert (matching.title, matching.curves) == ("Pretraining: loss", losses)
     assert list(cloning.curves) == ["held out", "pick, held out", "yaw, held out"]
 
 

@@ -144,6 +144,6 @@ def _stage_title(name: str) -> str:
 
 def _label(name: str, kind: str) -> str:
     """Name of a curve, such as "pick, held out" for "validation_pick_accuracy"."""
-    what = name.removeprefix(_HELD_OUT).replace(kind, "").strip("_").replace("_", " ")
+    what = name.removeprefix(_HELD_OUT).replace(kind, "").strip("_/").replace("_", " ")
     seen = _HELD_OUT_LABEL if name.startswith(_HELD_OUT) else "training data"
     return f"{what}, {seen}" if what else seen

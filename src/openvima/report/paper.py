@@ -134,8 +134,8 @@ def _difference_table(comparison: Comparison) -> Table:
     caption = (
         f"Success rate of {a} minus that of {b} on the same episodes, in percentage points, with 95 % "
         "intervals; episodes solved by one of them only; exact McNemar test, p as it is and after Holm for "
-        f"the number of such tests in all comparisons made. {_NOISE_MARK}: inside the noise, the "
-        "interval holds 0."
+        f"the number of such tests in all comparisons made. {_NOISE_MARK}: not significant, the "
+        "interval contains 0."
     )
     columns = ("task", "level", "difference", "one only", "p", "p (Holm)")
     return Table(f"difference-{a}-{b}".replace(", ", "-"), caption, columns, tuple(lines))

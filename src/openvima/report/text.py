@@ -201,10 +201,10 @@ def finding(comparison: Comparison, difference: Difference | None = None) -> str
     difference = difference or comparison.overall
     where = difference.level or "all levels together"
     a, b, value, (low, high) = comparison.a, comparison.b, difference.difference, difference.interval
-    if value < 0:  # a reader expects the better one first
+    if value < 0 and difference.verdict != "noise":  # a reader expects the better one first
         a, b, value, low, high = b, a, -value, -high, -low
     size = f"{points(value)} points ({points_span((low, high))})"
     if difference.verdict == "noise":
-        return f"On {where}, {a} − {b} is {size}: inside the noise, it may well be chance."
-    doubt = ", though the exact test leaves room for chance" if difference.verdict == "unsure" else ""
+        return f"On {where}, {a} − {b} is {size}: not significant."
+    doubt = ", though not by the adjusted exact test" if difference.verdict == "unsure" else ""
     return f"On {where}, {a} is better than {b}: {size}{doubt}."
