@@ -87,6 +87,11 @@ def _within_prompts_only(config: PointerConfig) -> PointerConfig:
     return replace(config, correspondence=replace(config.correspondence, within_view=False))
 
 
+def _hiding_likeness(config: PointerConfig) -> PointerConfig:
+    assert config.attributes
+    return replace(config, attributes=replace(config.attributes, hides_likeness=True))
+
+
 def _probs_of_cloning() -> dict[str, Variant]:
     """Leave out what the recipe draws in behaviour cloning, one at a time, or add what it does not."""
     return {
@@ -162,6 +167,7 @@ VARIANTS = {
         baseline="no-attributes",
     ),
     "no-attributes": Variant("no attributes", settings=_NO_ATTRIBUTES),
+    "hides-likeness": Variant("likeness hidden where attributes are selected", _hiding_likeness),
     "no-correspondence": Variant("no correspondence between images", _without("correspondence")),
     "no-view-correspondence": Variant("no correspondence within the view", _within_prompts_only),
     "no-coreference": Variant("no coreference", _without("coreference")),

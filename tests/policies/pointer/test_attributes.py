@@ -101,6 +101,42 @@ def test_crops_reach_the_decoder_only_without_attributes(network, demo):
     assert shown.attributes_BTNX is None
 
 
+def hiding_likeness(network: Pointer) -> Pointer:
+    """The same network, with `hides_likeness`."""
+    attributes = replace(network.config.attributes, hides_likeness=True)
+    other = build_network(replace(network.config, attributes=attributes), seed=3).double().eval()
+    other.load_state_dict(network.state_dict())
+    return other
+
+
+@pytest.mark.parametrize("hides", [False, True])
+def test_likeness_reaches_the_decoder_only_where_it_is_not_hidden(network, demo, hides):
+    other = hiding_likeness(network) if hides else deepcopy(network)
+    with torch.no_grad():
+        for each in (other.correspondence, other.prompt_correspondence):
+            each.threshold.fill_(-1)  # anything is found
+    same, shifted = (read(other, demo, shift=shift) for shift in (0.0, 0.5))
+    assert torch.allclose(same.objects_BTND, shifted.objects_BTND) == hides
+    assert not torch.allclose(same.appearance_BTNA, shifted.appearance_BTNA)  # the head knows it
+    plain = SAME.replace("same ", "")
+    shown, moved = (read(other, demo, plain, shift=shift) for shift in (0.0, 0.5))
+    assert not torch.allclose(shown.objects_BTND, moved.objects_BTND)
+
+
+def test_sizes_of_boxes_are_hidden_where_attributes_are_selected(network, demo):
+    objects = read(network, demo, SAME.replace("same ", "")).prompt.features
+    larger = replace(objects, boxes_VN4=objects.boxes_VN4 + torch.tensor([0, 0, 3, 5]))
+    selected_BP = torch.zeros(1, len(ATTRIBUTES), dtype=torch.bool)
+    attributes = hiding_likeness(network).attributes
+    unchanged = attributes.hide(larger, selected_BP)
+    assert torch.equal(unchanged.boxes_VN4, larger.boxes_VN4)
+    assert torch.equal(unchanged.appearance_NA, larger.appearance_NA)
+    selected_BP[0, 0] = True
+    hidden, also_hidden = attributes.hide(objects, selected_BP), attributes.hide(larger, selected_BP)
+    assert torch.equal(hidden.boxes_VN4, also_hidden.boxes_VN4)
+    assert torch.equal(hidden.boxes_VN4[..., :2], objects.boxes_VN4[..., :2])
+
+
 def test_a_prompt_that_selects_none_reads_the_same_beside_one_that_does(network, demo):
     policy = NetworkPolicy(network, tokenizer=TOKENIZER)
     plain = replace(demo.prompt, text=SAME.replace("same ", ""))

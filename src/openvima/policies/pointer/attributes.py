@@ -22,6 +22,7 @@ from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
 from openvima.policies.pointer.correspondence import ObjectFeatures
 
 _BOX_UNIT_PX = 32.0  # sides of boxes are of this order
+_HIDDEN_SIDE_PX = 24
 _WORD_SCALE = 50.0  # logits in units of the weights, so that a few hundred steps of 1e-3 suffice
 _UNKNOWN_WORD = -0.04  # weight of words that no caption has
 _ALL = range(len(ATTRIBUTES))
@@ -42,6 +43,7 @@ class Attributes(nn.Module):
 
     def __init__(self, config: AttributeConfig, images: ObjectEncoderConfig, vocabulary_size: int) -> None:
         super().__init__()
+        self._hides_likeness = config.hides_likeness
         widths = (NUM_VIEWS * (images.crop.output_width + 4), config.hidden_width, config.width)
         self.projections = nn.ModuleList(mlp(widths) for _ in ATTRIBUTES)
         # Logits of each word: which attributes it names, and last whether it compares.
@@ -125,9 +127,16 @@ class Attributes(nn.Module):
         embedded = projected.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
         return embedded.index_put((rows,), (projected * weights_BP1).flatten(-2))
 
-
-def without_crops(objects: ObjectFeatures, selected_BP: torch.Tensor) -> ObjectFeatures:
-    """Hide the crop features of objects, (B, ..., N), where attributes are selected."""
-    features = objects.features_VNF
-    is_shown = ~selected_BP.any(dim=1).view(-1, *(1,) * (features.ndim - 1))
-    return replace(objects, features_VNF=features * is_shown)
+    def hide(self, objects: ObjectFeatures, selected_BP: torch.Tensor) -> ObjectFeatures:
+        """Hide what else objects, (B, ..., N), could be compared by, where attributes are selected."""
+        features, boxes = objects.features_VNF, objects.boxes_VN4
+        is_shown = ~selected_BP.any(dim=1).view(-1, *(1,) * (features.ndim - 1))
+        objects = replace(objects, features_VNF=features * is_shown)
+        if not self._hides_likeness:
+            return objects
+        is_kept_4 = is_shown | (torch.arange(4, device=boxes.device) < 2)
+        return replace(
+            objects,
+            boxes_VN4=torch.where(is_kept_4, boxes, _HIDDEN_SIDE_PX),
+            appearance_NA=objects.appearance_NA * is_shown.squeeze(-1),
+        )

@@ -97,10 +97,13 @@ class AttributeConfig:
     Args:
         hidden_width: Width of the hidden layer.
         width: Length of a projection.
+        hides_likeness: Whether a prompt that selects attributes also hides the sizes of boxes and the
+            correspondence of appearance from the decoder, not only the crops.
     """
 
     hidden_width: int = 128
     width: int = 32
+    hides_likeness: bool = False
 
     def __post_init__(self) -> None:
         if self.hidden_width < 1 or self.width < 1:

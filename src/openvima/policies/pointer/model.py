@@ -22,7 +22,7 @@ from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.nn.step_trace import StepTrace
 from openvima.policies.nn.tensor_record import TensorRecord, join_rows
-from openvima.policies.pointer.attributes import Attributes, without_crops
+from openvima.policies.pointer.attributes import Attributes
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
 from openvima.policies.pointer.coreference import Coreference, coreference
@@ -118,19 +118,19 @@ class Pointer(PolicyNetwork):
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
         objects = _prompt_objects(prompts, row_BM, exists_BM, features_VSF, appearance_SA)
         weights_BLL = coreference(prompts).to(features_VSF.dtype)
-        selected_BP = attributes_BMX = None
+        compared, selected_BP, attributes_BMX = objects, None, None
         if self.attributes is not None:
             # Likeness alone is to decide: neither the name of the attribute nor what else the objects share.
             selected_BP, names_attribute_BL = self.attributes.selected(prompts)
             attributes_BMX = self.attributes.embed(objects, selected_BP) * exists_BM[..., None]
             word_ids_BL = prompts.word_ids_BL.masked_fill(names_attribute_BL, PADDING_ID)
             prompts = replace(prompts, word_ids_BL=word_ids_BL)
-            objects = without_crops(objects, selected_BP)
+            compared = self.attributes.hide(objects, selected_BP)
             is_shown_BM = ~selected_BP.any(dim=1)[:, None].expand_as(row_BM)
             is_shown_S = torch.ones_like(prompts.in_scene_S)
             is_shown_S = is_shown_S.index_put((row_BM[exists_BM],), is_shown_BM[exists_BM])
             features_VSF = features_VSF * is_shown_S[:, None]
-        changes_BMD, rotations_BMR = self._changes_in_prompt(objects)
+        changes_BMD, rotations_BMR = self._changes_in_prompt(compared)
         changes_SD = changes_BMD.new_zeros(prompts.masks_VS.shape[1], self.config.images.width)
         changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
         describes_BL = prompts.names_texture_BL & (self.text_appearance is not None)
@@ -159,7 +159,7 @@ class Pointer(PolicyNetwork):
             object_mask_BL,
             appearance_BLA,
             self._described_appearance(prompts.word_ids_BL, describes_BL, appearance_BLA),
-            objects,
+            compared,
             replace(object_set, image_index_BK=_scene_index(objects)),
             selected_BP,
             attributes_BLX,
@@ -220,14 +220,14 @@ class Pointer(PolicyNetwork):
         features_BTVNF = features_KF[history.crop_index_BTVN]
         appearance_BTNA = self.embed_appearance(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
         objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
-        attributes_BTNX, selected_BP = None, prompt.selected_BP
+        compared, attributes_BTNX, selected_BP = objects, None, prompt.selected_BP
         # Most prompts select none; in training their gradients are zero, which is not the same as none.
         has_selected = selected_BP is not None and (self.training or bool(selected_BP.any()))
         if self.attributes is not None and selected_BP is not None and has_selected:
             attributes_BTNX = self.attributes.embed(objects, selected_BP)
-            objects = without_crops(objects, selected_BP)
-        changes_BTND, rotations_BTNR = self._changes_in_view(objects, prompt)
-        tokens = self._observation_tokens(history, objects.features_VNF, changes_BTND)
+            compared = self.attributes.hide(objects, selected_BP)
+        changes_BTND, rotations_BTNR = self._changes_in_view(compared, prompt)
+        tokens = self._observation_tokens(history, compared, changes_BTND)
         previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
         outputs_BTQD, cache = decode_observations(self.decoder, state.cache, tokens, previous)
         objects_BTND = outputs_BTQD[:, :, :-1]
@@ -267,9 +267,9 @@ class Pointer(PolicyNetwork):
         return self.attributes.with_appearance(appearance_NA, features_VNF, boxes_VN4, masks_VN)
 
     def _observation_tokens(
-        self, history: HistoryBatch, features_BTVNF: torch.Tensor, changes_BTND: torch.Tensor
+        self, history: HistoryBatch, objects: ObjectFeatures, changes_BTND: torch.Tensor
     ) -> ObservationTokens:
-        tokens_BTNE = self.images(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN) + changes_BTND
+        tokens_BTNE = self.images(objects.features_VNF, objects.boxes_VN4, objects.masks_VN) + changes_BTND
         tokens_BTND = self.add_end_effector(tokens_BTNE, history.end_effector_BT)
         query_BT1D = self.query.expand(*tokens_BTND.shape[:2], 1, -1)
         mask_BTQ = torch.cat([history.masks_BTVN.any(dim=2), history.steps_BT[..., None]], dim=2)
