@@ -110,7 +110,7 @@ def pool_sentence(pool: Pool) -> str:
         "bases": len(pool.base_objects),
         "textures": len({*pool.dragged_textures, *pool.base_textures}),
     }
-    return ", ".join(f"{count} {what}" for what, count in counts.items() if count) + "."
+    return ", ".join(f"{what}: {count}" for what, count in counts.items() if count).capitalize() + "."
 
 
 def recorded_scores() -> dict[str, dict[tuple[str, str], Score]]:
