@@ -183,7 +183,7 @@ def main(
             )
     if num_near := sum(len(row.near_ties) for row in results.rows):
         print(
-            f"Rounding may have decided {num_near} episodes; each row lists its own as near_ties.",
+            f"Episodes that rounding may have decided: {num_near}; each row lists its own as near_ties.",
             file=sys.stderr,
         )
     print(
