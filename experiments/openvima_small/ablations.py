@@ -87,9 +87,9 @@ def _within_prompts_only(config: PointerConfig) -> PointerConfig:
     return replace(config, correspondence=replace(config.correspondence, within_view=False))
 
 
-def _hiding_likeness(config: PointerConfig) -> PointerConfig:
+def _exclusive_attributes(config: PointerConfig) -> PointerConfig:
     assert config.attributes
-    return replace(config, attributes=replace(config.attributes, hides_likeness=True))
+    return replace(config, attributes=replace(config.attributes, exclusive=True))
 
 
 def _probs_of_cloning() -> dict[str, Variant]:
@@ -167,7 +167,9 @@ VARIANTS = {
         baseline="no-attributes",
     ),
     "no-attributes": Variant("no attributes", settings=_NO_ATTRIBUTES),
-    "hides-likeness": Variant("likeness hidden where attributes are selected", _hiding_likeness),
+    "exclusive-attributes": Variant(
+        "selected attributes alone tell which objects are alike", _exclusive_attributes
+    ),
     "no-correspondence": Variant("no correspondence between images", _without("correspondence")),
     "no-view-correspondence": Variant("no correspondence within the view", _within_prompts_only),
     "no-coreference": Variant("no coreference", _without("coreference")),

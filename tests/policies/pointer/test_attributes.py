@@ -101,40 +101,40 @@ def test_crops_reach_the_decoder_only_without_attributes(network, demo):
     assert shown.attributes_BTNX is None
 
 
-def hiding_likeness(network: Pointer) -> Pointer:
-    """The same network, with `hides_likeness`."""
-    attributes = replace(network.config.attributes, hides_likeness=True)
+def exclusive(network: Pointer) -> Pointer:
+    """The same network, with exclusive attributes."""
+    attributes = replace(network.config.attributes, exclusive=True)
     other = build_network(replace(network.config, attributes=attributes), seed=3).double().eval()
     other.load_state_dict(network.state_dict())
     return other
 
 
-@pytest.mark.parametrize("hides", [False, True])
-def test_likeness_reaches_the_decoder_only_where_it_is_not_hidden(network, demo, hides):
-    other = hiding_likeness(network) if hides else deepcopy(network)
+@pytest.mark.parametrize("is_exclusive", [False, True])
+def test_appearance_reaches_the_decoder_only_where_attributes_are_not_exclusive(network, demo, is_exclusive):
+    first = exclusive(network) if is_exclusive else deepcopy(network)
     with torch.no_grad():
-        for each in (other.correspondence, other.prompt_correspondence):
+        for each in (first.correspondence, first.prompt_correspondence):
             each.threshold.fill_(-1)  # anything is found
-    same, shifted = (read(other, demo, shift=shift) for shift in (0.0, 0.5))
-    assert torch.allclose(same.objects_BTND, shifted.objects_BTND) == hides
-    assert not torch.allclose(same.appearance_BTNA, shifted.appearance_BTNA)  # the head knows it
+    second = deepcopy(first)
+    torch.nn.init.normal_(second.images.appearance.weight, generator=torch.Generator().manual_seed(1))
+    same = torch.equal(read(first, demo).objects_BTND, read(second, demo).objects_BTND)
+    assert same == is_exclusive
     plain = SAME.replace("same ", "")
-    shown, moved = (read(other, demo, plain, shift=shift) for shift in (0.0, 0.5))
-    assert not torch.allclose(shown.objects_BTND, moved.objects_BTND)
+    assert not torch.allclose(read(first, demo, plain).objects_BTND, read(second, demo, plain).objects_BTND)
+    profile, texture = read(first, demo), read(first, demo, SAME.replace("profile", "texture"))
+    assert torch.equal(profile.objects_BTND, texture.objects_BTND) != is_exclusive
 
 
-def test_sizes_of_boxes_are_hidden_where_attributes_are_selected(network, demo):
+def test_sizes_of_boxes_are_hidden_beside_exclusive_attributes(network, demo):
     objects = read(network, demo, SAME.replace("same ", "")).prompt.features
     larger = replace(objects, boxes_VN4=objects.boxes_VN4 + torch.tensor([0, 0, 3, 5]))
-    selected_BP = torch.zeros(1, len(ATTRIBUTES), dtype=torch.bool)
-    attributes = hiding_likeness(network).attributes
-    unchanged = attributes.hide(larger, selected_BP)
-    assert torch.equal(unchanged.boxes_VN4, larger.boxes_VN4)
-    assert torch.equal(unchanged.appearance_NA, larger.appearance_NA)
-    selected_BP[0, 0] = True
-    hidden, also_hidden = attributes.hide(objects, selected_BP), attributes.hide(larger, selected_BP)
-    assert torch.equal(hidden.boxes_VN4, also_hidden.boxes_VN4)
-    assert torch.equal(hidden.boxes_VN4[..., :2], objects.boxes_VN4[..., :2])
+    attributes = exclusive(network).attributes
+    none_BP = torch.zeros(1, len(ATTRIBUTES), dtype=torch.bool)
+    for selected_BP, are_hidden in ((none_BP, False), (~none_BP, True)):
+        embedded = attributes.embed(objects, selected_BP)
+        shown, other = (attributes.hide_others(each, selected_BP, embedded) for each in (objects, larger))
+        assert torch.equal(shown.boxes_VN4, other.boxes_VN4) == are_hidden
+        assert torch.equal(shown.boxes_VN4[..., :2], objects.boxes_VN4[..., :2])
 
 
 def test_a_prompt_that_selects_none_reads_the_same_beside_one_that_does(network, demo):

@@ -43,7 +43,7 @@ class Attributes(nn.Module):
 
     def __init__(self, config: AttributeConfig, images: ObjectEncoderConfig, vocabulary_size: int) -> None:
         super().__init__()
-        self._hides_likeness = config.hides_likeness
+        self._is_exclusive = config.exclusive
         widths = (NUM_VIEWS * (images.crop.output_width + 4), config.hidden_width, config.width)
         self.projections = nn.ModuleList(mlp(widths) for _ in ATTRIBUTES)
         # Logits of each word: which attributes it names, and last whether it compares.
@@ -127,16 +127,24 @@ class Attributes(nn.Module):
         embedded = projected.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
         return embedded.index_put((rows,), (projected * weights_BP1).flatten(-2))
 
-    def hide(self, objects: ObjectFeatures, selected_BP: torch.Tensor) -> ObjectFeatures:
-        """Hide what else objects, (B, ..., N), could be compared by, where attributes are selected."""
-        features, boxes = objects.features_VNF, objects.boxes_VN4
+    def hide_others(
+        self, objects: ObjectFeatures, selected_BP: torch.Tensor, embedded_NX: torch.Tensor
+    ) -> ObjectFeatures:
+        """Hide what else objects, (B, ..., N), could be compared by, where attributes are selected.
+
+        Args:
+            objects: The objects.
+            selected_BP: The attributes.
+            embedded_NX: What `embed` returns for them.
+        """
+        features, boxes, appearance_NA = objects.features_VNF, objects.boxes_VN4, objects.appearance_NA
         is_shown = ~selected_BP.any(dim=1).view(-1, *(1,) * (features.ndim - 1))
         objects = replace(objects, features_VNF=features * is_shown)
-        if not self._hides_likeness:
+        if not self._is_exclusive:
             return objects
         is_kept_4 = is_shown | (torch.arange(4, device=boxes.device) < 2)
+        # Only their dot products count, so that zeros may stand beside them.
+        apart_NX = torch.cat([appearance_NA * is_shown.squeeze(-1), embedded_NX], dim=-1)
         return replace(
-            objects,
-            boxes_VN4=torch.where(is_kept_4, boxes, _HIDDEN_SIDE_PX),
-            appearance_NA=objects.appearance_NA * is_shown.squeeze(-1),
+            objects, boxes_VN4=torch.where(is_kept_4, boxes, _HIDDEN_SIDE_PX), appearance_NA=apart_NX
         )

@@ -97,13 +97,13 @@ class AttributeConfig:
     Args:
         hidden_width: Width of the hidden layer.
         width: Length of a projection.
-        hides_likeness: Whether a prompt that selects attributes also hides the sizes of boxes and the
-            correspondence of appearance from the decoder, not only the crops.
+        exclusive: Whether objects are compared by nothing else where a prompt selects attributes: the decoder
+            sees no sizes of boxes, and correspondence is that of the selected attributes, not of appearance.
     """
 
     hidden_width: int = 128
     width: int = 32
-    hides_likeness: bool = False
+    exclusive: bool = False
 
     def __post_init__(self) -> None:
         if self.hidden_width < 1 or self.width < 1:

@@ -125,7 +125,7 @@ class Pointer(PolicyNetwork):
             attributes_BMX = self.attributes.embed(objects, selected_BP) * exists_BM[..., None]
             word_ids_BL = prompts.word_ids_BL.masked_fill(names_attribute_BL, PADDING_ID)
             prompts = replace(prompts, word_ids_BL=word_ids_BL)
-            compared = self.attributes.hide(objects, selected_BP)
+            compared = self.attributes.hide_others(objects, selected_BP, attributes_BMX)
             is_shown_BM = ~selected_BP.any(dim=1)[:, None].expand_as(row_BM)
             is_shown_S = torch.ones_like(prompts.in_scene_S)
             is_shown_S = is_shown_S.index_put((row_BM[exists_BM],), is_shown_BM[exists_BM])
@@ -225,7 +225,7 @@ class Pointer(PolicyNetwork):
         has_selected = selected_BP is not None and (self.training or bool(selected_BP.any()))
         if self.attributes is not None and selected_BP is not None and has_selected:
             attributes_BTNX = self.attributes.embed(objects, selected_BP)
-            compared = self.attributes.hide(objects, selected_BP)
+            compared = self.attributes.hide_others(objects, selected_BP, attributes_BTNX)
         changes_BTND, rotations_BTNR = self._changes_in_view(compared, prompt)
         tokens = self._observation_tokens(history, compared, changes_BTND)
         previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
@@ -332,6 +332,9 @@ class Pointer(PolicyNetwork):
         if self.correspondence is None or self.prompt_correspondence is None:
             return objects.appearance_NA.new_zeros(()), objects.appearance_NA[..., :0]
         shown, rotation_between = prompt.features.at_each_step(), self._rotation_between
+        # Further columns are zero where no prompt selects attributes.
+        width = objects.appearance_NA.shape[-1]
+        shown = replace(shown, appearance_NA=shown.appearance_NA[..., :width])
         allowed = in_earlier_image(objects, shown)
         changes_BTND, since_BTNR = self.prompt_correspondence(objects, shown, allowed, rotation_between)
         if self.config.correspondence and self.config.correspondence.within_view:
