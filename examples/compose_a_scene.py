@@ -1,6 +1,6 @@
 """A scene and a sentence of your own, played by openvima-small.
 
-`python examples/compose_a_scene.py video.mp4` records it; without a name it only plays.
+`python examples/compose_a_scene.py video.mp4` records the second sentence; without a name it only plays.
 """
 
 import sys
@@ -16,7 +16,10 @@ goals = [("in", "block", "bowl")]  # without goals the episode ends at its step 
 
 if __name__ == "__main__":
     video = sys.argv[1] if len(sys.argv) > 1 else None
-    for prompt in ("Put the {block} into the {bowl}.", "Put the red block into the green bowl."):
+    for prompt, file in (
+        ("Put the {block} into the {bowl}.", None),
+        ("Put the red block into the green bowl.", video),
+    ):
         episode = openvima.compose(objects, prompt, goals=goals)
-        result = openvima.play(episode, "openvima-small", video=video)
+        result = openvima.play(episode, "openvima-small", video=file)
         print(prompt, "→ solved" if result.outcome.success else f"→ not solved: {result.outcome.reason}")

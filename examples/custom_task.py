@@ -15,7 +15,12 @@ POOLS = {level: Pool(OBJECT_SETS[a], (), TEXTURE_SETS[b], ()) for level, (a, b) 
     "put_between", family="visual_goal_reaching", template=TEMPLATE, oracle_max_steps=2, pools=POOLS
 )
 def sample(table: TableSampler, *, tolerance_m: float = 0.05) -> Problem:
-    """Sample one problem; keyword arguments are the task's options."""
+    """Sample one problem; keyword arguments are the task's options.
+
+    Args:
+        table: Samples objects and their poses.
+        tolerance_m: Largest distance from the middle, in metres.
+    """
 
     def draw():
         return table.choose(table.pool.dragged_objects), table.choose(table.pool.dragged_textures)

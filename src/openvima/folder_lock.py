@@ -55,7 +55,7 @@ def parts_in_range(parts: Sequence[T], shard_range: Part) -> Sequence[T]:
     start, stop = shard_range
     if start >= len(parts):
         raise ConfigError(
-            f"shard_range is {start}:{stop}, but there are {len(parts)} shards, 0 … {len(parts) - 1}."
+            f"shard_range is {start}:{stop}, but shards are numbered from 0 to {len(parts) - 1}."
         )
     return parts[start:stop]
 

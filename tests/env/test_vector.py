@@ -325,9 +325,12 @@ def test_what_cannot_be_built_is_refused_at_once(num_workers: int) -> None:
 
     with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
         build(["visual_manipulation", "rotat"])
-    with pytest.raises(LevelError, match="L9"):
-        build("rotate", 2, level="L9")
-    with pytest.raises(ConfigError, match=r"no option of task 'rotate'.*num_distractors"):
+    with pytest.raises(LevelError, match="L9") as caught:
+        build(["rotate", {"task": "rotate", "level": "L9"}], 2)
+    assert caught.value.__notes__ == ["raised for sub-environment 1"]
+    with pytest.raises(ActionError, match="action 1: "):
+        stack_actions([None, {}])
+    with pytest.raises(ConfigError, match=r"no option of task 'rotate' or of environments.*num_distractors"):
         build("rotate", 2, num_distracters=1)
     with pytest.raises(ConfigError, match="a name, or a mapping with 'task'"):
         build([{"level": "L1"}])

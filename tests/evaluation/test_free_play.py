@@ -8,7 +8,7 @@ import pytest
 from openvima import compose
 from openvima.cli.main import main
 from openvima.env import save_episode
-from openvima.errors import PolicyError, UnknownPolicyError
+from openvima.errors import ConfigError, OracleError, PolicyError, UnknownPolicyError
 from openvima.evaluation import play
 from openvima.policies import RandomPolicy
 from openvima.scene import Action
@@ -48,7 +48,8 @@ def test_without_goals_the_step_limit_ends_the_episode() -> None:
     result = play(compose(OBJECTS, PROMPT, max_steps=2), FirstIntoSecond())
     assert result.steps == 2 and not result.outcome.is_over
     assert result.outcome.reason == "the step limit is reached; the episode has no goals"
-    assert "no goals" in play(compose(OBJECTS, PROMPT), "oracle").outcome.reason
+    with pytest.raises(OracleError, match="no goals"):
+        play(compose(OBJECTS, PROMPT), "oracle", video="never_written.mp4")
 
 
 def test_an_invalid_action_ends_the_episode_with_its_message() -> None:
@@ -63,6 +64,14 @@ def test_policies_by_name_and_what_is_none() -> None:
         play(episode, "no-such-policy")
     with pytest.raises(PolicyError, match="policy is a int without reset and act"):
         play(episode, 3)  # type: ignore[arg-type]  # wrong on purpose
+
+
+def test_an_episode_is_played_from_its_file(tmp_path: Path) -> None:
+    episode = compose(OBJECTS, PROMPT, goals=[("in", "a", "b")])
+    save_episode(episode, tmp_path / "scene.json")
+    assert play(tmp_path / "scene.json", FirstIntoSecond()) == play(episode, FirstIntoSecond())
+    with pytest.raises(ConfigError, match=r"video is 'a\.avi'; videos are MP4 files"):
+        play(episode, "oracle", video="a.avi")
 
 
 @pytest.mark.slow

@@ -50,11 +50,11 @@ def test_jobs_that_share_a_folder_give_the_same_bytes(first, tmp_path):
     assert runner.evaluate_range(config, (0, 2))
     assert (tmp_path / "results.json").read_bytes() == first.read_bytes()
     assert not runner.evaluate_range(config, (1, 3))  # all is there
-    with pytest.raises(ConfigError, match="4:5, but there are 4 shards, 0 … 3"):
+    with pytest.raises(ConfigError, match="4:5, but shards are numbered from 0 to 3"):
         runner.evaluate_range(config, (4, 5))
     with pytest.raises(ConfigError, match="force and shard_range exclude"):
         runner.evaluate_range(replace(config, force=True), (0, 1))
-    with pytest.raises(ConfigError, match="holds another evaluation"):
+    with pytest.raises(ConfigError, match=r"holds another evaluation: seed is .* there and 41 here"):
         runner.evaluate_range(replace(config, seed=41), (0, 1))
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from openvima.errors import ConfigError, UnknownTaskError
+from openvima.errors import ConfigError, PolicyError, UnknownTaskError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.policies import RandomPolicy
 
@@ -49,6 +49,14 @@ def test_ablations_are_played_with_objects_too():
         "idle": {"kind": "object", "modalities": ["rgb", "segm"]},
         "oracle": {"kind": "oracle"},
     }
+
+
+def test_names_may_stand_alone_and_policies_need_some():
+    one = {"tasks": "rotate", "levels": "L1", "episodes": 1}
+    listed = {"tasks": ["rotate"], "levels": ["L1"], "episodes": 1}
+    assert score({"random": RandomPolicy()}, **one) == score({"random": RandomPolicy()}, **listed)
+    with pytest.raises(PolicyError, match="policies is a RandomPolicy; give policies by name"):
+        score(RandomPolicy(), **one)
 
 
 def test_a_task_that_is_not_there_is_named():

@@ -31,7 +31,7 @@ def test_a_session_ends_as_a_rollout_does() -> None:
     assert outcome is not None and outcome.success == played.outcome.success
     assert actions(session) == list(played.actions)
     assert session.scene == played.scene
-    with pytest.raises(EpisodeError, match="ended after"):
+    with pytest.raises(EpisodeError, match="ended at step 2"):
         session.step()
 
 

@@ -328,6 +328,17 @@ def test_a_reset_without_prompts_is_refused(policy) -> None:
         policy.reset([])
 
 
+def test_one_prompt_or_observation_is_no_batch(policy, prompts, pool) -> None:
+    for wrong in (prompts[0], ["Put it there."]):
+        with pytest.raises(
+            PolicyError, match=r"reset takes a list of rendered prompts, such as \[env\.prompt"
+        ):
+            policy.reset(wrong)
+    policy.reset(prompts[:1])
+    with pytest.raises(PolicyError, match=r"act takes a list of observations, .* such as \[observation\]"):
+        policy.act(pool[0])
+
+
 def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(policy, prompts) -> None:
     prompt = replace(prompts[0], text=f"Juggle {prompts[0].text} Wildly!")
     with pytest.warns(UnknownWordWarning, match="in training: 'juggle', 'wildly'[.]") as caught:

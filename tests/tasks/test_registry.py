@@ -103,6 +103,14 @@ def test_a_new_task_may_bring_its_own_pools() -> None:
         del registry._TASKS["test only"]
 
 
+def test_a_new_task_needs_pools_of_known_levels() -> None:
+    with pytest.raises(ConfigError, match="task 'poolless' has no pools"):
+        register_task("poolless", family="x", template="x.", oracle_max_steps=1)
+    pools = {"L5": pool("rotate", "train")}
+    with pytest.raises(ConfigError, match="pools of task 'poolless': there is no level 'L5'"):
+        register_task("poolless", family="x", template="x.", oracle_max_steps=1, pools=pools)  # type: ignore[arg-type]
+
+
 def test_the_list_of_tasks_needs_no_compiled_code() -> None:
     code = (
         "import sys; from openvima.tasks import list_tasks; list_tasks(); "

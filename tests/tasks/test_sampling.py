@@ -1,6 +1,7 @@
 """Free places, sizes, crowding, redraws; what a sampled episode promises whatever the task."""
 
 import collections
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -311,6 +312,23 @@ def test_an_episode_of_more_than_twenty_steps_is_refused() -> None:
             sample_episode("endless", seed=0)
     finally:
         del registry._TASKS["endless"]
+
+
+@pytest.mark.parametrize(
+    ("sample", "message"),
+    [
+        (lambda table: 1 // 0, r"`sample` of task 'wrong', seed 4, raised ZeroDivisionError: .*line \d+"),
+        (lambda table: None, "`sample` of task 'wrong' returned a NoneType; return a Problem"),
+    ],
+)
+def test_errors_in_a_task_name_it(sample: Callable[[TableSampler], Problem], message: str) -> None:
+    pools = task_spec("rotate").pools
+    register_task("wrong", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample)
+    try:
+        with pytest.raises(ConfigError, match=message):
+            sample_episode("wrong", seed=4)
+    finally:
+        del registry._TASKS["wrong"]
 
 
 def test_wrong_arguments_are_refused_by_name() -> None:

@@ -52,7 +52,8 @@ def main(
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
         trust_code: Run the code that a run folder names, as that of a learner of your own does.
         explain: Draw beside the video what the policy considers at each step: probabilities of objects,
-            places and rotations, and attention to the prompt. For openvima-small, nano, small and vima-*.
+            places and rotations, and attention to the prompt. For openvima-small, nano, small, vima-* and
+            flamingo-*.
 
     Returns:
         Exit status; it does not tell whether the task was solved.

@@ -84,12 +84,12 @@ def main(
             all that have the option.
         control: primitives; or end_effector, where an action moves the tool for 0.1 s, for policies of that
             control and the oracle. Scores of the two are never joined.
-        ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
-            scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all of these. Also
+        ablations: Input ablations to evaluate besides, comma-separated. "all" stands for no_prompt,
+            other_prompt_images, scrambled_words, shuffled_objects, random, oracle, and with --boxes
+            detected_boxes. Others: held_out_phrasings, swapped_attribute, shuffled_prompt_objects,
             masked_words:0.2, swapped_words:0.2, gibberish_words, noisy_boxes:3, text_prompts,
-            paraphrased_prompts, num_distractors:2 (the numbers are examples); in_context; and
-            oracle_demonstration, which prompts with the oracle's solution of the same episode. "+" joins
-            several to one.
+            paraphrased_prompts, num_distractors:2 (the numbers are examples), in_context, and
+            oracle_demonstration. "+" joins several to one. docs/evaluation.md describes each.
         boxes: Detector of detected_boxes, which it implies: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION or
             FILE.py:FUNCTION, which makes an ObjectExtractor.
@@ -183,7 +183,8 @@ def main(
             )
     if num_near := sum(len(row.near_ties) for row in results.rows):
         print(
-            f"Episodes that rounding may have decided: {num_near}; each row lists its own as near_ties.",
+            f"Episodes with two choices of nearly equal score, which another machine may decide otherwise: "
+            f"{num_near} (near_ties in {path.name}).",
             file=sys.stderr,
         )
     print(
@@ -212,7 +213,7 @@ def print_results(results: "Results") -> None:
         cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in level_means)
         table.add_row(level, "mean", *cells, style="bold")
         oracle_horizon = (_oracle_horizon_mean(results, policy, level) for policy in policies)
-        table.add_row(level, "mean, oracle horizon", *oracle_horizon, end_section=True)
+        table.add_row(level, "mean within the oracle's steps", *oracle_horizon, end_section=True)
     print_table(table, num_heads=2)
     if any(row.ablation for row in results.rows):
         print_table(_ablation_table(results, means), num_heads=2)

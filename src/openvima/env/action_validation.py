@@ -113,8 +113,12 @@ def stack_actions(actions: Sequence[Mapping[str, Any] | Action | None]) -> dict[
     """
     corner = Action(WORKSPACE_LOW, WORKSPACE_LOW)
     rows = [corner if action is None else action for action in actions]
-    checked = [row if isinstance(row, Action) else Action.from_arrays(row) for row in rows]
-    arrays = [action.to_arrays() for action in checked]
+    arrays = []
+    for index, row in enumerate(rows):
+        try:
+            arrays.append((row if isinstance(row, Action) else Action.from_arrays(row)).to_arrays())
+        except ActionError as error:
+            raise ActionError(f"action {index}: {error}") from None
     return {key: np.stack([array[key] for array in arrays]) for key in ACTION_SHAPES}
 
 

@@ -56,14 +56,13 @@ def pair(value: Any, label: str) -> tuple[float, float]:
     """
     if hasattr(value, "tolist"):  # a NumPy array
         value = value.tolist()
-    both = entries(value, label)
-    if len(both) != 2:
-        raise SceneError(f"{label} is {shown(value)}; give x and y in metres.")
-    for coordinate in both:
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes) or len(value) != 2:
+        raise SceneError(f"{label} is {shown(value)}; give x and y in metres, as in [0.45, -0.25].")
+    for coordinate in value:
         is_number = isinstance(coordinate, int | float) and not isinstance(coordinate, bool)
         if not is_number or not -1e6 < coordinate < 1e6 or not math.isfinite(coordinate):
             raise SceneError(f"{label} is {shown(value)}; give two finite numbers, x and y in metres.")
-    return float(both[0]), float(both[1])
+    return float(value[0]), float(value[1])
 
 
 def known_object(handle: object, handles: Mapping[str, Placement], label: str) -> Placement:

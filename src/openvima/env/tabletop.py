@@ -1,6 +1,7 @@
 """The Gymnasium environment: one task, one arm, one table."""
 
 import copy
+import inspect
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
@@ -94,7 +95,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
 
     **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image),
     `prompt_ambiguous` (descriptions in it fit objects that the replaced images differ from), `success`,
-    `failure`, `reason` (why it failed, or empty), `progress` (`goals_met`, a fraction of those required, and
+    `failure`, `reason` (why it ended, or empty), `progress` (`goals_met`, a fraction of those required, and
     `distance_m` and `angle_rad` of the nearest goal that can be met next; NaN if goals state none), `grasped`
     (id of the object that the last step lifted, or 0), `num_steps`, `joints` (as in observations), `task`,
     `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of object and texture). The
@@ -161,6 +162,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         _check_render_mode(render_mode)
         self.task = task
         self.level = task_spec(task).checked_level(level)
+        _check_task_options(task, task_options)
         make_rng(domain, task, self.level, 0, purpose="scene")  # checks the domain
         self.domain = domain
         self.assets = load_assets(assets)
@@ -308,7 +310,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
     def _going_on(self) -> PrimitiveRun:
         run = self._running()
         if run.outcome.is_over or run.is_out_of_steps:
-            raise EpisodeError(f"the episode ended after {run.num_steps} steps; reset() starts the next one.")
+            raise EpisodeError(f"the episode ended at step {run.num_steps}; reset() starts the next one.")
         return run
 
     def _after_step(self, run: PrimitiveRun) -> tuple[float, bool, bool, dict[str, Any]]:
@@ -539,6 +541,18 @@ def _action_space(control: str) -> spaces.Space:
     return spaces.Dict(
         {key: spaces.Box(*bounds[key.split("_")[1]], dtype=np.float32) for key in ACTION_SHAPES}
     )
+
+
+def _check_task_options(task: str, options: Mapping[str, Any]) -> None:
+    if "seed" in options:
+        raise ConfigError("seed is no option of an environment; give it to `reset(seed=…)`.")
+    parameters = inspect.signature(TabletopEnv.__init__).parameters.values()
+    own = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+    known = [*own, *task_spec(task).options]
+    for name in options:
+        if name not in known:
+            hint = f"Allowed: {', '.join(known)}."
+            raise ConfigError(unknown_name(f"option of task {task!r} or of environments:", name, known, hint))
 
 
 def _check_render_mode(render_mode: str | None) -> None:

@@ -18,7 +18,7 @@ from openvima.env.registration import make
 from openvima.env.sub_environments import SubEnvironments, batch_infos
 from openvima.env.tabletop import TabletopEnv
 from openvima.env.workers import AsyncTabletopEnvs
-from openvima.errors import ConfigError, unknown_name
+from openvima.errors import ConfigError, OpenVimaError, unknown_name
 from openvima.tasks.seeding import checked_seed
 
 
@@ -64,7 +64,7 @@ def make_vec(
     choices = [tasks] if isinstance(tasks, str) else list(tasks)
     num_envs = len(choices) if num_envs is None else num_envs
     if not choices or isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-        raise ConfigError(f"got {len(choices)} tasks for {num_envs!r} sub-environments; give at least one.")
+        raise ConfigError(f"tasks are {choices}, num_envs is {num_envs!r}; give at least one of each.")
     if isinstance(num_workers, bool) or not isinstance(num_workers, int) or not 0 <= num_workers <= num_envs:
         raise ConfigError(
             f"num_workers is {num_workers!r}; with {num_envs} sub-environments give 0 to {num_envs}."
@@ -72,7 +72,7 @@ def make_vec(
     mode = _autoreset_mode(autoreset_mode)
     seed_lists = _split_seeds(seeds, num_envs)
     env_fns = [_env_factory(choices[i % len(choices)], options, seed_lists[i]) for i in range(num_envs)]
-    control = _common_control([env_fn() for env_fn in env_fns[: len(choices)]])
+    control = _common_control(_build(env_fns[: len(choices)]))
     validator = ActionValidator(num_envs, mode, control)
     if num_workers == 0:
         return SyncTabletopEnvs(env_fns, validator, mode)
@@ -192,6 +192,18 @@ def _env_factory(
     if "task" not in own:
         raise ConfigError(f"an entry of tasks is {own}; give a name, or a mapping with 'task' and options.")
     return EnvFactory({**options, **own}, seeds)
+
+
+def _build(env_fns: Sequence[EnvFactory]) -> list[gymnasium.Env]:
+    """Build sub-environments; an exception notes for which it was raised."""
+    envs = []
+    for index, env_fn in enumerate(env_fns):
+        try:
+            envs.append(env_fn())
+        except OpenVimaError as error:
+            error.add_note(f"raised for sub-environment {index}")
+            raise
+    return envs
 
 
 def _common_control(envs: Sequence[gymnasium.Env]) -> str:

@@ -352,7 +352,11 @@ def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]
     kept = [(task, level) for task, level in pairs if applies_to(ablation, task, ablated)]
     if not kept:
         tasks = list(dict.fromkeys(task for task, _ in pairs))
-        raise ConfigError(f"ablation {ablation} applies to none of the tasks {', '.join(tasks)}.")
+        others = [task for task in list_tasks() if applies_to(ablation, task, ablated)]
+        raise ConfigError(
+            f"ablation {ablation} applies to none of the tasks {', '.join(tasks)}; it does to "
+            f"{', '.join(others)}."
+        )
     return kept
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from openvima.catalog import Assets
 from openvima.env.config import DEFAULT_ENV_CONFIG
-from openvima.errors import ActionError, OracleError, PolicyError
+from openvima.env.episode_file import load_episode
+from openvima.errors import ActionError, ConfigError, OracleError, PolicyError
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, RolloutPolicy, load_rollout_policy
@@ -47,7 +48,7 @@ class PlayResult:
 
 
 def play(
-    episode: Episode,
+    episode: Episode | str | Path,
     policy: str | Policy = "openvima-small",
     *,
     video: str | Path | None = None,
@@ -63,7 +64,7 @@ def play(
     """Play one episode, composed or sampled.
 
     Args:
-        episode: The episode.
+        episode: The episode, or a YAML or JSON file of one.
         policy: An object with `reset` and `act`, or a name as for `openvima evaluate --policy`, such as
             "oracle", where the episode has goals.
         video: MP4 file to write; None: no video.
@@ -82,12 +83,21 @@ def play(
     Raises:
         UnknownPolicyError, CheckpointError, ServerError: There is no such policy.
         PolicyError: The policy has no `reset` and `act`, or gives no action.
+        InputFileError, SceneError: The episode's file is not valid.
+        OracleError: The oracle has no goals to pursue.
+        ConfigError: The name of the video does not end in .mp4.
 
     Example:
         >>> from openvima.tasks import sample_episode
         >>> play(sample_episode("rotate", seed=0), "oracle").outcome.success
         True
     """
+    if not isinstance(episode, Episode):
+        episode = load_episode(Path(episode), assets=assets)
+    if policy == "oracle" and not episode.problem.goals:
+        raise OracleError("the episode has no goals, so the oracle has nothing to do; give it some.")
+    if video is not None and Path(video).suffix.lower() != ".mp4":
+        raise ConfigError(f"video is {str(video)!r}; videos are MP4 files; give a name that ends in .mp4.")
     rollout_policy = _load(policy, episode, device=device, boxes=boxes, trust_code=trust_code)
     if explain:
         rollout_policy.explainer()  # raises now

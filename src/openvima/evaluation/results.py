@@ -259,13 +259,13 @@ class Results:
         return atomic_write_file(path, self.to_json())
 
     @staticmethod
-    def read(path: Path) -> "Results":
+    def read(path: str | Path) -> "Results":
         """Read a `results.json`, or the one of an evaluation's folder.
 
         Raises:
             DatasetError: The file is missing, damaged or of another schema.
         """
-        return ResultsFile.read(path).results
+        return ResultsFile.read(Path(path)).results
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,9 +289,10 @@ class ResultsFile:
         Raises:
             DatasetError: The file is missing, damaged, too large or of another schema.
         """
+        folder = path.parent if path.suffix == ".json" else path
         path = path / FILE_NAME if path.is_dir() else path
         if not path.is_file():
-            out = shlex.quote(str(path.parent))
+            out = shlex.quote(str(folder))
             raise DatasetError(f"there is no {path}; `openvima evaluate --out {out}` writes one.")
         try:
             text = read_text(path, max_bytes=_MAX_BYTES)

@@ -11,7 +11,7 @@ from typing import Any
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import load_assets
 from openvima.detector.plugins import plugged_boxes
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, echo
 from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
 from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
@@ -197,12 +197,18 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     if not path.exists() or prepared.config.force:
         return None
     earlier = Results.read(path)
-    same = (prepared.record(), prepared.policies, prepared.versions)
-    if (earlier.config, earlier.policies, earlier.versions) == same:
+    old = earlier.config | {"policies": earlier.policies, "versions": earlier.versions}
+    new = prepared.record() | {"policies": prepared.policies, "versions": prepared.versions}
+    differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    if not differing:
         return earlier
+    texts = (
+        f"{name} is {echo(repr(old.get(name)))} there and {echo(repr(new.get(name)))} here"
+        for name in differing
+    )
     raise ConfigError(
-        f"{path} holds another evaluation (its settings, weights or versions differ). "
-        "Choose another --out, or give --force to overwrite it."
+        f"{path} holds another evaluation: {'; '.join(texts)}. Choose another --out, or give --force to "
+        "overwrite it."
     )
 
 

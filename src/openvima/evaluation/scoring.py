@@ -1,9 +1,9 @@
 """Evaluating policy objects with `reset` and `act` in this process."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from openvima.env.config import EnvConfig
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, PolicyError
 from openvima.evaluation.ablations import NOISY_BOXES
 from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import EpisodeOutcome, Results
@@ -18,8 +18,8 @@ from openvima.scene.command import PRIMITIVES
 def score(
     policies: Mapping[str, Policy],
     *,
-    tasks: tuple[str, ...] = ("all",),
-    levels: tuple[str, ...] = ("L1", "L2", "L3", "L4"),
+    tasks: str | Sequence[str] = ("all",),
+    levels: str | Sequence[str] = ("L1", "L2", "L3", "L4"),
     episodes: int = DEFAULT_EPISODES,
     seed: int = 0,
     ablations: tuple[str, ...] = (),
@@ -31,7 +31,7 @@ def score(
 
     Args:
         policies: Objects that implement the `Policy` protocol, by their names in the results.
-        tasks: Names of tasks, or ("all",) for every task that the level holds.
+        tasks: Names of tasks, or "all" for every task that the level holds.
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
@@ -56,10 +56,14 @@ def score(
         >>> score({"random": RandomPolicy()}, tasks=("rotate",), levels=("L1",), episodes=2).rows[0].episodes
         2
     """
+    if not isinstance(policies, Mapping):
+        raise PolicyError(
+            f"policies is a {type(policies).__name__}; give policies by name, as {{'mine': …}}."
+        )
     config = EvaluationConfig(
         tuple(policies),
-        tasks=tasks,
-        levels=levels,
+        tasks=(tasks,) if isinstance(tasks, str) else tuple(tasks),
+        levels=(levels,) if isinstance(levels, str) else tuple(levels),
         episodes=episodes,
         seed=seed,
         env_config=EnvConfig(prompts=prompts, task_options=task_options, control=control),

@@ -165,7 +165,7 @@ class EpisodeSession:
             ActionError: The given action is invalid; nothing was moved.
         """
         if self.outcome is not None:
-            raise EpisodeError(f"the episode ended after {self.num_steps} steps; go back, or start another.")
+            raise EpisodeError(f"the episode ended at step {self.num_steps}; go back, or start another.")
         checked = None if action is None else Action.from_arrays(action.to_arrays())
         proposal = self.propose()
         decision = checked or self._decision

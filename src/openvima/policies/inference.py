@@ -281,6 +281,8 @@ class NetworkPolicy(Policy):
 
     def start_episodes(self, prompts: Sequence[RenderedPrompt]) -> Episodes:
         """Encode prompts of new episodes; the policy does not change. Raises as `reset`."""
+        if isinstance(prompts, RenderedPrompt) or not all(isinstance(p, RenderedPrompt) for p in prompts):
+            raise PolicyError("reset takes a list of rendered prompts, such as [env.prompt].")
         if not prompts:
             raise PolicyError("reset got no prompts; give one for each episode.")
         batch, stack = self.processor.encode_prompts(prompts)
@@ -328,6 +330,8 @@ class NetworkPolicy(Policy):
         """Return the episodes that have an observation; the policy does not change. Raises as `act`."""
         if self._episodes is None:
             raise PolicyError("there are no prompts yet; call reset with one for each episode first.")
+        if isinstance(observations, Mapping):
+            raise PolicyError("act takes a list of observations, one for each prompt, such as [observation].")
         if len(observations) != self._num_prompts:
             raise PolicyError(
                 f"got {len(observations)} observations for {self._num_prompts} prompts; give one for each, "

@@ -41,8 +41,8 @@ def unknown_policy(name: str, others: Sequence[str]) -> str:
     named = (*others, *BUNDLED)
     hint = (
         f"Allowed: {', '.join(named)}, a preset that `openvima policies` lists, the folder of a training "
-        "run, a published .ckpt file, owner/name or owner/name@revision on the Hugging Face Hub, or "
-        "FILE.py:FUNCTION."
+        "run, a published .ckpt file, owner/name or owner/name@revision on the Hugging Face Hub, "
+        "FILE.py:FUNCTION, MODULE:FUNCTION, or in evaluations ws://HOST:PORT or lerobot:PATH."
     )
     return unknown_name("policy", name, (*named, *PRESETS), hint)
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from openvima.brief import brief_repr
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
+from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.catalog.registration import with_registered
 from openvima.errors import ConfigError, LevelError, UnknownTaskError, unknown_name
 from openvima.scene import EndEffector, Problem
@@ -116,16 +117,23 @@ def register_task(
         template: The prompt with its slots.
         oracle_max_steps: Step limit of the oracle.
         end_effector: Tool of the arm.
-        pools: Objects and textures at each level; by default those of the catalogue.
+        pools: Objects and textures at each level; by default those of the benchmark, which has its own tasks
+            only.
         distractors_allowed: See `TaskSpec`.
 
     Returns:
         The decorator, which returns the function unchanged.
 
     Raises:
-        ConfigError: The name is already registered, or episodes would have more than 20 steps.
+        ConfigError: The name is already registered, there are no pools, one is of no level, or episodes would
+            have more than 20 steps.
     """
     check_steps(name, oracle_max_steps)
+    if not pools and name not in PUBLISHED_TASKS:
+        raise ConfigError(f"task {name!r} has no pools; give objects and textures of a level at least.")
+    for level in pools or ():
+        if level not in LEVELS:
+            raise ConfigError(f"pools of task {name!r}: {unknown_name('level', level, LEVELS)}")
 
     def register(sample: SampleFunction) -> SampleFunction:
         if name in _TASKS:
@@ -179,7 +187,7 @@ def task_spec(name: str) -> TaskSpec:
     try:
         return _TASKS[name]
     except (KeyError, TypeError):
-        hint = f"`openvima tasks` lists all {len(_TASKS)}."
+        hint = f"`openvima tasks` lists all {len(_TASKS)}; {TASK_FILES_VARIABLE} names files of your own."
         raise UnknownTaskError(unknown_name("task", name, _TASKS, hint)) from None
 
 

@@ -4,14 +4,15 @@ import functools
 from dataclasses import replace
 
 from openvima.catalog import Assets
-from openvima.errors import ConfigError, SamplingError, unknown_name
-from openvima.scene import Episode, ObjectImage
+from openvima.errors import ConfigError, OpenVimaError, SamplingError, unknown_name
+from openvima.scene import Episode, ObjectImage, Problem
 from openvima.tasks.ids import shuffled_ids
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewritten
 from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, check_steps, list_tasks, task_spec
 from openvima.tasks.seeding import checked_seed, make_rng
 from openvima.tasks.table import TableSampler
+from openvima.user_code import described
 
 MAX_REDRAWS = 100
 
@@ -49,7 +50,7 @@ def sample_episode(
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or the task is not defined there.
         ConfigError: The seed, the domain, the form of prompts or an option is not allowed, the task has no
-            text form, or the episode would have more than 20 steps.
+            text form, its code raises, or the episode would have more than 20 steps.
         SamplingError: No draw in a hundred could place all objects.
 
     Example:
@@ -72,6 +73,17 @@ def sample_episode(
         except SamplingError as error:
             reason = error
             continue
+        except OpenVimaError:
+            raise
+        except Exception as error:
+            raise ConfigError(
+                f"`sample` of task {task!r}, seed {number}, raised {described(error)}."
+            ) from error
+        if not isinstance(problem, Problem):
+            raise ConfigError(
+                f"`sample` of task {task!r} returned a {type(problem).__name__}; return a Problem, see "
+                "docs/your_own_task.md."
+            )
         if not compat:
             problem = shuffled_ids(problem, make_rng(domain, task, level, number, "ids", attempt=attempt))
         if prompts != MULTIMODAL:
