@@ -119,10 +119,7 @@ def facts(found: Shipped) -> list[tuple[str, str]]:
         ("weights file", f"{found.num_bytes / 1e6:.1f} MB, float16"),
         ("demonstrations", f"{found.episodes:,}, content hash {found.data_hash}"),
         *((stage, f"{steps:,} steps") for stage, steps in zip(stages, found.steps, strict=True)),
-        (
-            "time",
-            f"{found.hours:.1f} h, {found.cpu_hours:.1f} h of CPU in the first process",
-        ),
+        ("time", f"{found.hours:.1f} h of wall-clock time"),
         ("commit", ", ".join(found.commits)),
     ]
 

@@ -93,7 +93,8 @@ def _describe(spec: "TaskSpec", *, as_json: bool) -> int:
     for line in (f"{spec.name}: {spec.summary}", f"Prompt: {spec.template}"):
         print(line)
     print(f"Levels: {', '.join(spec.levels)}. At most {spec.max_steps} steps. Family: {families}.")
-    print_table(table)
+    if options:
+        print_table(table)
     if "difficulty" in options:
         print(f"Example: openvima demo {spec.name} --task-options difficulty=hard")
     return 0
