@@ -90,3 +90,13 @@ def test_demo_takes_a_task_or_a_file(capsys: pytest.CaptureFixture[str]) -> None
     assert "leave them out" in capsys.readouterr().err
     assert main(["demo", "--episode", "missing.yaml"]) == 2
     assert "missing.yaml" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("returned", [["because"], None])
+def test_an_explanation_of_another_kind_is_refused(returned: object, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    policy = FirstIntoSecond()
+    policy.explain = lambda: returned  # type: ignore[attr-defined]
+    with pytest.raises(PolicyError, match=r"explain\(\) of .* returned .*; give a list of an Explanation"):
+        play(compose(OBJECTS, PROMPT), policy, video=tmp_path / "a.mp4", explain=True)
+    assert not list(tmp_path.glob("*.mp4"))

@@ -11,7 +11,7 @@ import numpy as np
 
 from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import OpenVimaError, OracleError, PolicyError, UnknownWordWarning
+from openvima.errors import OpenVimaError, OracleError, PolicyError, UnknownWordWarning, echo
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource
@@ -177,7 +177,19 @@ class PromptedRolloutPolicy:
         if explain is None:
             kind = type(self._policy).__name__
             raise PolicyError(f"a policy of kind {kind} has no explain(). {POLICIES_THAT_EXPLAIN}")
-        return explain
+
+        def checked() -> list[Explanation | None]:
+            found = explain()
+            if not isinstance(found, list | tuple) or not all(
+                isinstance(e, Explanation | None) for e in found
+            ):
+                raise PolicyError(
+                    f"explain() of {self._name} returned {echo(repr(found))}; give a list of an Explanation or "
+                    "None for each episode, see docs/explain.md."
+                )
+            return list(found)
+
+        return checked
 
     def near_ties(self) -> Sequence[bool]:
         """Return those of the policy, if it reports any, as `NetworkPolicy` does."""
