@@ -180,12 +180,11 @@ class PromptedRolloutPolicy:
 
         def checked() -> list[Explanation | None]:
             found = explain()
-            if not isinstance(found, list | tuple) or not all(
-                isinstance(e, Explanation | None) for e in found
-            ):
+            is_list = isinstance(found, list | tuple)
+            if not is_list or not all(isinstance(each, Explanation | None) for each in found):
                 raise PolicyError(
-                    f"explain() of {self._name} returned {echo(repr(found))}; give a list of an Explanation or "
-                    "None for each episode, see docs/explain.md."
+                    f"explain() of {self._name} returned {echo(repr(found))}; give a list of an Explanation "
+                    "or None for each episode, see docs/explain.md."
                 )
             return list(found)
 
