@@ -207,3 +207,20 @@ def test_mixed_precision_takes_the_features_of_a_frozen_crop_encoder(network, de
         return network.loss(prompt, batch.history, features, batch.targets)[0]
 
     check_mixed_precision(network, loss)
+
+
+def test_the_object_of_the_prompt_itself_is_not_meant_beside_exclusive_attributes(network, demo):
+    inputs, pick = read(exclusive(network), demo), exclusive(network).head.pick
+    cosines = torch.linspace(-0.5, 1.0, inputs.masks_BTN.shape[-1]).double()
+    with torch.no_grad():
+        attention = torch.softmax(pick._attention_scores(inputs), dim=-1)
+        attended_BTA = (attention @ inputs.prompt.appearance_BLA[:, None]).mean(dim=2)
+        attended_BTA = attended_BTA / attended_BTA.norm(dim=-1, keepdim=True) ** 2
+        inputs = replace(inputs, appearance_BTNA=attended_BTA[:, :, None] * cosines[:, None])
+        scale_BTH = pick._scale(inputs)
+        pick.appearance_weight.fill_(-1.0)
+        with_weight = pick.similarity(inputs, scale_BTH)
+        pick.appearance_weight.fill_(0.0)
+        lost_BTN = pick.similarity(inputs, scale_BTH) - with_weight
+    expected = scale_BTH.sum(dim=-1, keepdim=True) * torch.relu(cosines - 0.7) / 0.3
+    torch.testing.assert_close(lost_BTN, expected)

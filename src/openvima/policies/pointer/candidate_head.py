@@ -24,7 +24,7 @@ from openvima.policies.pointer.candidates import (
     products,
     proximity,
 )
-from openvima.policies.pointer.config import CandidateHeadConfig
+from openvima.policies.pointer.config import AttributeConfig, CandidateHeadConfig
 from openvima.policies.pointer.geometry import (
     OFFSET_UNIT_M,
     accuracy,
@@ -43,6 +43,7 @@ from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
 
 _ON_TOP_M = 0.04  # scale within which an object is in or on another one
 _MAX_DISTANCE = 10.0  # in units of offsets; larger distances are clipped
+_SAME_APPEARANCE = 0.7  # cosine from which on two images are taken to show one object
 _ROTATION_SCALE = 5.0  # initial logit of a rotation that is certain
 
 
@@ -65,14 +66,18 @@ class CandidatePointerHead(nn.Module):
     score = "accuracy"
 
     def __init__(
-        self, config: CandidateHeadConfig, width: int, rotation_bins: int = 0, *, has_attributes: bool = False
+        self,
+        config: CandidateHeadConfig,
+        width: int,
+        rotation_bins: int = 0,
+        attributes: AttributeConfig | None = None,
     ) -> None:
         super().__init__()
         self.config = config
         self.rotation_copy: RotationCopy | None = None
         if rotation_bins == config.num_yaw_bins:
             self.rotation_copy = RotationCopy(width, config.hidden_width)
-        self.pick = PickPointer(config, width, has_attributes=has_attributes)
+        self.pick = PickPointer(config, width, attributes)
         self.place = PlacePointer(config, width)
         self.grid = GridCandidates(width)
         self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
@@ -202,12 +207,17 @@ class PickPointer(ObjectPointer):
     where a scene of the prompt shows another one has to be cleared away.
 
     Where the prompt selects attributes, similarity in them takes the place of that of appearance, which then
-    has a learned weight: nothing is more like {base} than itself, but that is not to be put "into it".
+    has a learned weight: nothing is more like {base} than itself, but that is not to be put "into it". Beside
+    exclusive attributes only the appearance of the very same object counts.
     """
 
-    def __init__(self, config: CandidateHeadConfig, width: int, *, has_attributes: bool = False) -> None:
+    def __init__(
+        self, config: CandidateHeadConfig, width: int, attributes: AttributeConfig | None = None
+    ) -> None:
         super().__init__(width, config.num_prompt_queries)
-        self.appearance_weight = nn.Parameter(torch.zeros(())) if has_attributes else None
+        self._is_exclusive = attributes is not None and attributes.exclusive
+        weight = torch.tensor(-1.0 if self._is_exclusive else 0.0)
+        self.appearance_weight = None if attributes is None else nn.Parameter(weight)
         self.grounding = TextGrounding(width)
         self.geometry = mlp((10, config.hidden_width, width))
 
@@ -225,7 +235,13 @@ class PickPointer(ObjectPointer):
         attended_BTHX = torch.softmax(self._attention_scores(inputs), dim=-1) @ attributes_BLX[:, None]
         attended_BTX = (scale_BTH[..., None] * attended_BTHX).sum(dim=2)
         attribute_similarity_BTN = (inputs.attributes_BTNX @ attended_BTX[..., None]).squeeze(-1)
-        attribute_similarity_BTN = attribute_similarity_BTN + self.appearance_weight * similarity_BTN
+        appearance_BTN = similarity_BTN
+        if self._is_exclusive:
+            scale_BT1 = scale_BTH.sum(dim=-1, keepdim=True)
+            appearance_BTN = torch.relu(similarity_BTN - _SAME_APPEARANCE * scale_BT1) / (
+                1 - _SAME_APPEARANCE
+            )
+        attribute_similarity_BTN = attribute_similarity_BTN + self.appearance_weight * appearance_BTN
         return torch.where(selected_BP.any(dim=1)[:, None, None], attribute_similarity_BTN, similarity_BTN)
 
     def prompt_weights(self, inputs: HeadInputs) -> torch.Tensor:

@@ -88,8 +88,7 @@ class Pointer(PolicyNetwork):
         self.text_appearance: nn.Linear | None = None
         if isinstance(config.head, CandidateHeadConfig):
             rotation_bins = images.rotation_bins if config.correspondence else 0
-            has_attributes = config.attributes is not None
-            self.head = CandidatePointerHead(config.head, width, rotation_bins, has_attributes=has_attributes)
+            self.head = CandidatePointerHead(config.head, width, rotation_bins, config.attributes)
             joined_width = Attributes.joined_width(config.attributes) if config.attributes else 0
             self.text_appearance = nn.Linear(words, images.appearance_width + joined_width, bias=False)
             nn.init.zeros_(self.text_appearance.weight)
