@@ -10,10 +10,9 @@ environments, whose workers are killed at random.
 Sampled are memory (without that of mapped files, which the system takes back as it likes), open handles,
 threads and children of these processes except the clients', and the latency of the server's answers. The
 first quarter warms up; memory is flat if its median over the last quarter exceeds that over the second by 5 %
-at most. Nothing
-is lost if every answer is that of the policy in process, to the bit, every evaluation has the outcomes of the
-first, and every step of a vector environment the bytes of one without workers. `--out` writes PATH.json,
-PATH.md and PATH.png. Exit status 1 if a verdict is bad.
+at most. Nothing is lost if every answer is that of the policy in process, to the bit, every evaluation has
+the outcomes of the first, and every step of a vector environment the bytes of one without workers. `--out`
+writes PATH.json, PATH.md and PATH.png. Exit status 1 if a verdict is bad.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """Every exception of the package. A message says what was given, what is allowed and what to do."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 
 class OpenVimaError(Exception):
@@ -153,6 +153,15 @@ def echo(text: str, limit: int = MAX_ECHO) -> str:
         c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text[:limit]
     )
     return kept if len(text) <= limit else kept[: limit - 1] + "…"
+
+
+def differences(there: Mapping[str, object], here: Mapping[str, object]) -> list[str]:
+    """Say which settings of a file differ from those given, for an error."""
+    return [
+        f"{echo(name)} is {echo(repr(there.get(name)))} there and {echo(repr(here.get(name)))} here"
+        for name in {**there, **here}
+        if there.get(name) != here.get(name)
+    ]
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") -> str:

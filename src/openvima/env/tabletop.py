@@ -162,7 +162,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         _check_render_mode(render_mode)
         self.task = task
         self.level = task_spec(task).checked_level(level)
-        _check_task_options(task, task_options)
+        if task_options:
+            _check_task_options(task, task_options)
         make_rng(domain, task, self.level, 0, purpose="scene")  # checks the domain
         self.domain = domain
         self.assets = load_assets(assets)
@@ -546,11 +547,11 @@ def _action_space(control: str) -> spaces.Space:
 def _check_task_options(task: str, options: Mapping[str, Any]) -> None:
     if "seed" in options:
         raise ConfigError("seed is no option of an environment; give it to `reset(seed=…)`.")
-    parameters = inspect.signature(TabletopEnv.__init__).parameters.values()
-    own = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
-    known = [*own, *task_spec(task).options]
+    of_task = task_spec(task).options
     for name in options:
-        if name not in known:
+        if name not in of_task:
+            parameters = inspect.signature(TabletopEnv.__init__).parameters.values()
+            known = [*(each.name for each in parameters if each.kind is each.KEYWORD_ONLY), *of_task]
             hint = f"Allowed: {', '.join(known)}."
             raise ConfigError(unknown_name(f"option of task {task!r} or of environments:", name, known, hint))
 

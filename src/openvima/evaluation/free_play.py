@@ -14,11 +14,12 @@ from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, RolloutPolicy, load_rollout_policy
 from openvima.evaluation.session import EpisodeSession
-from openvima.evaluation.sources import PolicySource
+from openvima.evaluation.sources import ORACLE, PolicySource
 from openvima.policies.base import Policy
 from openvima.render.rasteriser import Rasteriser, front_above_top
 from openvima.scene import Action, Episode, Outcome, Scene
 from openvima.scene.explanation import Explanation
+from openvima.tasks.oracle import require_goals
 from openvima.video.recorder import EpisodeRecorder
 
 
@@ -94,8 +95,8 @@ def play(
     """
     if not isinstance(episode, Episode):
         episode = load_episode(Path(episode), assets=assets)
-    if policy == "oracle" and not episode.problem.goals:
-        raise OracleError("the episode has no goals, so the oracle has nothing to do; give it some.")
+    if policy == ORACLE:
+        require_goals(episode.problem)
     if video is not None and Path(video).suffix.lower() != ".mp4":
         raise ConfigError(f"video is {str(video)!r}; videos are MP4 files; give a name that ends in .mp4.")
     rollout_policy = _load(policy, episode, device=device, boxes=boxes, trust_code=trust_code)

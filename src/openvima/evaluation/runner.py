@@ -11,7 +11,7 @@ from typing import Any
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import load_assets
 from openvima.detector.plugins import plugged_boxes
-from openvima.errors import ConfigError, echo
+from openvima.errors import ConfigError, differences
 from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
 from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
@@ -199,15 +199,11 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     earlier = Results.read(path)
     old = earlier.config | {"policies": earlier.policies, "versions": earlier.versions}
     new = prepared.record() | {"policies": prepared.policies, "versions": prepared.versions}
-    differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    differing = differences(old, new)
     if not differing:
         return earlier
-    texts = (
-        f"{name} is {echo(repr(old.get(name)))} there and {echo(repr(new.get(name)))} here"
-        for name in differing
-    )
     raise ConfigError(
-        f"{path} holds another evaluation: {'; '.join(texts)}. Choose another --out, or give --force to "
+        f"{path} holds another evaluation: {'; '.join(differing)}. Choose another --out, or give --force to "
         "overwrite it."
     )
 

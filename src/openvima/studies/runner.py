@@ -11,7 +11,7 @@ from openvima.catalog.packs import load_assets
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.resuming import is_finished
 from openvima.data.subsets import SubsetConfig, sample
-from openvima.errors import ConfigError, InputFileError, echo
+from openvima.errors import ConfigError, InputFileError, differences
 from openvima.evaluation.results import Results
 from openvima.evaluation.runner import evaluate_prepared, prepare
 from openvima.folder_lock import folder_lock, is_lock_file
@@ -174,13 +174,9 @@ def _claim(out: Path, record: dict[str, Any]) -> None:  # Any: JSON
     except (OSError, InputFileError) as error:
         raise ConfigError(f"{file} cannot be read ({error}); give another --out.") from None
     here = flattened(record)
-    names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
-    if names:
-        shown = [
-            f"{echo(n)} is {echo(repr(there.get(n)))} there and {echo(repr(here.get(n)))} here"
-            for n in names[:_MAX_DIFFERENCES]
-        ]
-        more = f"; and {len(names) - _MAX_DIFFERENCES} more" if len(names) > _MAX_DIFFERENCES else ""
+    if differing := differences(there, here):
+        shown, num_more = differing[:_MAX_DIFFERENCES], len(differing) - _MAX_DIFFERENCES
+        more = f"; and {num_more} more" if num_more > 0 else ""
         raise ConfigError(f"{out} holds another study: {'; '.join(shown)}{more}. Give another --out.")
 
 

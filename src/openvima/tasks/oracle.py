@@ -31,6 +31,12 @@ class OracleDecision:
     place_id: int
 
 
+def require_goals(problem: Problem) -> None:
+    """Raise an OracleError unless there is a goal to pursue."""
+    if not problem.goals:
+        raise OracleError("the episode has no goals, so the oracle has nothing to do; give it some.")
+
+
 def oracle_action(
     problem: Problem,
     progress: Progress,
@@ -58,8 +64,7 @@ def oracle_action(
         OracleError: No goal is open, the first one states no move, or the object to move is not visible from
             above.
     """
-    if not problem.goals:
-        raise OracleError("the episode has no goals, so the oracle has nothing to do; give it some.")
+    require_goals(problem)
     goals = [problem.goals[index] for index in progress.open_goals]
     if not goals:
         raise OracleError("all goals are met; the oracle has nothing left to do. Reset the environment.")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, differences
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
 from openvima.policies.config import PolicyConfig, appearance_width, config_to_dict
@@ -187,12 +187,7 @@ def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")
-    differing = [
-        f"{name} is {there.get(name)!r} there and {here.get(name)!r} here"
-        for name in {**there, **here}
-        if there.get(name) != here.get(name)
-    ]
-    if differing:
+    if differing := differences(there, here):
         raise ConfigError(
             f"init_from is {source}, a network of other sizes: {'; '.join(differing)}. Give the preset that "
             "it was trained with, and the same settings of the model."

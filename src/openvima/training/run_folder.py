@@ -23,7 +23,7 @@ import torch
 import yaml
 
 from openvima.atomic_io import atomic_write_file, naming, remove_stale, sync_file, sync_files, sync_folder
-from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.errors import CheckpointError, ConfigError, InputFileError, differences
 from openvima.folder_lock import folder_lock, is_lock_file
 from openvima.input_files import read_json, read_yaml
 from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER
@@ -233,9 +233,7 @@ class RunFolder:
             old = read_yaml(file)
         except InputFileError as error:
             return [str(error).rstrip(".")]
-        old, new = flattened(old), flattened(settings)
-        names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-        return [f"{name} is {old.get(name)!r} there and {new.get(name)!r} here" for name in names]
+        return differences(flattened(old), flattened(settings))
 
     def _clear(self) -> None:
         if not (self.path / CONFIG_FILE).is_file():
