@@ -177,7 +177,7 @@ def test_hidden_views_do_not_matter():
 
 
 def test_the_preset_has_them_and_is_small():
-    assert preset("small").attributes == AttributeConfig()
+    assert preset("small").attributes == AttributeConfig(exclusive=True)
     assert policy_size(preset("small")).parameters.trainable < 10e6
     assert with_attributes(preset("small"), False).attributes is None
     with pytest.raises(ConfigError, match="preset small"):

@@ -186,5 +186,5 @@ def small() -> PointerConfig:
         CandidateHeadConfig(),
         correspondence=CorrespondenceConfig(),
         coreference=True,
-        attributes=AttributeConfig(),
+        attributes=AttributeConfig(exclusive=True),
     )
