@@ -267,5 +267,6 @@ def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, recorded:
     slider.fill("1")
     slider.press("Enter")
     page.wait_for("step 1 of 1")
+    settle(session)
     demo = Dataset(recorded)[0]
     assert np.array_equal(session.table.shown.joints, demo.joint_paths[0][-1])
