@@ -49,6 +49,7 @@ _SMALL: Mapping[str, Any] = {
     "optimizer.learning_rate": 4e-4,
     "schedule.warmup_steps": 100,
     "augmentation.text_description_prob": 0.4,
+    "augmentation.text_prompt_prob": 0.15,
     "augmentation.synonym_prob": 0.3,
     "augmentation.paraphrase_prob": 0.4,
     "augmentation.unknown_word_prob": 0.05,
