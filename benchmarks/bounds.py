@@ -1,7 +1,7 @@
 """What limits a policy: nearest appearance, attributes that separate, and success with forced choices.
 
     python benchmarks/bounds.py --policy RUN [--tasks T,…] [--levels L3,…] [--episodes N] [--forced N]
-                                [--attribute NAME] [--seed S] [--assets PACK] [--json FILE]
+                                [--ways W,…] [--attribute NAME] [--seed S] [--assets PACK] [--json FILE]
 
 At the start of each episode, for policies with an appearance embedding:
 
@@ -10,9 +10,11 @@ At the start of each episode, for policies with an appearance embedding:
 - `texture`, `profile`: in `same_texture` and `same_shape`, all right objects are more similar to the base in
   that attribute than all wrong ones. Policies without attributes are measured by appearance.
 
-Played, with `--forced N`, on the first N episodes: `free`, the policy's own choices; `picks`, objects that no
-open goal is about are excluded from the picks; `places`, objects in view that the picked object's goal is not
-relative to, and all other places, are excluded from the places, if the goal is relative to one; and both.
+Played, with `--forced N`, on the first N episodes, in each of `--ways`: `free`, the policy's own choices;
+`picks`, objects that no open goal is about are excluded from the picks; `places`, objects in view that the
+picked object's goal is not relative to, and all other places, are excluded from the places, if the goal is
+relative to one; both; and `guess`, which reads no prompt: any object that can be moved goes to any that
+cannot, without rotation.
 
 Intervals are Wilson's at 95 %. `confused` lists what was wanted, and what was nearer.
 """
@@ -54,7 +56,8 @@ TASKS = (
     "same_shape,same_texture,pick_in_order_then_restore,visual_manipulation,scene_understanding,novel_noun"
 )
 COMPARED = {"same_texture": "texture", "same_shape": "profile"}
-FORCED = ("free", "picks", "places", "picks+places")
+GUESS = "guess"
+FORCED = ("free", "picks", "places", "picks+places", GUESS)
 NUM_CONFUSED = 12  # most frequent ones that are listed
 BATCH = 10  # episodes that are played together
 
@@ -186,16 +189,17 @@ def start_row(
 
 
 class ForcedPolicy(PromptedRolloutPolicy):
-    """Plays a policy whose picks or places are restricted to the right ones.
+    """Plays a policy whose picks or places are restricted to the right ones, or guessed.
 
     Args:
         policy: Its network points at objects, then at place candidates, of which those in view come first.
         force: One of `FORCED`.
+        generator: Draws the guesses.
     """
 
-    def __init__(self, policy: NetworkPolicy, force: str) -> None:
+    def __init__(self, policy: NetworkPolicy, force: str, generator: torch.Generator) -> None:
         super().__init__(policy)
-        self._network_policy, self._force = policy, force
+        self._network_policy, self._force, self._generator = policy, force, generator
         self._running: list[tuple[TabletopEnv, list[int]]] = []
 
     def decide(self, observations: Sequence[Mapping | None]) -> Sequence[Any]:
@@ -225,6 +229,11 @@ class ForcedPolicy(PromptedRolloutPolicy):
             for row, (env, ids) in enumerate(self._running if len(choices) < 2 else ()):
                 allowed_BTX[row, :, self._allowed(env, ids, choices[0][row] if choices else None)] = True
             allowed_BTX |= ~allowed_BTX.any(dim=-1, keepdim=True)
+            if self._force == GUESS and len(choices) < 2:
+                logits_BTX = torch.rand(logits_BTX.shape, generator=self._generator)
+            elif self._force == GUESS:
+                num_bins = logits_BTX.shape[-1]
+                logits_BTX = -torch.arange(num_bins, dtype=logits_BTX.dtype).expand_as(logits_BTX)  # none
             choice = strategy(logits_BTX.masked_fill(~allowed_BTX, torch.finfo(logits_BTX.dtype).min))
             choices.append(choice[:, 0].tolist())
             return choice
@@ -239,7 +248,10 @@ class ForcedPolicy(PromptedRolloutPolicy):
         goals = [
             problem.goals[n] for n in open_goals if n == open_goals[0] or (n in stage and n not in waiting)
         ]
-        if picked_slot is None:
+        if self._force == GUESS:
+            is_place = picked_slot is not None
+            right = {each.id for each in problem.scene.placements if each.fixed == is_place}
+        elif picked_slot is None:
             right = {object_of(goal) for goal in goals} if "picks" in self._force else set()
         else:
             mine = [goal for goal in goals if object_of(goal) == ids[picked_slot]]
@@ -249,15 +261,18 @@ class ForcedPolicy(PromptedRolloutPolicy):
         return [slot for slot, object_id in enumerate(ids) if object_id in right]
 
 
-def forced_rows(policy: NetworkPolicy, task: str, level: str, seeds: Sequence[int], assets: str) -> list[Row]:
+def forced_rows(
+    policy: NetworkPolicy, task: str, level: str, seeds: Sequence[int], assets: str, ways: Sequence[str]
+) -> list[Row]:
     """Play episodes of one task and level, freely and with forced choices."""
     rows = []
-    for force in FORCED:
+    for force in ways:
         outcomes = []
         for first in range(0, len(seeds), BATCH):
             part = seeds[first : first + BATCH]
             envs = [EnvConfig(assets=assets).make(task, level, domain="eval") for _ in part]
-            outcomes += play(envs, part, ForcedPolicy(policy, force))
+            generator = torch.Generator().manual_seed(first)
+            outcomes += play(envs, part, ForcedPolicy(policy, force, generator))
         rows.append(row_of(task, level, force, [outcome.success for outcome in outcomes]))
     return rows
 
@@ -284,7 +299,8 @@ def main() -> None:
     parser.add_argument("--tasks", default=TASKS, help="names with commas in between")
     parser.add_argument("--levels", default="L1,L2,L3,L4")
     parser.add_argument("--episodes", type=int, default=100, help="starts of each task and level")
-    parser.add_argument("--forced", type=int, default=0, help="episodes to play in each of four ways")
+    parser.add_argument("--forced", type=int, default=0, help="episodes to play in each way")
+    parser.add_argument("--ways", default=",".join(FORCED), help="ways of choosing, with commas in between")
     parser.add_argument("--attribute", choices=ATTRIBUTES, help="compare in it, whatever the task asks for")
     parser.add_argument("--seed", type=int, default=60000, help="first episode")
     parser.add_argument("--assets", default="procedural", help="as of `openvima evaluate`")
@@ -293,13 +309,16 @@ def main() -> None:
     policy = NetworkPolicy.from_pretrained(arguments.policy, dtype=torch.float32)
     if not isinstance(policy.network, Pointer):
         parser.error(f"--policy is {arguments.policy}; it must be a pointer network, such as nano or small")
+    ways = arguments.ways.split(",")
+    if unknown := set(ways) - set(FORCED):
+        parser.error(f"--ways names {', '.join(sorted(unknown))}; allowed: {', '.join(FORCED)}")
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     rows: list[Row] = []
     for task in arguments.tasks.split(","):
         for level in sorted(set(arguments.levels.split(",")) & set(task_spec(task).levels)):
             new = [start_row(policy.network, task, level, seeds, arguments.assets, arguments.attribute)]
             if arguments.forced:
-                new += forced_rows(policy, task, level, seeds[: arguments.forced], arguments.assets)
+                new += forced_rows(policy, task, level, seeds[: arguments.forced], arguments.assets, ways)
             for row in new:
                 low, high = (100 * end for end in row["interval"])
                 rate = 100 * row["right"] / max(1, row["episodes"])
