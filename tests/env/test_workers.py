@@ -70,7 +70,7 @@ def is_running(pid: int) -> bool:
 
 
 def wait_until_gone(pids: list[int]) -> None:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while any(map(is_running, pids)):
         assert time.monotonic() < deadline, f"{[pid for pid in pids if is_running(pid)]} still run"
         time.sleep(0.02)
@@ -174,7 +174,7 @@ def test_ctrl_c_ends_everything_with_one_traceback(tmp_path: Path) -> None:
     workers = [int(pid) for pid in process.stdout.readline().split()]
     assert len(workers) == 2
     os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert process.returncode == -signal.SIGINT
     assert errors.count("Traceback") == 1
     assert errors.endswith("KeyboardInterrupt\n")
@@ -196,7 +196,7 @@ def test_workers_leave_ctrl_c_to_their_parent_from_the_first_moment_on(tmp_path:
     time.sleep(0.2)
     assert all(map(is_running, workers))
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert errors.count("Traceback") == 1
     wait_until_gone(workers)
 
@@ -208,7 +208,7 @@ def test_ctrl_c_while_workers_start_ends_them(tmp_path: Path) -> None:
     while len(pids := children.read_text(encoding="utf-8").split()) < 3:  # a third one counts resources
         time.sleep(0.005)
     os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert errors.count("Traceback") == 1
     assert errors.endswith("KeyboardInterrupt\n")
     wait_until_gone([int(pid) for pid in pids])
@@ -220,7 +220,7 @@ def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
     process.stdout.readline()
     workers = [int(pid) for pid in process.stdout.readline().split()]
     process.kill()
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert "Traceback" not in errors
     wait_until_gone(workers)
 
@@ -228,7 +228,7 @@ def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_script_without_a_guard_gets_a_hint(tmp_path: Path) -> None:
     process = start(tmp_path, SCRIPT + "main()")
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert process.returncode == 1
     assert "WorkerError: the worker of sub-environment" in errors
     assert 'need `if __name__ == "__main__":`' in errors

@@ -56,7 +56,7 @@ def test_serve_prints_its_address_answers_and_ends_with_ctrl_c() -> None:
         assert policy.metadata["policy"] == {"name": "dice", "kind": "random", "device": "cpu"}
         assert set(policy.metadata["versions"]) == {"openvima", "numpy"}
         server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=20) == 130
+        assert server.wait(timeout=120) == 130
         logged = server.stderr.read()
         assert "connected" in logged and logged.endswith("goodbye.\n") and "Traceback" not in logged
         policy.close()
