@@ -76,5 +76,5 @@ for row in results.rows:
 # ```sh
 # openvima generate --tasks visual_manipulation --episodes 900 --out demos
 # openvima train --data demos --preset nano --out run
-# openvima evaluate --policy run --tasks visual_manipulation --out results
+# openvima evaluate --policy run --tasks visual_manipulation --out scores
 # ```

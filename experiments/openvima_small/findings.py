@@ -43,6 +43,7 @@ SIMULATORS = {
 _OTHER_WEIGHTS = ("second_seed", "without_", "previous")
 _DETECTED = "detected_boxes"
 ABLATIONS, BASELINES = "ablations", "baselines"  # what the scripts of these names write
+GUESS = "guess"  # GUESS.json is what `benchmarks/bounds.py --ways guess` wrote
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +81,13 @@ class Findings:
         scores: Evaluations by the names of `EVALUATIONS` and `SIMULATORS`; absent ones are not there.
         ablations: Tables of `ablations.py`, in Markdown, by name; empty if absent.
         baselines: Other architectures at equal cost.
+        guesses: Successes and episodes of a policy that reads no prompt, a pair for each task, by level.
     """
 
     scores: Mapping[str, Results]
     ablations: Mapping[str, str] = field(default_factory=dict)
     baselines: tuple[Training, ...] = ()
+    guesses: Mapping[str, Sequence[tuple[int, int]]] = field(default_factory=dict)
 
     def means(self, name: str = "default") -> dict[str, LevelMean]:
         """Plain success rate by level; of `detected` and `previous_detected` that with detected boxes."""
@@ -130,7 +133,25 @@ def find(folder: Path, weights: str) -> Findings:
     rows = read_rows(folder / ABLATIONS)
     made = {"ablations": differences_table(rows) if rows else "", "attributes": attribute_table(rows)}
     trainings = read_trainings(sorted((folder / BASELINES).glob("*.json")))
-    return Findings(found, {name: table.strip() for name, table in made.items()}, trainings)
+    guesses = read_guesses(folder / f"{GUESS}.json")
+    return Findings(found, {name: table.strip() for name, table in made.items()}, trainings, guesses)
+
+
+def read_guesses(file: Path) -> dict[str, list[tuple[int, int]]]:
+    """Read successes and episodes of each task by level; nothing where the file is absent.
+
+    Raises:
+        DatasetError: The file is damaged.
+    """
+    found: dict[str, list[tuple[int, int]]] = {}
+    try:
+        rows = read_json(file)["rows"] if file.exists() else []
+        for row in rows:
+            if row["measure"] == GUESS:
+                found.setdefault(row["level"], []).append((int(row["right"]), int(row["episodes"])))
+    except (ValueError, TypeError, KeyError) as error:
+        raise DatasetError(f"{file} cannot be read ({error!r}); measure it again.") from error
+    return found
 
 
 def read_simulator(folder: Path) -> Results:

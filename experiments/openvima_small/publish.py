@@ -57,6 +57,7 @@ def record(findings: Findings) -> dict[str, Any]:  # Any: plain JSON values
     return {
         "scores": {name: _score_record(results) for name, results in findings.scores.items()},
         "baselines": [_training_record(training) for training in findings.baselines],
+        "guesses": {level: [list(pair) for pair in pairs] for level, pairs in findings.guesses.items()},
     }
 
 

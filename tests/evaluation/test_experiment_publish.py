@@ -66,6 +66,8 @@ def scores(tmp_path: Path) -> Path:
         path = tmp_path / "scores" / "simulator" / "L3" / "rotate" / f"{seed}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"seed": seed, "success": seed > 0, "failure": False, "steps": 2}))
+    guesses = {"rows": [{"measure": "guess", "level": "L1", "right": 2, "episodes": EPISODES}]}
+    (tmp_path / "scores" / "guess.json").write_text(json.dumps(guesses))
     (tmp_path / "scores" / "ablations").mkdir()
     row = {"variant": "no-rotation", "seed": 0, "solved": {"L1": {"twist": "1110"}}}
     (tmp_path / "scores" / "ablations" / "no-rotation.json").write_text(json.dumps(row))
@@ -103,9 +105,10 @@ def test_tables_show_ours_beside_the_published_and_the_previous(findings: Findin
     assert lines_of(made["levels"])["openvima-small"][2].startswith("90.0 (")
     settings = lines_of(made["settings"])
     assert settings["procedural assets"][2].startswith("90.0")
-    assert settings["previous weights"][0] == "8.5M"
+    assert settings["previous weights"][0] == "7.3M"
     assert settings["previous weights"][2].startswith("60.0")
     assert "no prompt" in made["controls"] and "swapped" not in made["controls"]
+    assert lines_of(made["controls"])["a guess in place of the policy"][0].startswith("20.0 (")
     swapped = lines_of(made["swapped_attribute"])["same\\_texture, L4"]
     assert [cell.split()[0] for cell in swapped] == ["90.0", "40.0", "33.3"]
     assert lines_of(made["failures"])["rotate, L1"][1] == "missed (1)"
@@ -123,6 +126,9 @@ def test_scores_of_other_weights_are_refused_and_absent_ones_named(scores: Path,
         find(scores / "default", WEIGHTS)
     with pytest.raises(DatasetError, match="has no episode"):
         read_simulator(scores / "default")
+    (scores / "guess.json").write_text('{"rows": [{"measure": "guess"}]}')
+    with pytest.raises(DatasetError, match=r"guess\.json cannot be read"):
+        find(scores, WEIGHTS)
     (scores / "simulator" / "L3" / "rotate" / "2.json").write_text("{}")
     with pytest.raises(DatasetError, match=r"2\.json cannot be read"):
         read_simulator(scores / "simulator")

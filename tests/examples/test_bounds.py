@@ -51,5 +51,16 @@ def test_objects_are_separated_if_the_least_right_one_is_above_all_wrong_ones(
 def test_a_network_that_knows_nothing_solves_what_it_is_forced_to(force: str, solved: bool) -> None:
     policy = NetworkPolicy(build_network(narrow_small(), seed=0), dtype=torch.float32)
     envs = [TabletopEnv("visual_manipulation", level="L1", domain="eval") for _ in range(2)]
-    outcomes = play(envs, [0, 1], ForcedPolicy(policy, force))
+    outcomes = play(envs, [0, 1], ForcedPolicy(policy, force, torch.Generator()))
     assert [outcome.success for outcome in outcomes] == [solved, solved]
+
+
+def test_guesses_follow_from_their_generator_alone_and_are_sometimes_right() -> None:
+    def solved(network_seed: int) -> list[bool]:
+        policy = NetworkPolicy(build_network(narrow_small(), seed=network_seed), dtype=torch.float32)
+        envs = [TabletopEnv("visual_manipulation", level="L1", domain="eval") for _ in range(8)]
+        generator = torch.Generator().manual_seed(0)
+        return [each.success for each in play(envs, range(8), ForcedPolicy(policy, "guess", generator))]
+
+    assert solved(0) == solved(1)
+    assert set(solved(0)) == {True, False}

@@ -22,7 +22,7 @@ def main(
     seed: int = 0,
     workers: int | None = None,
 ) -> int:
-    """Write demonstrations, train a small VIMA policy on them, score it, and leave a report.
+    """Write demonstrations, train a small pointer network on them, score it, and leave a report.
 
     openvima-small, which comes trained with the package, is scored beside it. Takes at most ten minutes on
     two cores. It can be interrupted at any time; the same command goes on where it stopped.

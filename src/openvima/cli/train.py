@@ -91,7 +91,7 @@ def run(words: Sequence[str]) -> int:
     if not is_first:
         return 0
     trust = " --trust-code" if ":" in config.preset else ""
-    hint = f"`openvima evaluate --policy {shlex.quote(str(folder))}{trust} --out results` scores it."
+    hint = f"`openvima evaluate --policy {shlex.quote(str(folder))}{trust} --out scores` scores it."
     print(hint, file=sys.stderr)
     print(folder)
     return 0

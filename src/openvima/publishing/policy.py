@@ -262,6 +262,6 @@ def _scores(scores: Results | None, name: HubName, *, confirmed: bool) -> str:
 
 
 def _use(name: HubName) -> str:
-    shell = f"pip install 'openvima[train,hub]'\nopenvima evaluate --policy {name} --out results"
+    shell = f"pip install 'openvima[train,hub]'\nopenvima evaluate --policy {name} --out scores"
     python = f'from openvima.policies import load_policy\n\npolicy = load_policy("{name}")'
     return f"{fenced(shell, 'sh')}\n{fenced(python, 'python')}"
