@@ -41,10 +41,11 @@ from weights import read_lines, spent
 
 _PRETRAINED = ("images.crop_encoder.", "images.appearance.", "images.rotation.", "attributes.")
 _SHORT_PRETRAINING = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000}
+FULL = "full"
 _NO_ATTRIBUTES = {"model.attributes": False, "pretraining.attribute_loss_weight": 0.0}
 
 Settings = dict[str, Any]  # Any: as in `TrainingConfig`
-Rows = dict[str, dict[int, dict[str, dict[str, str]]]]  # outcomes by variant, seed, level and task
+Solved = dict[str, dict[str, str]]  # outcomes by level and task
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +62,27 @@ class Variant:
     what: str
     change: Callable[[PointerConfig], PointerConfig] = lambda config: config
     settings: Settings = field(default_factory=dict)
-    baseline: str = "full"
+    baseline: str = FULL
 
     @property
     def has_own_crops(self) -> bool:
         """Whether it pretrains a crop encoder of its own, instead of that of another run."""
         return "pretraining.steps" in self.settings
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The trainings of a variant, whose definition may have changed since.
+
+    Args:
+        what: As of the variant.
+        baseline: As of the variant.
+        seeds: Outcomes by seed.
+    """
+
+    what: str
+    baseline: str
+    seeds: dict[int, Solved] = field(default_factory=dict)
 
 
 def _without(part: str) -> Callable[[PointerConfig], PointerConfig]:
@@ -87,9 +103,9 @@ def _within_prompts_only(config: PointerConfig) -> PointerConfig:
     return replace(config, correspondence=replace(config.correspondence, within_view=False))
 
 
-def _exclusive_attributes(config: PointerConfig) -> PointerConfig:
+def _shared_attributes(config: PointerConfig) -> PointerConfig:
     assert config.attributes
-    return replace(config, attributes=replace(config.attributes, exclusive=True))
+    return replace(config, attributes=replace(config.attributes, exclusive=False))
 
 
 def _probs_of_cloning() -> dict[str, Variant]:
@@ -105,14 +121,14 @@ def _probs_of_cloning() -> dict[str, Variant]:
         "no-rerendering": Variant(
             "no demonstrations with random appearance", settings={"loader.rerendered_prob": 0.0}
         ),
-        "text-prompts": Variant(
-            "whole prompts as text with probability 0.25", settings={"augmentation.text_prompt_prob": 0.25}
+        "no-text-prompts": Variant(
+            "no prompts of text alone", settings={"augmentation.text_prompt_prob": 0.0}
         ),
         "no-wording": Variant(
             "no text descriptions, synonyms, paraphrases and unknown words",
             settings={
                 f"augmentation.{name}_prob": 0.0
-                for name in ("text_description", "synonym", "paraphrase", "unknown_word")
+                for name in ("text_description", "text_prompt", "synonym", "paraphrase", "unknown_word")
             },
         ),
         **{
@@ -159,7 +175,7 @@ def _pretraining() -> dict[str, Variant]:
 
 
 VARIANTS = {
-    "full": Variant("full model"),
+    FULL: Variant("full model"),
     "pointing": Variant(
         "object head: place positions relative to visible objects only",
         lambda config: replace(config, head=ObjectHeadConfig(), attributes=None),
@@ -167,9 +183,7 @@ VARIANTS = {
         baseline="no-attributes",
     ),
     "no-attributes": Variant("no attributes", settings=_NO_ATTRIBUTES),
-    "exclusive-attributes": Variant(
-        "selected attributes alone tell which objects are alike", _exclusive_attributes
-    ),
+    "shared-attributes": Variant("sizes and appearance beside selected attributes", _shared_attributes),
     "no-correspondence": Variant("no correspondence between images", _without("correspondence")),
     "no-view-correspondence": Variant("no correspondence within the view", _within_prompts_only),
     "no-coreference": Variant("no coreference", _without("coreference")),
@@ -271,6 +285,7 @@ def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
     return {
         "variant": name,
         "what": variant.what,
+        "baseline": variant.baseline,
         "demonstrations": len(Dataset(given.data)),
         "steps": given.steps,
         "seed": seed,
@@ -282,34 +297,36 @@ def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
     }
 
 
-def solved(results: Results) -> dict[str, dict[str, str]]:
+def solved(results: Results) -> Solved:
     """Return which episodes were solved, by level and task: "1" or "0" for each, in the order of seeds."""
-    found: dict[str, dict[str, str]] = {}
+    found: Solved = {}
     for row in results.rows:
         bits = "".join(str(int(outcome.success)) for outcome in row.outcomes)
         found.setdefault(row.level, {})[row.task] = bits
     return found
 
 
-def read_rows(folder: Path) -> Rows:
-    """Read the outcomes of all runs, by variant, seed, level and task."""
-    rows: Rows = {name: {} for name in VARIANTS}
-    for file in sorted(folder.glob("*.json")):
-        row = json.loads(file.read_text(encoding="utf-8"))
-        rows[row["variant"]][row["seed"]] = row["solved"]
-    return {name: of_seeds for name, of_seeds in rows.items() if of_seeds}
+def read_rows(folder: Path) -> dict[str, Recorded]:
+    """Read the outcomes of all runs by variant, the full model first."""
+    found: dict[str, Recorded] = {}
+    rows = [json.loads(file.read_text(encoding="utf-8")) for file in folder.glob("*.json")]
+    for row in sorted(rows, key=lambda row: (row["variant"] != FULL, row["variant"], row["seed"])):
+        new = Recorded(row["what"], row.get("baseline", FULL))
+        found.setdefault(row["variant"], new).seeds[row["seed"]] = row["solved"]
+    return found
 
 
-def differences_table(found: Rows) -> str:
+def differences_table(found: dict[str, Recorded]) -> str:
     """Write the success of all variants and their differences from their baselines, of the seeds of both."""
-    levels = list(next(iter(next(iter(found.values())).values()))) if found else []
+    levels = list(next(iter(next(iter(found.values())).seeds.values()))) if found else []
     lines = []
-    for name, of_seeds in found.items():
-        baseline, cells = found.get(VARIANTS[name].baseline, {}), []
+    for name, recorded in found.items():
+        of_seeds, cells = recorded.seeds, []
+        baseline = found[recorded.baseline].seeds if recorded.baseline in found else {}
         shared = sorted(of_seeds.keys() & baseline.keys())
         for level in levels:
             cells.append(_score(list(own[level].values()) for own in of_seeds.values()))
-            if not shared or VARIANTS[name].baseline == name:
+            if not shared or recorded.baseline == name:
                 cells.append("")
                 continue
             pairs = [(of_seeds[seed][level], baseline[seed][level]) for seed in shared]
@@ -318,20 +335,20 @@ def differences_table(found: Rows) -> str:
             )
             mark = "≈" if interval[0] <= 0 <= interval[1] else ""
             cells.append(Estimate(difference, interval, True, mark))
-        lines.append(Line(VARIANTS[name].what, (str(len(of_seeds)), *cells)))
+        lines.append(Line(recorded.what, (str(len(of_seeds)), *cells)))
     columns = ("", "seeds", *(column for level in levels for column in (level, "difference")))
     return markdown([Table("ablations", "", columns, tuple(lines))])
 
 
-def attribute_table(found: Rows) -> str:
+def attribute_table(found: dict[str, Recorded]) -> str:
     """Write L4 with and without attributes, task by task; empty if one of them was not trained."""
-    pair = [found.get(name, {}) for name in ("full", "no-attributes")]
-    if not all(pair):
+    pair = [found[name] for name in (FULL, "no-attributes") if name in found]
+    if len(pair) < 2:
         return ""
-    tasks = list(next(iter(pair[0].values()))["L4"])
+    tasks = list(next(iter(pair[0].seeds.values()))["L4"])
     lines = []
-    for what, of_seeds in zip(("with attributes", "without"), pair, strict=True):
-        rows = list(of_seeds.values())
+    for what, recorded in zip(("with attributes", "without"), pair, strict=True):
+        rows = list(recorded.seeds.values())
         of_tasks = [_score([row["L4"][task]] for row in rows) for task in tasks]
         means = _score(row["L4"].values() for row in rows), _score([row["L3"]["same_shape"]] for row in rows)
         lines.append(Line(what, (str(len(rows)), *of_tasks, *means)))

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from ablations import VARIANTS, attribute_table, differences_table, read_rows, settings_of, solved
+from ablations import VARIANTS, Recorded, attribute_table, differences_table, read_rows, settings_of, solved
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import PairCounts, difference_over_seeds
 from openvima.policies.parameter_counts import policy_size
@@ -47,22 +47,25 @@ def test_differences_are_over_the_seeds_of_both(tmp_path: Path) -> None:
         ("no-rotation", 1): 9,
     }
     for (name, seed), count in solved_of.items():
-        row = {"variant": name, "seed": seed, "solved": {"L1": {"twist": f"{'1' * count:0<{EPISODES}}"}}}
+        outcomes = {"L1": {"twist": f"{'1' * count:0<{EPISODES}}"}}
+        row = {"variant": name, "what": name.replace("-", " "), "seed": seed, "solved": outcomes}
         (tmp_path / f"{name}-{seed}.json").write_text(json.dumps(row))
     lines = differences_table(read_rows(tmp_path)).splitlines()
     rows = {line.split(" | ")[0].strip("| "): line for line in lines if line.startswith("| ")}
-    assert "70.0" in rows["full model"] and "+" not in rows["full model"]
+    assert "70.0" in rows["full"] and "+" not in rows["full"]
     difference, interval = difference_over_seeds([[PairCounts(5, 0, 3, 2)], [PairCounts(5, 0, 1, 4)]])
     assert f"−{-100 * difference:.1f}" in rows["no coreference"]
     assert f"{100 * interval[1]:.1f}" in rows["no coreference"]
-    assert "+30.0" in rows["no relative rotation"]  # of the seed that both have
+    assert "+30.0" in rows["no rotation"]  # of the seed that both have
 
 
 def test_attributes_are_shown_where_both_were_trained() -> None:
     with_them = {"L3": {"same_shape": "11"}, "L4": {"same_texture": "11", "follow_motion": "10"}}
     without = {"L3": {"same_shape": "10"}, "L4": {"same_texture": "00", "follow_motion": "10"}}
-    assert attribute_table({"full": {0: with_them}}) == ""
-    lines = attribute_table({"full": {0: with_them}, "no-attributes": {0: without}}).splitlines()
+    full = Recorded("full model", "full", {0: with_them})
+    assert attribute_table({"full": full}) == ""
+    found = {"full": full, "no-attributes": Recorded("no attributes", "full", {0: without})}
+    lines = attribute_table(found).splitlines()
     cells = {line.split(" | ")[0].strip("| "): line.split(" | ")[1:] for line in lines if " | " in line}
     assert [cell.split()[0] for cell in cells["with attributes"]] == ["1", "100.0", "50.0", "75.0", "100.0"]
     assert [cell.split()[0] for cell in cells["without"]] == ["1", "0.0", "50.0", "25.0", "50.0"]

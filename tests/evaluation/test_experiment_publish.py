@@ -69,7 +69,12 @@ def scores(tmp_path: Path) -> Path:
     guesses = {"rows": [{"measure": "guess", "level": "L1", "right": 2, "episodes": EPISODES}]}
     (tmp_path / "scores" / "guess.json").write_text(json.dumps(guesses))
     (tmp_path / "scores" / "ablations").mkdir()
-    row = {"variant": "no-rotation", "seed": 0, "solved": {"L1": {"twist": "1110"}}}
+    row = {
+        "variant": "no-rotation",
+        "what": "no relative rotation",
+        "seed": 0,
+        "solved": {"L1": {"twist": "1110"}},
+    }
     (tmp_path / "scores" / "ablations" / "no-rotation.json").write_text(json.dumps(row))
     (tmp_path / "scores" / "baselines").mkdir()
     record = training(tmp_path / "scores" / "baselines", "vima", 1)
