@@ -225,16 +225,18 @@ class ForcedPolicy(PromptedRolloutPolicy):
         choices: list[list[int]] = []  # slots that were picked, places, bins of rotations
 
         def choose(logits_BTX: torch.Tensor) -> torch.Tensor:
+            least = torch.finfo(logits_BTX.dtype).min
             allowed_BTX = torch.zeros_like(logits_BTX, dtype=torch.bool)
             for row, (env, ids) in enumerate(self._running if len(choices) < 2 else ()):
                 allowed_BTX[row, :, self._allowed(env, ids, choices[0][row] if choices else None)] = True
             allowed_BTX |= ~allowed_BTX.any(dim=-1, keepdim=True)
             if self._force == GUESS and len(choices) < 2:
-                logits_BTX = torch.rand(logits_BTX.shape, generator=self._generator)
+                guessed_BTX = torch.rand(logits_BTX.shape, generator=self._generator, dtype=logits_BTX.dtype)
+                logits_BTX = guessed_BTX.masked_fill(logits_BTX <= least / 2, least)  # what is not there
             elif self._force == GUESS:
                 num_bins = logits_BTX.shape[-1]
                 logits_BTX = -torch.arange(num_bins, dtype=logits_BTX.dtype).expand_as(logits_BTX)  # none
-            choice = strategy(logits_BTX.masked_fill(~allowed_BTX, torch.finfo(logits_BTX.dtype).min))
+            choice = strategy(logits_BTX.masked_fill(~allowed_BTX, least))
             choices.append(choice[:, 0].tolist())
             return choice
 

@@ -13,7 +13,6 @@ from openvima.evaluation.results import EpisodeOutcome, LevelMean, Results, Row
 from openvima.input_files import read_json
 
 POLICY = "openvima-small"
-DEMONSTRATIONS = 52_000  # of the bundled checkpoint
 PUBLISHED_DEMONSTRATIONS = 650_000  # of the papers' models, the full dataset
 LEVELS = ("L1", "L2", "L3", "L4")
 SWAPPED = "swapped_attribute"

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from findings import (
-    DEMONSTRATIONS,
     EVALUATIONS,
     LEVELS,
     POLICY,
@@ -17,8 +16,6 @@ from findings import (
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.bundled import BUNDLED
-from openvima.policies.checkpoint import read_info
-from openvima.policies.parameter_counts import policy_size
 from openvima.report.paper import paper_tables
 from openvima.report.published import PublishedModel, leading_models, published_models
 from openvima.report.text import ablation_name, counted
@@ -26,7 +23,7 @@ from openvima.report.typesetting import Estimate, Line, Table, markdown
 from weights import shipped
 
 _BESIDE = (("MIDAS", "92M"), ("VIMA", "200M"), ("VIMA", "9M"))  # best, best known, of similar size
-_PREVIOUS_SIZE = "7.3M"
+_PREVIOUS = ("7.3M", "52,000")  # parameters and demonstrations
 _CHANCE = 1 / 3  # with the other attribute: docs/evaluation.md
 _SETTINGS = tuple(name for name in EVALUATIONS if name not in ("controls", "text"))
 _IN_SIMULATOR = (
@@ -71,12 +68,13 @@ def _level_table(
     found = {what: means for name, what in shown.items() if (means := findings.means(name))}
     if not found:
         return None
-    size = policy_size(read_info(BUNDLED[POLICY].folder).config).parameters.total
+    own = shipped(BUNDLED[POLICY].folder)
+    ours = (f"{own.parameters / 1e6:.1f}M", f"{own.episodes:,}") if own else ("–", "–")
     columns = ("", "parameters", "demonstrations") if models else ("",)
     lines = []
     for what, means in found.items():
-        own = (_PREVIOUS_SIZE if what.startswith("previous") else f"{size / 1e6:.1f}M", f"{DEMONSTRATIONS:,}")
-        lines.append(Line(what, (*(own if models else ()), *_cells(means, LEVELS))))
+        about = _PREVIOUS if what.startswith("previous") else ours
+        lines.append(Line(what, (*(about if models else ()), *_cells(means, LEVELS))))
     for model in models:
         rates = (model.written(level, model.levels[level], keep_marks=False) for level in LEVELS)
         cells = (f"{model.size} and T5", f"{PUBLISHED_DEMONSTRATIONS:,}", *rates)

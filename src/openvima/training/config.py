@@ -216,7 +216,8 @@ class AugmentationConfig:
             1 for inverse-dynamics pretraining, less for in-context demonstrations. Validation uses the
             prompts of the tasks, unless it is 1.
         drop_unused_objects_prob: Probability of dropping each object that an inverse-dynamics demonstration
-            does not use from the observations and, independently, from the prompt frames. Needs true boxes.
+            does not use from the observations, and each that is left from the prompt frames. Needs true
+            boxes.
         rename_objects_prob: Probability of naming prompt objects by novel nouns: "This is a wug {image}."
             Prompts with novel words of their own stay as they are.
         shuffle_sentences_prob: Probability of shuffling the sentences that define novel words, and of keeping

@@ -30,8 +30,8 @@ def preprocess(
     Args:
         folder: Folder of demonstrations.
         kind: objects for presets with object tokens, frames for gato, flamingo and gpt.
-        boxes: Detector that extracts the objects, for `openvima train --loader.boxes`: "detector" for the bundled
-            one, detector=FOLDER for one trained with `openvima detector train`, or MODULE:FUNCTION or
+        boxes: Detector that extracts the objects, for `openvima train --loader.boxes`: "detector" for the
+            bundled one, detector=FOLDER for one trained with `openvima detector train`, or MODULE:FUNCTION or
             FILE.py:FUNCTION, which returns an ObjectExtractor. Default: the segmentation.
         fraction: Fraction of the demonstrations in which `boxes` detects objects, for `openvima train
             --loader.detected-fraction`.

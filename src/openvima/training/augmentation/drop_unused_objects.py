@@ -10,10 +10,11 @@ from openvima.training.dataset import Example
 
 @dataclass(frozen=True, slots=True)
 class DropUnusedObjects:
-    """Drops unused objects from the observations and, independently, from the prompt frames.
+    """Drops unused objects from the observations, and others from the prompt frames.
 
     Args:
-        prob: Probability of either for each unused object; it needs the ids of the segmentation.
+        prob: Probability of the first for each unused object, and of the second for each that is left; it
+            needs the ids of the segmentation.
     """
 
     prob: float

@@ -1,7 +1,8 @@
 """Occlusion by bars of the background: white in a prompt image, the table in a scene.
 
 Few shapes of the training partition have gaps, so that the encoder would take what shows through those of
-pallets and crates for their texture. All images of one object get the same bars.
+pallets and crates for their texture. All images of one object get the same bars,
+each upright or level at random.
 
 Shape suffixes: K objects, D draws, Y rows, X columns of a crop.
 """
