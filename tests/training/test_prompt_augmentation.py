@@ -118,6 +118,16 @@ def test_renamed_objects_keep_image_and_placeholder(task, episodes):
     assert bool(with_others) == (task != "rotate" or episode.objects_per_step[0] > 1)
 
 
+@pytest.mark.parametrize("determiner", ["any", "one", "two", "three", "all"])
+def test_a_renamed_object_has_no_article_beside_another_determiner(determiner, episodes):
+    episode = episodes["visual_manipulation"]
+    text = f"Sweep {determiner} {{dragged_obj}} into {{base_obj}}."
+    episode = replace(episode, prompt=replace(episode.prompt, text=text))
+    for seed in range(12):
+        *_, rest = renamed(episode, np.random.default_rng(seed)).prompt.text.split(". ")
+        assert re.fullmatch(rf"Sweep {determiner} ({{dragged_obj}}|\w+) into ({{base_obj}}|the \w+)\.", rest)
+
+
 @pytest.mark.parametrize("task", KEPT)
 def test_prompts_with_novel_words_or_without_single_objects_are_unchanged(task, episodes):
     assert renamed(episodes[task], np.random.default_rng(0)) is episodes[task]

@@ -11,11 +11,12 @@ import numpy as np
 from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.perception.preprocessing import ObjectTable
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS
+from openvima.tasks.sweep_table import NUMBER_WORDS
 from openvima.training.augmentation.prompt_images import DEFINITION, images_by_name, with_prompt
 
 MAX_NAMES = 2
 _NOVEL_WORD = re.compile(rf"\b({'|'.join(NOUNS + ADJECTIVES)})\b")
-_DETERMINERS = ("the", "same", "any", "all")  # words after which a noun needs no article
+_DETERMINERS = ("the", "same", "any", "all", *NUMBER_WORDS)  # words after which a noun needs no article
 
 
 def renamed(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
