@@ -317,6 +317,7 @@ def test_boxes_are_drawn_around_masks_and_specks_left_out() -> None:
         (lambda: Detections.from_edges(np.zeros(4)), ShapeError, "left, upper, right, lower"),
         (lambda: Detections.from_edges(np.array([[256.0, 0, 300, 9]])), DetectionError, "outside"),
         (lambda: Detections.from_edges(np.array([[np.nan, 0, 9, 9]])), DetectionError, "outside"),
+        (lambda: Detections.from_edges(np.array([[9.0, 9.0, 20.0, 5.0]])), DetectionError, "ends before"),
     ],
 )
 def test_impossible_detections_are_refused_at_once(make, error: type, message: str) -> None:

@@ -109,17 +109,20 @@ class Detections:
 
         Raises:
             ShapeError: `edges` is not of shape (N, 4).
-            DetectionError: An edge is not a finite number, or a box lies outside the image.
+            DetectionError: An edge is not a finite number, or a box lies outside the image or ends before
+                it begins.
         """
         edges = np.asarray(edges, np.float64)
         if edges.ndim != 2 or edges.shape[1] != 4:
             raise ShapeError(f"edges have shape {edges.shape}; it must be (N, 4): left, upper, right, lower.")
         limit = np.array([width, height], np.float64)
         inside = (edges[:, :2] < limit).all(axis=1) & (edges[:, 2:] > 0).all(axis=1)
-        wrong = ~(inside & np.isfinite(edges).all(axis=1))
+        ordered = (edges[:, 2:] >= edges[:, :2]).all(axis=1)
+        wrong = ~(inside & ordered & np.isfinite(edges).all(axis=1))
         if wrong.any():
             raise DetectionError(
-                f"box {edges[wrong][0].tolist()} lies outside the image of {width} × {height} pixels."
+                f"box {edges[wrong][0].tolist()} lies outside the image of {width} × {height} pixels, or "
+                "ends before it begins."
             )
         first = np.maximum(np.floor(edges[:, :2]), 0)
         last = np.maximum(np.minimum(np.ceil(edges[:, 2:]), limit) - 1, first)
