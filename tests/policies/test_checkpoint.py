@@ -302,6 +302,10 @@ def test_of_a_run_the_best_checkpoint_is_taken_else_the_last(tmp_path) -> None:
     (checkpoints / BEST_FILE).write_text("2-cloning-000100")
     assert checkpoint_folder(tmp_path).name == "2-cloning-000400"
     assert checkpoint_folder(checkpoints / "2-cloning-000400").name == "2-cloning-000400"
+    (checkpoints / BEST_FILE).unlink()
+    for name in ("2-cloning-999000", "2-cloning-1000000", "1-pretraining-2000000"):
+        (checkpoints / name).mkdir()
+    assert checkpoint_folder(tmp_path).name == "2-cloning-1000000"
 
 
 def test_a_run_without_a_checkpoint_yet_is_refused(tmp_path) -> None:

@@ -190,6 +190,13 @@ def test_an_empty_run_folder_has_no_checkpoint(tmp_path):
         folder.optimizer_state()
 
 
+def test_the_last_checkpoint_is_that_of_most_steps_of_the_last_stage(tmp_path):
+    folder = RunFolder(tmp_path / "run", {"a": 1})
+    for name in ("1-pretraining-2000000", "2-cloning-999000", "2-cloning-1000000"):
+        (folder.checkpoints / name).mkdir()
+    assert folder.latest().name == "2-cloning-1000000"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -14,6 +14,7 @@ from openvima.policies.file_names import (
     CONFIG_FILE,
     TOKENIZER_FOLDER,
     WEIGHTS_FILE,
+    checkpoint_order,
 )
 from openvima.policies.presets import PRESETS
 from openvima.user_code import is_code
@@ -97,5 +98,5 @@ def checkpoint_folder(folder: Path) -> Path:
         named = checkpoints / Path(read_text(best).strip()).name  # never a folder elsewhere
         if named.is_dir():
             return named
-    found = sorted(path for path in checkpoints.iterdir() if path.is_dir() and not path.suffix)
-    return found[-1] if found else folder
+    found = (path for path in checkpoints.iterdir() if path.is_dir() and not path.suffix)
+    return max(found, key=checkpoint_order, default=folder)

@@ -26,7 +26,7 @@ from openvima.atomic_io import atomic_write_file, naming, remove_stale, sync_fil
 from openvima.errors import CheckpointError, ConfigError, InputFileError, differences
 from openvima.folder_lock import folder_lock, is_lock_file
 from openvima.input_files import read_json, read_yaml
-from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER
+from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_order
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.learner import Learner
 from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER
@@ -124,14 +124,14 @@ class RunFolder:
 
     def latest(self) -> Path | None:
         """Return the last complete checkpoint, or None."""
-        found = sorted(path for path in self.checkpoints.iterdir() if path.is_dir())
-        return found[-1] if found else None
+        found = (path for path in self.checkpoints.iterdir() if path.is_dir())
+        return max(found, key=checkpoint_order, default=None)
 
     def save(self, name: str, learner: Learner, state: TrainedState, progress: Progress) -> None:
         """Write a checkpoint, and delete others except the best and permanent ones.
 
         Args:
-            name: Folder name; names sort in the order of steps.
+            name: Folder name, STAGE-STEP.
             learner: Writes its weights.
             state: Weights and optimizer state.
             progress: Progress of the run.
