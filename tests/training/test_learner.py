@@ -119,6 +119,19 @@ def test_weights_that_do_not_fit_are_refused(example, tmp_path) -> None:
         learner.read(tmp_path)
 
 
+def test_tied_weights_are_written_and_read(tmp_path) -> None:
+    class Tied(Learner):
+        def __init__(self) -> None:
+            super().__init__()
+            self.first = torch.nn.Linear(2, 2)
+            self.second = self.first
+
+    written, other = Tied(), Tied()
+    written.write(tmp_path, written.state_dict())
+    other.read(tmp_path)
+    assert torch.equal(other.second.weight, written.first.weight)
+
+
 def test_rollouts_are_logged_with_their_step(settings, monkeypatch) -> None:
     seen, tracked = [], []
 

@@ -75,7 +75,8 @@ class Learner(nn.Module):
             folder: The folder.
             weights: State dict of the learner, gathered if sharded.
         """
-        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
+        # Copies, since a file holds no tensors that share memory, as tied weights do.
+        tensors = {name: t.detach().to("cpu", copy=True).contiguous() for name, t in weights.items()}
         write_safetensors(tensors, folder / WEIGHTS_FILE)
 
     def read(self, folder: Path) -> None:
