@@ -23,7 +23,7 @@ BAD = {
     "augmentation.shuffle_sentences_prob": (-0.1, 1.1),
     "augmentation.distractor_prob": (-0.1, 1.1),
     "pretraining.steps": (-1,),
-    "pretraining.num_scenes": (0,),
+    "pretraining.num_scenes": (0, 1),
     "pretraining.batch_size": (1,),
     "pretraining.learning_rate": (-1.0,),
     "pretraining.appearance_randomization_prob": (-0.1, 1.1),
@@ -64,6 +64,9 @@ def test_a_value_out_of_range_is_named_with_what_is_allowed(name: str, value: ob
         ("optimizer.learning_rate", True, "optimizer.learning_rate is True; it must be a number"),
         ("runtime.tensorboard", "no", "runtime.tensorboard is 'no'; it must be true or false"),
         ("preset", 3, "preset is 3; it must be text"),
+        ("data", None, "data is None; it must be a path"),
+        ("out", 20240501, "out is 20240501; it must be a path"),
+        ("object_cache", 5, "object_cache is 5; it must be a path"),
     ],
 )
 def test_a_value_of_another_type_is_named(name: str, value: object, message: str) -> None:

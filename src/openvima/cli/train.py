@@ -71,12 +71,15 @@ def run(words: Sequence[str]) -> int:
         settings = overridden(settings, {"init_from": known.init_from})
     if preset:
         settings["preset"] = preset  # so that the defaults are consistent before it is parsed again
+    default = TrainingConfig.of({"data": Path(), "out": Path(), **settings})
+    for name in {"data", "out"} - settings.keys():
+        object.__setattr__(default, name, tyro.MISSING)  # required, but a config checks that it is a path
     config = tyro.cli(
         TrainingConfig,
         prog="openvima train",
         description=DESCRIPTION,
         args=rest,
-        default=TrainingConfig.of({"data": tyro.MISSING, "out": tyro.MISSING, **settings}),
+        default=default,
     )
     is_first = os.environ.get("RANK", "0") == "0"
     others = config.runtime.processes - 1 if "WORLD_SIZE" not in os.environ else 0

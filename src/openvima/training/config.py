@@ -190,7 +190,7 @@ class PretrainingConfig:
     """
 
     steps: Steps | None = None
-    num_scenes: Count = 2500
+    num_scenes: Annotated[int, Range(2)] = 2500
     batch_size: Annotated[int, Range(2)] = 128
     learning_rate: Probability = 1e-3
     temperature: Annotated[float, Range(1e-3)] = 0.07

@@ -29,6 +29,7 @@ _TYPES = {
     float: (Real, "a number"),
     bool: (bool, "true or false"),
     str: (str, "text"),
+    Path: (Path, "a path (in YAML, quote digits)"),
 }
 
 
