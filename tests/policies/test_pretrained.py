@@ -94,7 +94,7 @@ def test_options_reach_the_policy(policy, tmp_path) -> None:
     assert isinstance(load_policy("random", dtype=torch.float32), RandomPolicy)
 
 
-@pytest.mark.parametrize("device", ["cdua", "cuda:99"])
+@pytest.mark.parametrize("device", ["cdua", "cuda:99", "meta"])
 def test_a_device_that_is_not_there_is_refused(device: str) -> None:
     with pytest.raises(PolicyError, match=f"device '{device}' cannot be used here; allowed: cpu, and cuda"):
         load_policy("untrained", device=device)

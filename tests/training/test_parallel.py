@@ -188,8 +188,7 @@ def test_half_precision_trains_nearly_equally(bins, tmp_path) -> None:
 
 
 def test_a_missing_device_is_named() -> None:
-    with pytest.raises(ConfigError, match="device is 'gpu0'; it must be auto, cpu"), joined("gpu0", "ddp"):
-        pass
-    if not torch.cuda.is_available():
-        with pytest.raises(ConfigError, match="no GPU can be used"), joined("cuda", "ddp"):
+    for device in ("gpu0", "meta", "cuda:99", *(() if torch.cuda.is_available() else ("cuda",))):
+        message = f"device is '{device}'; it must be auto, cpu"
+        with pytest.raises(ConfigError, match=message), joined(device, "ddp"):
             pass

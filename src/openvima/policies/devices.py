@@ -16,7 +16,7 @@ def usable_device(device: torch.device | str) -> torch.device:
     """
     try:
         found = torch.device(device)
-        torch.empty(1, device=found)
+        torch.zeros(1, device=found).item()  # raises on "meta", too, whose tensors have no values
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise PolicyError(
             f"device {str(device)!r} cannot be used here; allowed: cpu, and cuda on a machine with a GPU for "

@@ -15,7 +15,8 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, PolicyError
+from openvima.policies.devices import usable_device
 
 Sharding = Literal["ddp", "fsdp"]
 FORWARD_METHODS = ("keys_values",)  # methods of layers that are called besides `forward`
@@ -177,19 +178,18 @@ def joined(device: str, sharding: Sharding) -> Iterator[Parallel]:
         ConfigError: There is no such device.
     """
     rank, num_ranks = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    resolved = device
+    if resolved == "auto":
+        resolved = "cuda" if torch.cuda.is_available() else "cpu"
+    if resolved == "cuda":
+        resolved = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
     try:
-        chosen = torch.device(device)
-    except RuntimeError:
+        chosen = usable_device(resolved)
+    except PolicyError:
         raise ConfigError(
-            f"runtime.device is {device!r}; it must be auto, cpu, cuda or cuda:NUMBER."
+            f"runtime.device is {device!r}; it must be auto, cpu, or a usable GPU: cuda or cuda:NUMBER."
         ) from None
     if chosen.type == "cuda":
-        if not torch.cuda.is_available():
-            raise ConfigError("runtime.device is 'cuda', but no GPU can be used here; take cpu, or auto.")
-        local = int(os.environ.get("LOCAL_RANK", 0)) if chosen.index is None else chosen.index
-        chosen = torch.device("cuda", local)
         torch.cuda.set_device(chosen)
     if num_ranks == 1:
         yield Parallel(0, 1, chosen, sharding)
