@@ -1,5 +1,6 @@
 """Acting with caches equals decoding everything from scratch, whatever the batch."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -311,9 +312,14 @@ def test_samples_have_the_distribution_of_the_logits() -> None:
     assert ((counts[shown] - expected) ** 2 / expected).sum() < 23.5  # exceeded once in 10 000 times
 
 
-@pytest.mark.parametrize(("temperature", "generator"), [(-1.0, torch.Generator()), (0.5, None)])
+@pytest.mark.parametrize(
+    ("temperature", "generator"),
+    [(0.5, None), *((temperature, torch.Generator()) for temperature in (-1.0, math.nan, math.inf))],
+)
 def test_a_temperature_that_makes_no_sense_is_refused(small_sizes, temperature, generator) -> None:
-    with pytest.raises(PolicyError, match=f"temperature is {temperature:g}; it must be 0, or above 0 with"):
+    with pytest.raises(
+        PolicyError, match=f"temperature is {temperature:g}; it must be 0, or a finite number above 0"
+    ):
         NetworkPolicy(build_network(small_sizes, seed=0), temperature=temperature, generator=generator)
 
 

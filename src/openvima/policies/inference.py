@@ -1,5 +1,6 @@
 """Inference: a network as a policy, with cached prompts and decoding states for a batch of episodes."""
 
+import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -86,8 +87,8 @@ class NetworkPolicy(Policy):
             the prompt, independent of other episodes; the generator itself does not change.
 
     Raises:
-        PolicyError: The temperature is negative, or above 0 without a generator; the network needs the T5
-            tokenizer and none is given; or the device is not available.
+        PolicyError: The temperature is negative or not finite, or above 0 without a generator; the network
+            needs the T5 tokenizer and none is given; or the device is not available.
     """
 
     prompt_limits = PROMPT_LIMITS
@@ -103,9 +104,10 @@ class NetworkPolicy(Policy):
         temperature: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> None:
-        if temperature < 0 or (temperature > 0 and generator is None):
+        if not 0 <= temperature < math.inf or (temperature > 0 and generator is None):
             raise PolicyError(
-                f"temperature is {temperature:g}; it must be 0, or above 0 with a generator to sample with."
+                f"temperature is {temperature:g}; it must be 0, or a finite number above 0 with a generator "
+                "to sample with."
             )
         tokenizer = tokenizer or tokenizer_for(network.config.prompt)
         self.processor = Processor.of(network.config.inputs, tokenizer, extractor)
