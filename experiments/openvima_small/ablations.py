@@ -36,8 +36,8 @@ from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import with_variant
 from openvima.report.typesetting import Estimate, Line, Table, markdown
 from openvima.training import TrainingConfig, train
+from openvima.training.costs import logged_costs
 from openvima.training.recipes import overridden, recipe_settings
-from weights import read_lines, spent
 
 _PRETRAINED = ("images.crop_encoder.", "images.appearance.", "images.rotation.", "attributes.")
 _SHORT_PRETRAINING = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000}
@@ -291,7 +291,7 @@ def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
         "seed": seed,
         "recipe": given.recipe,
         "parameters": sum(p.numel() for p in network.parameters()),
-        "minutes": round(60 * spent(read_lines(run / "timings_log.jsonl"))[0], 1),
+        "minutes": round(logged_costs(run)["seconds"] / 60, 1),
         "first_episode": evaluation.seed,
         "solved": solved(results),
     }

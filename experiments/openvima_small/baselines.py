@@ -11,6 +11,7 @@ command resumes it.
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +22,8 @@ from openvima.data import Dataset
 from openvima.policies.checkpoint import read_info
 from openvima.policies.parameter_counts import policy_size
 from openvima.policies.sources import find_checkpoint
-from weights import read_lines, spent
+from openvima.training.costs import logged_costs
+from openvima.training.run_folder import TIMINGS_FILE, whole_lines
 
 _TIMED_STEPS, _FIRST_STEPS = 100, 40  # the first ones load data and caches
 _COMMON = (
@@ -68,8 +70,9 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
     kept = folder / "steps.txt"
     if not kept.exists():
         timing = folder / "timing"
+        shutil.rmtree(timing, ignore_errors=True)  # times of two sessions cannot be subtracted
         _openvima(*train, "--schedule.steps", f"{_TIMED_STEPS}", "--out", os.fspath(timing))
-        per_step = seconds_per_step(read_lines(timing / "timings_log.jsonl"))
+        per_step = seconds_per_step([values for _, values in whole_lines(timing / TIMINGS_FILE)])
         atomic_write_file(kept, f"{int(3600 * given.hours / per_step)}\n")
     steps = kept.read_text(encoding="utf-8").strip()
     _openvima(*train, "--schedule.steps", steps, "--out", os.fspath(run))
@@ -83,7 +86,7 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
         "steps": int(steps),
         "learning_rate": given.learning_rate,
         "parameters": policy_size(read_info(find_checkpoint(run)).config).parameters.total,
-        "minutes": round(60 * spent(read_lines(run / "timings_log.jsonl"))[0], 1),
+        "minutes": round(logged_costs(run)["seconds"] / 60, 1),
         "evaluation": f"{name}/evaluation/results.json",
     }
 

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,13 @@ from openvima.policies.checkpoint import load_network, read_info, write_checkpoi
 from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.parameter_counts import policy_size
 from openvima.policies.t5 import tokenizer_for
+from openvima.training.costs import logged_costs
+from openvima.training.run_folder import CONFIG_FILE, METRICS_FILE, SESSIONS_FILE, TIMINGS_FILE, whole_lines
 from openvima.training.validation import flattened
 
 RECORD = "training"  # folder beside the weights
 DATA = "training_data.json"
-_FILES = ("config.yaml", "metrics.jsonl", "sessions_log.jsonl", "timings_log.jsonl")
+_FILES = (CONFIG_FILE, METRICS_FILE, SESSIONS_FILE, TIMINGS_FILE)
 _SETTING = re.compile(r"(_prob|warmup_steps|\.steps|_scenes|_px|_weight|batch_size|learning_rate)$")
 _COMMITS = 12  # letters
 
@@ -40,7 +41,6 @@ class Shipped:
         commits: Commits at which the run was started and resumed.
         steps: Steps of each stage.
         hours: Wall-clock hours, of all sessions.
-        cpu_hours: CPU hours of the first process.
     """
 
     parameters: int
@@ -50,7 +50,6 @@ class Shipped:
     commits: tuple[str, ...]
     steps: tuple[int, ...]
     hours: float
-    cpu_hours: float
 
 
 def ship(run: Path, folder: Path, data: Path | None = None) -> None:
@@ -68,7 +67,7 @@ def ship(run: Path, folder: Path, data: Path | None = None) -> None:
     missing = [name for name in _FILES if not (run / name).is_file()]
     if missing:
         raise DatasetError(f"{run} lacks {', '.join(missing)}; give the folder of a finished training.")
-    sessions = read_lines(run / "sessions_log.jsonl")
+    sessions = _sessions(run)
     changed = [each["git"]["commit"] for each in sessions if each.get("git", {}).get("changed", True)]
     if changed:
         raise ConfigError(f"{run} ran with uncommitted changes at {changed[0]}; train from a clean clone.")
@@ -92,20 +91,17 @@ def ship(run: Path, folder: Path, data: Path | None = None) -> None:
 
 def shipped(folder: Path) -> Shipped | None:
     """Read the record of the bundled weights; None where it is absent."""
-    if not (folder / RECORD / "sessions_log.jsonl").is_file():
+    if not (folder / RECORD / SESSIONS_FILE).is_file():
         return None
-    sessions, times = (read_lines(folder / RECORD / f"{name}_log.jsonl") for name in ("sessions", "timings"))
-    steps: dict[int, int] = {}
-    for each in times:
-        steps[each["stage"]] = max(each["step"], steps.get(each["stage"], 0))
+    sessions, costs = _sessions(folder / RECORD), logged_costs(folder / RECORD)
     return Shipped(
         policy_size(read_info(folder).config).parameters.total,
         (folder / WEIGHTS_FILE).stat().st_size,
         sessions[-1]["data"]["content_hash"],
         sessions[-1]["data"]["counts"]["episodes"],
         tuple(dict.fromkeys(each["git"]["commit"][:_COMMITS] for each in sessions)),
-        tuple(steps[stage] for stage in sorted(steps)),
-        *spent(times),
+        tuple(steps for _, steps in sorted(costs["steps"].items())),
+        costs["seconds"] / 3600,
     )
 
 
@@ -132,18 +128,5 @@ def settings(folder: Path) -> list[tuple[str, str]]:
     return [(name, f"{value:g}") for name, value in chosen.items() if _SETTING.search(name) and value]
 
 
-def spent(times: Sequence[Mapping[str, Any]]) -> tuple[float, float]:  # Any: JSON
-    """Return wall-clock hours and CPU hours of the first process, from a log of times.
-
-    Each session counts from its start, so the last entry before a start is a session's length.
-    """
-    following = [*(each["seconds_since_start"] for each in times[1:]), -1.0]
-    ends = [each for each, then in zip(times, following, strict=True) if then < each["seconds_since_start"]]
-    kinds = ("seconds_since_start", "cpu_seconds_since_start")
-    wall, cpu = (sum(each[kind] for each in ends) / 3600 for kind in kinds)
-    return wall, cpu
-
-
-def read_lines(path: Path) -> list[dict[str, Any]]:  # Any: JSON
-    """Read a log of a run, an object a line."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+def _sessions(run: Path) -> list[dict[str, Any]]:  # Any: JSON
+    return [values for _, values in whole_lines(run / SESSIONS_FILE)]
