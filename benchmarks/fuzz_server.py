@@ -296,7 +296,7 @@ def attack(
         fragments: Empty fragments of a message.
 
     Returns:
-        Peak memory in MB, longest waits in seconds, crashes, and a row for each attack.
+        Peak memory in MB, longest waits in seconds, and a row for each attack.
     """
     env = TabletopEnv("rotate", domain="user")
     seen = encode_observation(env.reset(seed=1)[0])
@@ -327,7 +327,6 @@ def attack(
     hostile = [each for each in rows if not each["attack"].startswith("allowed")]
     return {
         "messages": rounds,
-        "crashes": int(not Path(f"/proc/{pid}").exists()),
         "failures_of_others": failures,
         "memory_before_mb": before_mb,
         "peak_memory_mb": memory_mb(pid, "VmHWM"),
@@ -430,7 +429,8 @@ def memory_mb(pid: int, field: str) -> float:
         lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
     except OSError:
         return float("inf")
-    return round(next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1024, 1)
+    # A process that has ended, and for which nobody has waited, holds none.
+    return round(next((int(line.split()[1]) for line in lines if line.startswith(field)), 0) / 1024, 1)
 
 
 @contextmanager

@@ -41,6 +41,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("oracle"))
     parser.add_argument("--record", action="store_true")
     options = parser.parse_args()
+    for name in ("episodes", "tasks", "levels", "seed", "control"):
+        if options.record and getattr(options, name) != parser.get_default(name):
+            parser.error(f"--record replaces the counts of all tasks; leave out --{name}.")
     config = EvaluationConfig(
         policies=("oracle",),
         tasks=tuple(options.tasks.split(",")),
@@ -62,7 +65,7 @@ def main() -> None:
         for outcome in row.outcomes:
             if not outcome.success:
                 print(f"failed: {row.task} {row.level} seed {outcome.seed}: {outcome.reason}")
-    if options.record and options.control == PRIMITIVES:
+    if options.record:
         record = {
             "command": "python benchmarks/oracle.py --record",
             "versions": results.versions,
