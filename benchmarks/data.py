@@ -17,7 +17,6 @@ Memory: what the process holds besides mapped files, while it reads the same epi
 import argparse
 import itertools
 import json
-import math
 import os
 import pickle
 import statistics
@@ -36,7 +35,6 @@ from PIL import Image
 from openvima.data import Dataset, Demonstration, ShardWriter, rollout_oracle
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
-from openvima.data.object_cache.cache import open_object_cache
 from openvima.data.records import package_versions
 from openvima.data.schema import ARRAYS, VIEWS
 from openvima.env import TabletopEnv
@@ -279,28 +277,6 @@ def anonymous_megabytes() -> float:
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("RssAnon")), 0.0)
 
 
-def measure_object_cache(folders: Sequence[Path], num_rounds: int) -> Numbers:
-    """Make the object caches of data folders, and read their episodes in random order, the folders mixed."""
-    datasets = [Dataset(folder) for folder in folders]
-    making, caches = timed(lambda: [open_object_cache(dataset) for dataset in datasets])
-    episodes = [(cache, number) for cache in caches for number in range(len(cache))]
-    order = np.random.default_rng(0).permutation(len(episodes)).tolist()
-    num_steps = sum(int(dataset.index.column("steps").to_numpy().sum()) for dataset in datasets)
-    times = []
-    for _ in range(num_rounds + 1):
-        seconds, _ = timed(
-            lambda: [len(cache[number].images) for cache, number in map(episodes.__getitem__, order)]
-        )
-        times.append(seconds)
-    num_bytes = sum(path.stat().st_size for cache in caches for path in cache.folder.iterdir())
-    return {
-        "episodes": len(episodes),
-        "bytes": round(num_bytes / len(episodes)),
-        "making_ms": round(1000 * making / len(episodes), 3),
-        "training_steps_per_s": round(num_steps / statistics.median(times[1:])),
-    }
-
-
 def measure_all(tasks: Sequence[str], num_episodes: int, num_rounds: int, folder: Path) -> Numbers:
     """Measure task by task; return a dictionary of results by task."""
     results: Numbers = {}
@@ -339,7 +315,9 @@ def summary(results: Numbers) -> Numbers:
     entries = list(results.values())
     making = [1 / entry["generation"]["episodes_per_s"] for entry in entries]
     means: Numbers = {
-        "share_of_bare_geomean": round(geomean(e["generation"]["share_of_bare"] for e in entries), 3),
+        "share_of_bare_geomean": round(
+            statistics.geometric_mean(e["generation"]["share_of_bare"] for e in entries), 3
+        ),
         "tasks_below_85_percent": [t for t, e in results.items() if e["generation"]["share_of_bare"] < 0.85],
         "formats": {
             name: {
@@ -350,7 +328,9 @@ def summary(results: Numbers) -> Numbers:
         },
         "training_steps_per_s": {
             way: {
-                "geomean": round(geomean(entry["training_steps_per_s"][way] for entry in entries)),
+                "geomean": round(
+                    statistics.geometric_mean(entry["training_steps_per_s"][way] for entry in entries)
+                ),
                 "of_equal_episodes": round(mean_rate(entries, way)),
             }
             for way in entries[0]["training_steps_per_s"]
@@ -366,11 +346,6 @@ def summary(results: Numbers) -> Numbers:
             "gigabytes_zstd": round(NUM_PUBLISHED * means["formats"]["zstd"]["bytes"] / 1e9, 1),
         }
     }
-
-
-def geomean(values: Any) -> float:  # Any: an iterable of numbers
-    """Return the geometric mean."""
-    return math.exp(statistics.fmean(math.log(value) for value in values))
 
 
 def mean_rate(entries: Sequence[Numbers], way: str) -> float:
@@ -401,7 +376,6 @@ def main() -> None:
         results = measure_all(tasks, num_episodes, options.rounds, folder)
         means = summary(results)
         means["memory"] = measure_memory(Dataset(folder / tasks[0]), 400 if options.quick else 4000)
-        means["object_cache"] = measure_object_cache([folder / task for task in tasks], options.rounds)
     for key, value in means.items():
         print(f"{key}: {value}")
     if options.json:

@@ -9,7 +9,6 @@ the bodies with most triangles, and so on. Compilation and building of shapes an
 import argparse
 import json
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -17,13 +16,13 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numba
 import numpy as np
 
 from openvima.catalog import TEXTURES, Assets, object_spec
 from openvima.catalog.packs import load_assets
 from openvima.render import Rasteriser, label_raster
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
+from sim import circumstances
 
 SCENES: dict[str, tuple[str, ...]] = {
     "two letters": ("letter A", "letter G"),
@@ -102,8 +101,7 @@ def main() -> None:
     observation = statistics.geometric_mean(row["observation"] for row in scenes.values())
     print(f"one observation, geometric mean: {observation:.3f} ms")
     if arguments.json:
-        machine = {"platform": platform.platform(), "numpy": np.__version__, "numba": numba.__version__}
-        result = {"observation_ms": observation, "assets": assets.name, "scenes": scenes, "machine": machine}
+        result = {"observation_ms": observation, "assets": assets.name, "scenes": scenes, **circumstances()}
         arguments.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
 

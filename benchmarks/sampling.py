@@ -9,19 +9,16 @@ not counted.
 import argparse
 import json
 import os
-import platform
 import statistics
 import time
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numba
-import numpy as np
-
 from openvima.catalog import Assets
 from openvima.catalog.packs import load_assets
 from openvima.tasks import list_tasks, sample_episode, task_spec
+from sim import circumstances
 
 
 def measure(
@@ -74,8 +71,7 @@ def main() -> None:
     geomean = statistics.geometric_mean(row["episodes_per_s"] for row in rows.values())
     print(f"geometric mean: {geomean:.0f}")
     if arguments.json:
-        machine = {"platform": platform.platform(), "numpy": np.__version__, "numba": numba.__version__}
-        result = {"geomean": geomean, "assets": assets.name, "tasks": rows, "machine": machine}
+        result = {"geomean": geomean, "assets": assets.name, "tasks": rows, **circumstances()}
         arguments.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
 

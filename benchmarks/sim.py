@@ -9,7 +9,6 @@ The rate is measured without timers inside; a separate pass, with timers, divide
 
 import argparse
 import json
-import math
 import os
 import platform
 import statistics
@@ -158,7 +157,7 @@ def main() -> None:
     print(", ".join(f"{name}: {value}" for name, value in where.items()))
     results = measure(tasks, options.episodes, options.rounds)
     rates = [entry["episodes_per_s"] for entry in results.values()]
-    geomean = math.exp(statistics.fmean(math.log(r) for r in rates))
+    geomean = statistics.geometric_mean(rates)
     print(table(results, geomean))
     if options.json:
         content = {"geomean": round(geomean, 2), "tasks": results, **where}
