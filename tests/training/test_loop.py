@@ -150,6 +150,23 @@ def test_a_damaged_checkpoint_is_named(settings):
         train(config)
 
 
+def test_trackers_are_closed_when_a_run_cannot_start(settings, monkeypatch):
+    closed = []
+
+    class Tracker:
+        def close(self):
+            closed.append(True)
+
+    def fails(dataset):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("openvima.training.loop.open_trackers", lambda *_: [Tracker()])
+    monkeypatch.setattr("openvima.training.loop.provenance", fails)
+    with pytest.raises(OSError, match="no space left"):
+        train(TrainingConfig.of(settings))
+    assert closed == [True]
+
+
 @pytest.mark.slow
 def test_partial_checkpoints_are_removed(settings):
     config = TrainingConfig.of(settings)

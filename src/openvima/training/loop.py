@@ -141,14 +141,14 @@ class Trainer:
         Raises:
             ConfigError: The loss diverged.
         """
-        self._stages, first = stages, self.parallel.is_first
-        if first:
-            self._trackers = open_trackers(self.config, self.run.path, self._done() + 1)
-            self.run.rewind_to(self.progress)
-            origin = {"processes": self.parallel.num_ranks, **provenance(self.dataset)}
-            self.run.append(SESSIONS_FILE, {**self._here(), **origin})
-            self._log_times()
+        self._stages = stages
         try:
+            if self.parallel.is_first:
+                self._trackers = open_trackers(self.config, self.run.path, self._done() + 1)
+                self.run.rewind_to(self.progress)
+                origin = {"processes": self.parallel.num_ranks, **provenance(self.dataset)}
+                self.run.append(SESSIONS_FILE, {**self._here(), **origin})
+                self._log_times()
             for number in range(self.progress.stage, len(stages)):
                 if number > self.progress.stage:
                     self.progress = replace(self.progress, stage=number, step=0)
