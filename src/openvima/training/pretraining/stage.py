@@ -133,8 +133,7 @@ def compares_rotations(network: PolicyNetwork) -> bool:
 def crop_parameters(network: PolicyNetwork) -> list[torch.nn.Parameter]:
     """Return what pretraining trains, and behaviour cloning keeps frozen."""
     encoder = network.object_encoder
-    if encoder is None:
-        return list(network.get_submodule("images").parameters())
+    assert encoder is not None  # only networks with an appearance embedding are pretrained or frozen
     appearance = list(encoder.appearance.parameters()) if encoder.config.appearance_width else []
     rotation = list(encoder.rotation.parameters()) if encoder.config.rotation_bins else []
     of_attributes = list(attributes.parameters()) if (attributes := attributes_of(network)) else []
