@@ -96,14 +96,11 @@ class Processor:
         """Kind of images: crops of objects, or whole frames."""
         return "frames" if self.layout == "frames" else "objects"
 
-    def encode_prompts(
-        self, prompts: Sequence[RenderedPrompt], stack: ImageStack | None = None
-    ) -> tuple[PromptBatch, ImageStack]:
+    def encode_prompts(self, prompts: Sequence[RenderedPrompt]) -> tuple[PromptBatch, ImageStack]:
         """Encode prompts for inference.
 
         Args:
             prompts: One for each episode.
-            stack: Image stack to extend; None starts a new one.
 
         Returns:
             The batch, and its image stack.
@@ -118,7 +115,7 @@ class Processor:
             PROMPT_LIMITS.check(prompt)
         if not all(prompt.sequence() for prompt in prompts):
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
-        stack = stack or ImageStack(self.image_size)
+        stack = ImageStack(self.image_size)
         extract_ahead(self.input_kind, self.extractor, prompts=prompts)
         preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
         return self.batch_prompts(PreprocessedPrompts.of(preprocessed)), stack
@@ -452,10 +449,9 @@ class _TokenSequences:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Steps:
-    """Episode `b` and time `t` of each step, its place in a padded array, and the shape (B, T) of that."""
+    """Episode `b` of each step, its place in a padded array, and the shape (B, T) of that."""
 
     b: np.ndarray
-    t: np.ndarray
     place: np.ndarray
     shape: tuple[int, int]
 
@@ -465,7 +461,7 @@ class _Steps:
         lengths = np.asarray(lengths, np.int64)
         b, t = _steps_and_slots(lengths)
         shape = (len(lengths), int(lengths.max(initial=0)))
-        return _Steps(b, t, b * shape[1] + t, shape)
+        return _Steps(b, b * shape[1] + t, shape)
 
     def exist(self) -> np.ndarray:
         """Where a padded array holds steps, shape (B, T), bool."""
