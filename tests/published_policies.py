@@ -4,14 +4,17 @@ from pathlib import Path
 
 import torch
 
+from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.published.names import to_published
+from openvima.policies.published.rules import T5
 from openvima.policies.sizes import Size
 from openvima.policies.vima.config import VimaConfig, vima
 
 VOCABULARY_SIZE = 160
+_UNUSED_VOCABULARY_SIZE = 40478  # of the first GPT, whose unused embedding Gato and GPT contain
 
 
 def small_vima() -> VimaConfig:
@@ -29,6 +32,26 @@ def write_published(network: PolicyNetwork, file: Path) -> Path:
     weights = {f"policy.{name}": tensor for name, tensor in to_published(network).items()}
     torch.save({"state_dict": weights, "cfg": cfg}, file)
     return file
+
+
+def with_unused_entries(network: PolicyNetwork) -> dict[str, torch.Tensor]:
+    """Published weights with the entries without effect, which the published code demands."""
+    words = network.prompt.words.weight.detach().float()
+    positions = torch.arange(MAX_POSITIONS, device=words.device)
+    entries = {"t5_prompt_encoder.t5.shared.weight": words, f"{T5}.embed_tokens.weight": words}
+    if network.config.architecture in ("gato", "gpt"):
+        entries["transformer.lm.position_ids"] = positions
+        unused = words.new_zeros(_UNUSED_VOCABULARY_SIZE, network.decoder.width)
+        entries["transformer.lm.tokens_embed.weight"] = unused
+        return {**to_published(network), **entries}
+    prompt_positions = positions[:MAX_PROMPT_POSITIONS].clone()
+    causal = words.new_ones(1, 1, MAX_POSITIONS, MAX_POSITIONS).tril()
+    entries["xattn_gpt.position_ids"] = positions
+    entries["xattn_gpt.xattn_position_ids"] = prompt_positions
+    for block in range(len(network.decoder.self_blocks)):
+        entries[f"xattn_gpt.h.{block}.attn.bias"] = causal
+        entries[f"xattn_gpt.xattns.{block}.kv_position_ids"] = prompt_positions
+    return {**to_published(network), **entries}
 
 
 def write_tokenizer(folder: Path) -> Path:

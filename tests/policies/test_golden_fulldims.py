@@ -32,6 +32,7 @@ from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig
 from openvima.policies.published.config import config_from_published
 from openvima.policies.published.names import to_published
+from published_policies import with_unused_entries
 
 pytestmark = [pytest.mark.slow, needs("fulldims")]
 
@@ -92,7 +93,7 @@ def test_golden_weights_follow_from_their_names(made: dict[str, torch.Tensor], c
 def make_weights(model: str, about: Mapping, made: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Make the weights of a model by their published names, but for those without effect."""
     outline = outline_network(config_of(model, about["cfg"]))
-    assert len(to_published(outline, unused_entries=True)) == about["n_state_dict_keys"]
+    assert len(with_unused_entries(outline)) == about["n_state_dict_keys"]
     weights = {}
     for name, tensor in to_published(outline).items():
         key = f"{name} {list(tensor.shape)}"

@@ -17,6 +17,7 @@ from openvima.policies.nn.decoder import PrefixDecoderConfig  # noqa: E402
 from openvima.policies.published.checkpoint import load_published  # noqa: E402
 from openvima.policies.published.config import config_from_published  # noqa: E402
 from openvima.policies.published.names import from_published, to_published  # noqa: E402
+from published_policies import with_unused_entries  # noqa: E402
 
 FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"
 SHAPES = FOLDER / "state_dict_shapes.json"
@@ -48,7 +49,7 @@ def tiny_weights(name: str) -> tuple[dict, dict]:
 @pytest.mark.parametrize("name", RECORDED)
 def test_golden_names_shapes_and_dtypes_are_the_published_ones(name) -> None:
     recorded = RECORDED[name]
-    weights = to_published(recorded_network(name), unused_entries=True)
+    weights = with_unused_entries(recorded_network(name))
     assert len(weights) == recorded["n_keys"]
     described = {
         key: [list(tensor.shape), str(tensor.dtype).removeprefix("torch.")] for key, tensor in weights.items()
@@ -62,7 +63,7 @@ def test_golden_numbers_of_parameters_are_the_published_ones(name) -> None:
     recorded = RECORDED[name]
     sizes = {
         key: tensor.numel()
-        for key, tensor in to_published(recorded_network(name), unused_entries=True).items()
+        for key, tensor in with_unused_entries(recorded_network(name)).items()
         if tensor.is_floating_point() and not key.endswith((".attn.bias", ".embed_tokens.weight"))
     }
     blocks = ("xattn_gpt.h.", "xattn_gpt.xattns.", "transformer.lm.h.")
@@ -84,7 +85,7 @@ def test_golden_weights_go_to_our_names_and_back(name) -> None:
     network.load_state_dict(from_published(weights), assign=True)
     back = to_published(network)
     assert all(torch.equal(tensor, weights[key].float()) for key, tensor in back.items())
-    whole = to_published(network, unused_entries=True)
+    whole = with_unused_entries(network)
     dead = {key for key in weights if key not in back}
     assert dead <= whole.keys()
     for key in dead - {"transformer.lm.tokens_embed.weight"}:  # of another size here, and never looked at
@@ -102,7 +103,7 @@ def test_a_golden_file_as_published_loads_with_nothing_missing_and_nothing_left_
 
 def test_a_golden_file_holds_just_the_names_that_we_would_write() -> None:
     stored = torch.load(FOLDER / "official_like.ckpt", weights_only=True)["state_dict"]
-    ours = to_published(load_published(FOLDER / "official_like.ckpt"), unused_entries=True)
+    ours = with_unused_entries(load_published(FOLDER / "official_like.ckpt"))
     assert {f"policy.{key}" for key in ours} == stored.keys()
     for key, tensor in ours.items():
         original = stored[f"policy.{key}"]

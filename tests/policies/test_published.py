@@ -27,6 +27,7 @@ from openvima.policies.published.config import config_from_published  # noqa: E4
 from openvima.policies.published.names import from_published, to_published  # noqa: E402
 from openvima.policies.sizes import Size  # noqa: E402
 from openvima.policies.vima.config import vima  # noqa: E402
+from published_policies import with_unused_entries  # noqa: E402
 
 ARCHITECTURES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 DECODER_NAMES = {
@@ -80,7 +81,7 @@ def network(architecture) -> PolicyNetwork:
 
 
 def contents(network: PolicyNetwork, architecture: str, *, unused_entries: bool = True) -> dict:
-    weights = to_published(network, unused_entries=unused_entries)
+    weights = with_unused_entries(network) if unused_entries else to_published(network)
     return {
         "state_dict": {f"policy.{name}": tensor for name, tensor in weights.items()},
         "cfg": cfg_of(network.config, architecture),
@@ -99,7 +100,7 @@ def saved(values: object, folder: Path) -> Path:
 
 
 def test_names_go_to_published_ones_and_back(network) -> None:
-    published = to_published(network, unused_entries=True)
+    published = with_unused_entries(network)
     assert_same(from_published(published), network.state_dict())
 
 
@@ -205,7 +206,7 @@ def test_weights_of_something_else_are_refused() -> None:
 )
 def test_sizes_of_every_published_network_follow_from_its_weights(architecture, size) -> None:
     config = preset(f"{architecture}-{size}")
-    weights = to_published(outline_network(config), unused_entries=True)
+    weights = with_unused_entries(outline_network(config))
     assert config_from_published(weights, cfg_of(config, architecture)) == config
 
 

@@ -10,13 +10,11 @@ from openvima.policies.flamingo.published import ADAPTER as FLAMINGO
 from openvima.policies.flamingo.published import PERCEIVER
 from openvima.policies.gato.published import ADAPTER as GATO
 from openvima.policies.gpt.published import ADAPTER as GPT
-from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.policies.published.rules import T5, PublishedAdapter, to_ours, to_theirs
+from openvima.policies.published.rules import PublishedAdapter, to_ours, to_theirs
 from openvima.policies.vima.published import ADAPTER as VIMA
 
 PREFIX = "policy."  # before every name in a file
-_UNUSED_VOCABULARY_SIZE = 40478  # of the first GPT, whose unused embedding Gato and GPT contain
 ADAPTERS = {adapter.architecture: adapter for adapter in (VIMA, GATO, FLAMINGO, GPT)}
 # Unused position counters, masks and embeddings of the files.
 _UNUSED = re.compile(
@@ -77,7 +75,7 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     return result
 
 
-def to_published(network: PolicyNetwork, *, unused_entries: bool = False) -> dict[str, torch.Tensor]:
+def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     """Give the weights of a network their published names, without `policy.` before them.
 
     Numbers of heads are not in the weights; a file gives those of the decoder in its `cfg`, and all image
@@ -85,7 +83,6 @@ def to_published(network: PolicyNetwork, *, unused_entries: bool = False) -> dic
 
     Args:
         network: Of the published architecture, in any size, with or without weights.
-        unused_entries: Add the entries without effect, which the published code demands.
 
     Returns:
         Weights in float32, matrices as they are published. They may share memory with the network.
@@ -107,27 +104,7 @@ def to_published(network: PolicyNetwork, *, unused_entries: bool = False) -> dic
             f"this network has parts that no published policy has: {', '.join(without_name)}. "
             "Only presets of the form vima-…, gato-…, flamingo-… and gpt-… have published names."
         )
-    return {**result, **_unused_entries(network)} if unused_entries else result
-
-
-def _unused_entries(network: PolicyNetwork) -> dict[str, torch.Tensor]:
-    """Entries without effect; unused embeddings are those in use, or zero."""
-    words = _converted(network.prompt.words.weight, transposed=False)
-    positions = torch.arange(MAX_POSITIONS, device=words.device)
-    entries = {"t5_prompt_encoder.t5.shared.weight": words, f"{T5}.embed_tokens.weight": words}
-    if network.config.architecture in ("gato", "gpt"):
-        unused = words.new_zeros(_UNUSED_VOCABULARY_SIZE, network.decoder.width)
-        entries["transformer.lm.position_ids"] = positions
-        entries["transformer.lm.tokens_embed.weight"] = unused
-        return entries
-    prompt_positions = positions[:MAX_PROMPT_POSITIONS].clone()
-    causal = words.new_ones(1, 1, MAX_POSITIONS, MAX_POSITIONS).tril()
-    entries["xattn_gpt.position_ids"] = positions
-    entries["xattn_gpt.xattn_position_ids"] = prompt_positions
-    for block in range(len(network.decoder.self_blocks)):
-        entries[f"xattn_gpt.h.{block}.attn.bias"] = causal
-        entries[f"xattn_gpt.xattns.{block}.kv_position_ids"] = prompt_positions
-    return entries
+    return result
 
 
 def _converted(tensor: torch.Tensor, transposed: bool) -> torch.Tensor:
