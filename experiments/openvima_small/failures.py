@@ -156,14 +156,14 @@ def _pixel(position: Sequence[float] | np.ndarray) -> tuple[float, float]:
     return float(column), float(row)
 
 
-def _draw_ring(draw: ImageDraw.ImageDraw, at: tuple[float, float], radius: float = 26) -> None:
-    box = (at[0] - radius, at[1] - radius, at[0] + radius, at[1] + radius)
+def _draw_ring(draw: ImageDraw.ImageDraw, at: tuple[float, float]) -> None:
+    box = (at[0] - 26, at[1] - 26, at[0] + 26, at[1] + 26)
     draw.ellipse(box, outline=GOOD, width=4)
 
 
-def _draw_cross(draw: ImageDraw.ImageDraw, at: tuple[float, float], size: float = 9) -> None:
-    for sign in (-1, 1):
-        draw.line((at[0] - size, at[1] - sign * size, at[0] + size, at[1] + sign * size), fill=GOOD, width=4)
+def _draw_cross(draw: ImageDraw.ImageDraw, at: tuple[float, float]) -> None:
+    for sign in (-9, 9):
+        draw.line((at[0] - 9, at[1] - sign, at[0] + 9, at[1] + sign), fill=GOOD, width=4)
 
 
 def _draw_arrow(draw: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float]) -> None:

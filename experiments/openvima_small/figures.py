@@ -97,15 +97,12 @@ def levels(findings: Findings) -> Figure:
 # Elements of the figures.
 
 
-def draw_bar(
-    axes: Any, place: float, mean: LevelMean, colour: str, *, faint: bool = False, label: bool = True
-) -> None:
+def draw_bar(axes: Any, place: float, mean: LevelMean, colour: str) -> None:
     """Draw a mean as a bar with its interval."""
     low, high = (100 * end for end in mean.interval)
-    axes.barh(place, 100 * mean.mean, color=colour, height=0.66, alpha=0.55 if faint else 1.0, linewidth=0)
+    axes.barh(place, 100 * mean.mean, color=colour, height=0.66, linewidth=0)
     axes.plot([low, high], [place, place], color=INK, linewidth=1.3, solid_capstyle="butt")
-    if label:
-        draw_label(axes, max(high, 100 * mean.mean), place, (f"{100 * mean.mean:.1f}", INK), bold=True)
+    draw_label(axes, max(high, 100 * mean.mean), place, (f"{100 * mean.mean:.1f}", INK), bold=True)
 
 
 def draw_label(axes: Any, x: float, y: float, text: str | tuple[str, str], *, bold: bool = False) -> None:
@@ -115,7 +112,7 @@ def draw_label(axes: Any, x: float, y: float, text: str | tuple[str, str], *, bo
     axes.text(x + 2, y, words, va="center", fontsize=8, color=colour, fontweight=weight)
 
 
-def percent_axis(axes: Any, room: float = 14) -> None:
+def percent_axis(axes: Any) -> None:
     """Scale from 0 to 100 %, with room for numbers beyond."""
-    axes.set_xlim(0, 100 + room)
+    axes.set_xlim(0, 114)
     axes.set_xticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)], fontsize=8)
