@@ -23,6 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from openvima.data.records import package_versions, rollout_oracle
 from openvima.env import TabletopEnv, tabletop
+from openvima.env.running_episode import PrimitiveRun
 from openvima.errors import OracleError, SamplingError
 from openvima.render.rasteriser import Rasteriser
 from openvima.sim.world import World
@@ -32,7 +33,7 @@ NUM_WARM_UP = 10  # episodes: compiles or loads the kernels, fills the caches of
 FIRST_SEED = 1_000_000
 PHASES: dict[str, tuple[Any, str]] = {  # phase → owner and name of the function that it consists of
     "sampling": (tabletop, "sample_episode"),
-    "model_building": (tabletop, "World"),
+    "model_building": (PrimitiveRun, "build_world"),
     "physics": (World, "execute"),
     "oracle": (tabletop, "oracle_action"),
     "observations": (Rasteriser, "scene"),
