@@ -42,7 +42,7 @@ def ways_of(cache: ObjectCache, batch: int) -> dict[str, Callable[[], object]]:
     """Return functions that read every episode once."""
     processor = Processor("objects")
     shuffled = np.random.default_rng(0).permutation(len(cache)).tolist()
-    order = BatchOrder(len(cache), batch=batch, lengths=cache.lengths(), drop_last=False)
+    order = BatchOrder(len(cache), batch_size=batch, lengths=cache.lengths(), drop_last=False)
     batches = [order.rows(number) for number in range(order.batches_per_epoch)]
 
     def read_batch(rows: np.ndarray, *, images: bool) -> int:

@@ -74,7 +74,7 @@ pa.set_cpu_count(1)
 folder = sys.argv[1]
 dataset = Dataset(folder)
 cache, processor = open_object_cache(dataset), Processor("objects")
-order = BatchOrder(len(cache), batch=128, lengths=cache.lengths(), drop_last=False)
+order = BatchOrder(len(cache), 128, lengths=cache.lengths(), drop_last=False)
 batches = [order.rows(number) for number in range(order.batches_per_epoch)]
 demos = [dataset[row] for row in range(min(100, len(dataset)))]
 info = dataset.shard(dataset.shard_names()[0]).info

@@ -100,21 +100,21 @@ def test_slices_are_data_sets(demos: Dataset) -> None:
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on a machine of two processors
 @pytest.mark.parametrize("workers", [1, 3])
 def test_loader_workers_do_not_change_the_batches(workers: int) -> None:
-    order = BatchOrder(60, batch=4, seed=2)
+    order = BatchOrder(60, batch_size=4, seed=2)
     expected = [order.rows(number).tolist() for number in range(30)]
-    loader = BatchLoader(Numbers(60), order, workers=workers)
+    loader = BatchLoader(Numbers(60), order, num_workers=workers)
     assert [*loader, *loader] == expected
 
 
 def test_a_transform_is_told_the_number_of_its_batch() -> None:
-    order = BatchOrder(60, batch=4, seed=2)
-    loader = BatchLoader(Numbers(60), order, workers=2, transform=numbered)
+    order = BatchOrder(60, batch_size=4, seed=2)
+    loader = BatchLoader(Numbers(60), order, num_workers=2, transform=numbered)
     list(loader)
     assert next(iter(loader)) == (15, order.rows(15).tolist())
 
 
 def test_an_epoch_ends_and_the_next_one_follows() -> None:
-    order = BatchOrder(10, batch=4, seed=2)
+    order = BatchOrder(10, batch_size=4, seed=2)
     loader = BatchLoader(Numbers(10), order, transform=total)
     assert len(loader) == 2
     assert len(list(loader)) == 2
@@ -126,20 +126,20 @@ def test_an_epoch_ends_and_the_next_one_follows() -> None:
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_position_is_that_of_what_was_shown_not_of_what_was_read_ahead(workers: int) -> None:
-    order = BatchOrder(60, batch=4, seed=2)
-    loader = BatchLoader(Numbers(60), order, workers=workers)
+    order = BatchOrder(60, batch_size=4, seed=2)
+    loader = BatchLoader(Numbers(60), order, num_workers=workers)
     batches = iter(loader)
     shown = [next(batches) for _ in range(5)]
     state = json.loads(json.dumps(loader.state_dict()))
     rest = list(batches)
-    other = BatchLoader(Numbers(60), order, workers=2 - workers)
+    other = BatchLoader(Numbers(60), order, num_workers=2 - workers)
     other.load_state_dict(state)
     assert list(other) == rest
     assert [*shown, *rest] == [order.rows(number).tolist() for number in range(15)]
 
 
 def test_ranks_that_become_more_go_on_where_one_was() -> None:
-    whole = BatchOrder(60, batch=4, seed=2)
+    whole = BatchOrder(60, batch_size=4, seed=2)
     one = BatchLoader(Numbers(60), whole)
     forever = one.forever()
     for _ in range(17):
@@ -153,7 +153,7 @@ def test_ranks_that_become_more_go_on_where_one_was() -> None:
 
 
 def test_a_position_of_another_order_is_refused() -> None:
-    order = BatchOrder(60, batch=4, seed=2)
+    order = BatchOrder(60, batch_size=4, seed=2)
     state = BatchLoader(Numbers(60), order).state_dict()
     with pytest.raises(ConfigError, match=r"another order: seed was 2, is 3"):
         BatchLoader(Numbers(60), replace(order, seed=3)).load_state_dict(state)
@@ -165,14 +165,14 @@ def test_the_global_generator_is_left_alone() -> None:
     torch.manual_seed(0)
     expected = torch.rand(1)
     torch.manual_seed(0)
-    list(BatchLoader(Numbers(60), BatchOrder(60, batch=4, seed=2)))
+    list(BatchLoader(Numbers(60), BatchOrder(60, batch_size=4, seed=2)))
     assert torch.equal(torch.rand(1), expected)
 
 
 @pytest.mark.parametrize("source", ["images", "tokens"])
 def test_episodes_of_a_data_set_come_in_batches(demos: Dataset, source: str) -> None:
     episodes = demos if source == "images" else open_object_cache(demos)
-    loader = BatchLoader(episodes, BatchOrder(8, batch=4, seed=0), workers=1)
+    loader = BatchLoader(episodes, BatchOrder(8, batch_size=4, seed=0), num_workers=1)
     seen = [(episode.task, episode.seed) for batch in loader for episode in batch]
     assert sorted(seen) == sorted((demo.task, demo.seed) for demo in demos)
 

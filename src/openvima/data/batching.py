@@ -18,7 +18,7 @@ class BatchOrder:
 
     Args:
         num_episodes: Episodes of the data set.
-        batch: Episodes of a batch, of all ranks together.
+        batch_size: Episodes of a batch, of all ranks together.
         seed: Decides the order.
         shuffle: Draw a fresh permutation for each epoch; without, episodes come as they are stored.
         lengths: Lengths of the episodes, shape (N,) or (N, columns), the first column counting most. Batches
@@ -33,13 +33,13 @@ class BatchOrder:
         ConfigError: Numbers that cannot be, or that do not fit together.
 
     Example:
-        >>> order = BatchOrder(10, batch=4, seed=0)
+        >>> order = BatchOrder(10, batch_size=4, seed=0)
         >>> [rows.tolist() for rows in (order.rows(0), order.rows(1))]
         [[4, 6, 2, 7], [3, 5, 9, 0]]
     """
 
     num_episodes: int
-    batch: int
+    batch_size: int
     seed: int = 0
     shuffle: bool = True
     lengths: np.ndarray | None = None
@@ -50,29 +50,31 @@ class BatchOrder:
 
     def __post_init__(self) -> None:
         problems = []
-        if self.batch < 1:
-            problems.append(f"batch is {self.batch}; it must be at least 1.")
+        if self.batch_size < 1:
+            problems.append(f"batch_size is {self.batch_size}; it must be at least 1.")
         if self.bucket < 1:
             problems.append(f"bucket is {self.bucket}; it must be at least 1.")
         if not 0 <= self.seed < 2**63:
             problems.append(f"seed is {self.seed}; it must lie within 0 … 2^63 - 1.")
         if self.num_ranks < 1 or not 0 <= self.rank < self.num_ranks:
             problems.append(f"rank is {self.rank} of {self.num_ranks}; count ranks from 0.")
-        elif self.batch % self.num_ranks:
-            problems.append(f"batch is {self.batch}; {self.num_ranks} ranks cannot share that equally.")
+        elif self.batch_size % self.num_ranks:
+            problems.append(
+                f"batch_size is {self.batch_size}; {self.num_ranks} ranks cannot share that equally."
+            )
         elif self.num_ranks > 1 and not self.drop_last:
             problems.append("drop_last is False; ranks could not share the last batch equally.")
         if self.lengths is not None and len(self.lengths) != self.num_episodes:
             problems.append(f"there are {len(self.lengths)} lengths for {self.num_episodes} episodes.")
         if not problems and self.batches_per_epoch < 1:
-            problems.append(f"batch is {self.batch}; there are {self.num_episodes} episodes.")
+            problems.append(f"batch_size is {self.batch_size}; there are {self.num_episodes} episodes.")
         if problems:
             raise ConfigError(" ".join(problems))
 
     @property
     def batches_per_epoch(self) -> int:
         """Number of batches of an epoch."""
-        whole, rest = divmod(self.num_episodes, self.batch)
+        whole, rest = divmod(self.num_episodes, self.batch_size)
         return whole + bool(rest and not self.drop_last)
 
     def rows(self, number: int) -> np.ndarray:
@@ -82,7 +84,8 @@ class BatchOrder:
             number: Of the batch, from 0, through all epochs.
 
         Returns:
-            Shape (batch / ranks,), int64; the last batch of an epoch may be shorter if none is dropped.
+            Shape (batch_size / num_ranks,), int64; the last batch of an epoch may be shorter if none is
+            dropped.
         """
         return self.rows_of_all(number)[self.rank :: self.num_ranks]
 
@@ -90,12 +93,12 @@ class BatchOrder:
         """Return the episodes of one batch, those of all ranks."""
         epoch, place = divmod(number, self.batches_per_epoch)
         rows, order = _epoch(self, epoch)
-        start = order[place] * self.batch
-        return rows[start : start + self.batch]
+        start = order[place] * self.batch_size
+        return rows[start : start + self.batch_size]
 
     def settings(self) -> dict[str, int | bool]:
         """Return what decides which episodes a batch takes."""
-        names = ("num_episodes", "batch", "seed", "shuffle", "bucket", "drop_last")
+        names = ("num_episodes", "batch_size", "seed", "shuffle", "bucket", "drop_last")
         return {**{name: getattr(self, name) for name in names}, "by_length": self.lengths is not None}
 
 
@@ -104,13 +107,13 @@ def _epoch(order: BatchOrder, epoch: int) -> tuple[np.ndarray, np.ndarray]:
     """Episodes of an epoch in the order in which batches are cut, and the order of the batches."""
     rng = np.random.default_rng([order.seed, epoch])
     rows = rng.permutation(order.num_episodes) if order.shuffle else np.arange(order.num_episodes)
-    num_whole = order.num_episodes // order.batch
+    num_whole = order.num_episodes // order.batch_size
     batches = np.arange(order.batches_per_epoch)
     if order.lengths is not None:
         keys = np.reshape(order.lengths, (order.num_episodes, -1)).T[::-1]
-        span = order.bucket * order.batch
-        for start in range(0, num_whole * order.batch, span):
-            part = rows[start : min(start + span, num_whole * order.batch)]
+        span = order.bucket * order.batch_size
+        for start in range(0, num_whole * order.batch_size, span):
+            part = rows[start : min(start + span, num_whole * order.batch_size)]
             rows[start : start + len(part)] = part[np.lexsort(keys[:, part])]
     if order.shuffle:  # the remainder, if it is kept, stays at the end
         batches[:num_whole] = rng.permutation(num_whole)

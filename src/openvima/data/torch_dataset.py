@@ -206,7 +206,7 @@ class BatchLoader(Generic[Episode]):
         source: Episodes by number: a `ObjectCache`, or a `Dataset` for those with images.
         order: Which of them each batch takes.
         transform: Turns a list of episodes into a batch; see `BatchStream`.
-        workers: Processes that read ahead; 0 reads when asked.
+        num_workers: Processes that read ahead; 0 reads when asked.
         context: How they start: "fork", "spawn" or "forkserver"; by default as the system does.
         pin_memory: Put tensors into memory from which a GPU copies faster.
 
@@ -215,8 +215,8 @@ class BatchLoader(Generic[Episode]):
 
     Example:
         >>> cache = open_object_cache(Dataset("demos"))
-        >>> order = BatchOrder(len(cache), batch=64, seed=0, lengths=cache.lengths())
-        >>> loader = BatchLoader(cache, order, workers=2)
+        >>> order = BatchOrder(len(cache), batch_size=64, seed=0, lengths=cache.lengths())
+        >>> loader = BatchLoader(cache, order, num_workers=2)
         >>> for episodes in loader: ...
         >>> torch.save(loader.state_dict(), "position.pt")
     """
@@ -227,7 +227,7 @@ class BatchLoader(Generic[Episode]):
         order: BatchOrder,
         *,
         transform: Transform[Episode] | None = None,
-        workers: int = 0,
+        num_workers: int = 0,
         context: str | None = None,
         pin_memory: bool = False,
     ) -> None:
@@ -235,8 +235,8 @@ class BatchLoader(Generic[Episode]):
             raise ConfigError(f"the order is for {order.num_episodes} episodes; there are {len(source)}.")
         self.source, self.order, self.transform = source, order, transform
         self._options = {
-            "num_workers": workers,
-            "multiprocessing_context": context if workers else None,
+            "num_workers": num_workers,
+            "multiprocessing_context": context if num_workers else None,
             "pin_memory": pin_memory,
         }
         self._num_done = 0

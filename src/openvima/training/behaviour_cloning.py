@@ -56,7 +56,7 @@ class BehaviourCloning:
         self._validated = module if parallel.is_sharded else learner
         self._order = order_of(
             training,
-            batch=config.loader.batch_size,
+            batch_size=config.loader.batch_size,
             seed=config.seed,
             bucket=config.loader.bucket_batches,
             rank=parallel.rank,
@@ -90,7 +90,7 @@ class BehaviourCloning:
             return {}
         total = source.num_steps(np.arange(len(source)))
         ranks, parts = self._parallel.num_ranks, self._config.optimizer.grad_accum_steps
-        size = max(1, self._order.batch // ranks // parts)
+        size = max(1, self._order.batch_size // ranks // parts)
         sums: Metrics = {}
         # Sorted by length, to reduce padding; processes take parts in turn.
         rows = np.lexsort(source.lengths.T[::-1])
@@ -109,7 +109,7 @@ class BehaviourCloning:
 
     def _from(self, step: int) -> Iterator[list[tuple[Any, int]]]:
         config, parts = self._config, self._config.optimizer.grad_accum_steps
-        ours = self._order.batch // self._parallel.num_ranks
+        ours = self._order.batch_size // self._parallel.num_ranks
         stream = BatchStream(
             self._training,
             self._order,

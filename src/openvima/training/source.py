@@ -232,7 +232,7 @@ def check_words(cache: ObjectCache, processor: Processor, *, describes: bool = F
 
 
 def order_of(
-    source: ExampleSource, *, batch: int, seed: int, bucket: int, rank: int, num_ranks: int
+    source: ExampleSource, *, batch_size: int, seed: int, bucket: int, rank: int, num_ranks: int
 ) -> BatchOrder:
     """Return the order of demonstrations; a batch is at most as large as the data.
 
@@ -244,10 +244,10 @@ def order_of(
             f"there are {len(source)} demonstrations to train on and {num_ranks} processes; start fewer of "
             "these, or generate more."
         )
-    batch = min(batch, len(source) // num_ranks * num_ranks)
+    batch_size = min(batch_size, len(source) // num_ranks * num_ranks)
     return BatchOrder(
         len(source),
-        batch=batch,
+        batch_size=batch_size,
         seed=seed,
         lengths=source.lengths if bucket else None,
         bucket=max(1, bucket),

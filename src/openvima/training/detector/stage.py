@@ -107,7 +107,7 @@ class DetectorStage:
         self.parameters = list(learner.parameters())
         self._learner, self._config, self._parallel = learner, config, parallel
         self._source, self._held_out = source, held_out
-        self._order = BatchOrder(len(source), batch=config.loader.batch_size // 2, seed=config.seed)
+        self._order = BatchOrder(len(source), batch_size=config.loader.batch_size // 2, seed=config.seed)
 
     def backward(self, step: int) -> Metrics:
         """Add the gradients of one batch of frames, in parts."""
