@@ -30,7 +30,8 @@ HEAD = """# Performance
 
 Made from the JSON files in [results](../results/) by `python benchmarks/performance_table.py`; do not edit.
 Absolute figures are those of the machine that the source names, ratios were measured in one run. `a / b` in
-the column of commits is a ratio of commit `a` to commit `b`.
+the column of commits is a ratio of commit `a` to commit `b`. × is a speed-up, or in rows of a time the ratio
+of the times.
 
 | what | figure | command | commit | date | source |
 |---|---:|---|---|---|---|
