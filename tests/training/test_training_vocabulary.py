@@ -15,12 +15,14 @@ from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.presets import PUBLISHED  # noqa: E402
+from openvima.policies.pointer.config import AttributeConfig  # noqa: E402
+from openvima.policies.presets import PRESETS, PUBLISHED  # noqa: E402
 from openvima.policies.sizes import VOCABULARY_SIZE  # noqa: E402
 from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benchmark_vocabulary  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import build_learner, resolved  # noqa: E402
 from openvima.training.vocabulary import training_texts  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
 
 WORDS = {
     *("rotate", "the", "degrees", ".", "put", "into", "sweep", "without", "exceeding"),
@@ -92,6 +94,24 @@ def test_fine_tuning_adds_new_words_to_those_of_the_checkpoint(settings, tmp_pat
     assert len(words) > VOCABULARY_SIZE and third.network.config.prompt.vocabulary_size == len(words)
     assert torch.equal(words[:VOCABULARY_SIZE], first.network.prompt.words.weight)
     assert torch.equal(third.network.query, first.network.query)
+
+
+def test_fine_tuning_compares_attributes_as_the_checkpoint_does(
+    settings, tmp_path: Path, monkeypatch
+) -> None:
+    sizes = replace(narrow_small(), attributes=AttributeConfig(hidden_width=8, width=4))
+    for name, exclusive in (("shared", False), ("exclusive", True)):
+        own = replace(sizes, attributes=replace(sizes.attributes, exclusive=exclusive))
+        monkeypatch.setitem(PRESETS, name, lambda own=own: own)
+    steps = {"pretraining.steps": 0, "schedule.steps": 2}
+    config = resolved(TrainingConfig.of({**settings, **steps, "preset": "shared"}))
+    first = build_learner(config, ["put it there"])
+    (tmp_path / "first").mkdir()
+    first.write(tmp_path / "first", first.state_dict())
+    again = replace(config, preset="exclusive", init_from=str(tmp_path / "first"))
+    assert build_learner(again, ["put it there"]).network.config == first.network.config
+    fresh = build_learner(replace(again, init_from=None), ["put it there"])
+    assert fresh.network.config.attributes.exclusive
 
 
 def test_words_of_the_augmentation_are_in_the_vocabulary(data: Path, settings) -> None:

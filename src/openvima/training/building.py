@@ -11,6 +11,7 @@ from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
 from openvima.policies.config import PolicyConfig, appearance_width, config_to_dict
 from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
 from openvima.policies.sizes import t5_name
@@ -148,6 +149,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
     sizes, initial, stored = _sizes(config), None, None
     if config.init_from:
         initial, stored = load_network(config.init_from)
+        sizes = _comparing_like(sizes, initial.config)
         _check_sizes(sizes, initial.config, config.init_from)
         sizes = replace(sizes, prompt=initial.config.prompt)
     if sizes.prompt.tokenizer == "t5":
@@ -179,6 +181,15 @@ def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | No
             "folder that holds it, or to 't5-base'. Its weights are then not read."
         )
     return tokenizer_for(sizes.prompt, where)
+
+
+def _comparing_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
+    """Compare attributes as the weights to begin with have learned to, which is no matter of size."""
+    if not (isinstance(ours, PointerConfig) and isinstance(theirs, PointerConfig)):
+        return ours
+    if ours.attributes is None or theirs.attributes is None:
+        return ours
+    return replace(ours, attributes=replace(ours.attributes, exclusive=theirs.attributes.exclusive))
 
 
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
