@@ -160,7 +160,7 @@ def test_every_option_named_in_the_text_exists(page: Path) -> None:
     stale = [
         f"{page.relative_to(ROOT)}:{number}: {option}"
         for number, line in enumerate(prose.splitlines(), 1)
-        for code in re.findall(r"`([^`]+)`", line)
+        for _, code in re.findall(r"(`+)(.+?)\1", line)
         if code.split()[0] not in OTHER_PROGRAMS
         for option in OPTION.findall(code)
         if option not in known

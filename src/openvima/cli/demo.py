@@ -52,8 +52,8 @@ def main(
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
         trust_code: Run the code that a run folder names, as that of a learner of your own does.
         explain: Draw beside the video what the policy considers at each step: probabilities of objects,
-            places and rotations, and attention to the prompt. For openvima-small, nano, small, vima-* and
-            flamingo-*.
+            places and rotations, and attention to the prompt. For openvima-small, nano, nano-bins, small,
+            vima-* and flamingo-*.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -74,6 +74,7 @@ def main(
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
     if boxes is not None and policy in ("oracle", "random"):
         raise ConfigError(f"--boxes is {boxes!r}, but {policy} uses no boxes; name a trained policy.")
+    from openvima.catalog import load_assets
     from openvima.env import EnvConfig
     from openvima.evaluation.config import Batch
     from openvima.evaluation.recording import record_episode
@@ -96,6 +97,7 @@ def main(
         )
     assert task is not None  # as checked
     env_config = EnvConfig(assets, compat, prompts, task_options, control)
+    load_assets(env_config.assets)  # may register objects of the task that is sampled next
     check_task_options((task,), env_config.task_options)
     batch = Batch(
         policy,

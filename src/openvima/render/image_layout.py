@@ -1,7 +1,7 @@
 """The two layouts of images.
 
-Images are channels first throughout the package, from the rasteriser through observations, demonstrations
-and shards to the networks. Image files, video encoders and plots take them channels last.
+Images are channels first from the rasteriser through observations and demonstrations to the networks. Shards,
+image files, video encoders and plots have them channels last.
 """
 
 import numpy as np

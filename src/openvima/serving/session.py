@@ -54,8 +54,8 @@ class Session:
     """Answers the requests of one client.
 
     A request is read and checked in one thread and answered in that of the policy, so one that is refused
-    keeps no other client waiting. No method raises: a refusal is a text, and the next request may be a better
-    one.
+    delays other clients only briefly. No method raises: a refusal is a text, and the next request may be a
+    better one.
 
     Args:
         policy: Has no other user. Its `prompt_limits`, if any, bound the prompts.

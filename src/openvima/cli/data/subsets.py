@@ -24,8 +24,8 @@ def sample(
 ) -> int:
     """Sample a fraction of the demonstrations of each task.
 
-    Smaller fractions of the same seed are split of larger ones: the 1 % is split of the 10 %. Nothing in a
-    demonstration is changed.
+    Samples of one seed are nested: the 1 % sample is a subset of the 10 % sample. Nothing in a demonstration
+    is changed.
 
     Example: openvima data sample demos demos-1-percent --fraction 0.01
 
