@@ -95,8 +95,6 @@ def read_png(file: Path, *, max_bytes: int, max_side: int) -> "PIL.Image.Image":
     Raises:
         InputFileError: There is no such file, it is no regular file, too large, or no PNG file.
     """
-    from PIL import Image
-
     try:
         with open_regular(file) as stream:
             content = stream.read(max_bytes + 1)
@@ -105,8 +103,28 @@ def read_png(file: Path, *, max_bytes: int, max_side: int) -> "PIL.Image.Image":
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputFileError(f"{str(file)!r} cannot be read: {reason}.") from None
+    return decode_png(content, repr(str(file)), max_bytes=max_bytes, max_side=max_side)
+
+
+def decode_png(content: bytes, label: str, *, max_bytes: int, max_side: int) -> "PIL.Image.Image":
+    """Decode the content of a PNG file of limited size.
+
+    Args:
+        content: The bytes.
+        label: What errors call it.
+        max_bytes: As for `read_png`.
+        max_side: As for `read_png`.
+
+    Returns:
+        The image, in mode RGBA.
+
+    Raises:
+        InputFileError: It is too large, or no PNG file.
+    """
+    from PIL import Image
+
     if len(content) > max_bytes:
-        raise InputFileError(f"{str(file)!r} has more than {max_bytes:,} bytes, the most allowed.")
+        raise InputFileError(f"{label} has more than {max_bytes:,} bytes, the most allowed.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # of bombs, and of damaged chunks
@@ -114,13 +132,13 @@ def read_png(file: Path, *, max_bytes: int, max_side: int) -> "PIL.Image.Image":
                 width, height = image.size
                 if max(width, height) > max_side:
                     raise InputFileError(
-                        f"{str(file)!r} has {width} × {height} pixels; sides must lie within 1 … {max_side}."
+                        f"{label} has {width} × {height} pixels; sides must lie within 1 … {max_side}."
                     )
                 return image.convert("RGBA")
     except InputFileError:
         raise
     except Exception as error:  # Pillow raises many kinds for damaged files
-        raise InputFileError(f"{str(file)!r} is no readable PNG file ({type(error).__name__}).") from None
+        raise InputFileError(f"{label} is no readable PNG file ({type(error).__name__}).") from None
 
 
 class _PlainLoader(yaml.SafeLoader):

@@ -1,13 +1,12 @@
 """Photos of objects as prompt images: bounded reading of PNG files."""
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from openvima.errors import InputFileError
-from openvima.input_files import read_png
+from openvima.input_files import decode_png, read_png
 from openvima.render.rasteriser import PHOTO_WHITE
 from openvima.scene import PhotoImage
 from openvima.scene.prompt import PHOTO_SIDE
@@ -28,21 +27,28 @@ def read_photo(file: Path) -> PhotoImage:
         picture = read_png(file, max_bytes=MAX_PNG_BYTES, max_side=MAX_PNG_SIDE)
     except InputFileError as error:
         raise InputFileError(f"photo {error}") from None
+    return _photo(picture, f"photo {str(file)!r}")
+
+
+def photo_from_bytes(content: bytes) -> PhotoImage:
+    """Read the content of a PNG file; see `read_photo`.
+
+    Raises:
+        InputFileError: It is no PNG, too large, or empty.
+    """
+    label = "the photo"
+    return _photo(decode_png(content, label, max_bytes=MAX_PNG_BYTES, max_side=MAX_PNG_SIDE), label)
+
+
+def _photo(picture: Image.Image, label: str) -> PhotoImage:
+    """Cut a picture to its object and resize it."""
     paper = Image.new("RGBA", picture.size, "white")
     pixels = np.asarray(Image.alpha_composite(paper, picture).convert("RGB"))
     is_object = (pixels < PHOTO_WHITE).any(axis=-1)
     if not is_object.any():
-        raise InputFileError(f"photo {str(file)!r} is all white; it must show an object on white.")
+        raise InputFileError(f"{label} is all white; it must show an object on white.")
     rows, columns = np.flatnonzero(is_object.any(axis=-1)), np.flatnonzero(is_object.any(axis=0))
     return _fitted(Image.fromarray(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]))
-
-
-def photo_from_bytes(content: bytes) -> PhotoImage:
-    """Read the content of a PNG file; see `read_photo`."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "photo.png")
-        file.write_bytes(content)
-        return read_photo(file)
 
 
 def _fitted(picture: Image.Image) -> PhotoImage:
