@@ -60,9 +60,8 @@ class ImageMaker:
             return _object_image(known_object(given, self.handles, label))
         if isinstance(given, Mapping):
             if set(given) != {"object", "texture"}:
-                raise SceneError(
-                    f"{label} has fields {shown(sorted(given))}; allowed are object and texture."
-                )
+                names = shown(sorted(map(str, given)))
+                raise SceneError(f"{label} has fields {names}; allowed are object and texture.")
             return self._from_catalogue(given["object"], given["texture"], label)
         parts = entries(given, label)
         if len(parts) == 2 and all(isinstance(part, str) for part in parts):
