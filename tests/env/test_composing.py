@@ -11,6 +11,7 @@ import openvima
 from compose import outcome_of, random_scene
 from openvima import SceneObject, compose
 from openvima.catalog import load_assets
+from openvima.env.photos import photo_from_bytes
 from openvima.errors import InputFileError, OpenVimaError, SceneError, UnknownObjectError, UnknownTextureError
 from openvima.perception.objects import observe_prompt_image
 from openvima.render.rasteriser import Rasteriser
@@ -125,6 +126,18 @@ def test_photos_that_show_nothing_are_refused(tmp_path: Path) -> None:
         compose(OBJECTS, "Put {x}.", images={"x": tmp_path / "white.png"})
 
 
+def test_an_uploaded_photo_is_refused_without_a_path() -> None:
+    with pytest.raises(InputFileError, match=r"^the photo is no readable PNG file"):
+        photo_from_bytes(b"no PNG")
+
+
+def test_fields_of_an_image_are_named_whatever_they_are() -> None:
+    with pytest.raises(
+        SceneError, match=r"image 'x' has fields .*1.*texture.*; allowed are object and texture"
+    ):
+        compose(OBJECTS, "Put the {x}.", images={"x": {1: "heart", "texture": "red"}})
+
+
 def test_goals_by_name() -> None:
     given = [
         ("in", "a", "b"),
@@ -142,6 +155,39 @@ def test_goals_by_name() -> None:
         table, "Sweep.", goals=[("swept_into", "a", "b")], end_effector="spatula"
     ).problem.goals
     assert isinstance(swept, InZone) and swept.zone.size_x == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "yaw_deg", "is_met"),
+    [
+        ("block", 45, False),
+        ("block", 90, True),
+        ("shorter block", 45, False),
+        ("small block", 90, True),
+        ("cross", 90, True),
+        ("cross", 45, False),
+        ("triangle", 120, False),
+        ("pan", 180, False),
+        ("round", 70, True),
+        ("disk", 70, True),
+        ("star", 72, True),
+        ("heart", 180, False),
+    ],
+)
+def test_a_heading_is_met_where_the_object_looks_the_same(name: str, yaw_deg: float, is_met: bool) -> None:
+    given = {"object": name, "texture": "red", "position": (0.5, 0.0), "fixed": False}
+    problem = compose([given], "Look.", goals=[("at", 0, (0.5, 0.0), yaw_deg)]).problem
+    assert problem.goals[0].is_met(problem.scene) is is_met
+
+
+def test_nothing_is_swept_into_itself() -> None:
+    with pytest.raises(SceneError, match="cannot be in itself"):
+        compose(
+            [("small block", "red", (0.5, 0.0))],
+            "Sweep.",
+            goals=[("swept_into", 0, 0)],
+            end_effector="spatula",
+        )
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import Any  # of whatever type a user gives; checked here
 import numpy as np
 
 from openvima.catalog import Assets, object_spec
+from openvima.catalog.objects import FULL_SYMMETRY, NO_SYMMETRY
 from openvima.env.checked_values import entries, known_object, number, pair, shown
 from openvima.env.composed_objects import MAX_ANGLE_DEG, WORKSPACE, outline
 from openvima.errors import SceneError, unknown_name
@@ -17,6 +18,13 @@ from openvima.tasks.into_base import TOLERANCE
 from openvima.tasks.rotation import TOLERANCE_DEG, rotation_goal
 
 Handles = Mapping[str, Placement]
+
+# The angles of the catalogue are those of the benchmark, which differ from the shapes or are unset for these.
+_SYMMETRY_RAD = {
+    **dict.fromkeys(("block", "shorter block", "small block", "cross"), math.pi / 2),
+    **dict.fromkeys(("triangle", "pan"), NO_SYMMETRY),
+    **dict.fromkeys(("round", "disk"), FULL_SYMMETRY),
+}
 
 
 def composed_goals(
@@ -83,8 +91,7 @@ def _usage(name: str) -> str:
 
 def _in(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     """The position of a is within 0.1 m of that of b, as in the tasks; so a is in b or on it."""
-    if a.id == b.id:
-        raise SceneError(f"{a.texture} {a.object} cannot be in itself; name two objects.")
+    _check_two_objects(a, b)
     return AtPose(a.id, b.pose, TOLERANCE, relative_to=b.id)
 
 
@@ -97,9 +104,9 @@ def _at(a: Placement, position: object, yaw_deg: object = None, *, assets: Asset
         return AtPose(a.id, Pose((x, y, a.pose.z), a.pose.quaternion), TOLERANCE)
     yaw_rad = math.radians(number(yaw_deg, "yaw_deg", -MAX_ANGLE_DEG, MAX_ANGLE_DEG))
     tolerance = Tolerance(TOLERANCE.position_m, math.radians(TOLERANCE_DEG))
-    symmetry_rad = object_spec(a.object).symmetry_rad
+    symmetry_rad = _SYMMETRY_RAD.get(a.object, object_spec(a.object).symmetry_rad)
     target = Pose.planar(x, y, yaw_rad, z=a.pose.z)
-    return AtPose(a.id, target, tolerance, 2 * math.pi if symmetry_rad is None else symmetry_rad)
+    return AtPose(a.id, target, tolerance, NO_SYMMETRY if symmetry_rad is None else symmetry_rad)
 
 
 def _rotated(a: Placement, degrees: object, *, assets: Assets) -> Goal:
@@ -114,6 +121,7 @@ def _swept_into(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     """The small block a is inside the outline of b."""
     if a.object != "small block":
         raise SceneError(f"only a small block can be swept, not a {a.object}.")
+    _check_two_objects(a, b)
     if abs(math.remainder(b.pose.yaw_rad, math.pi / 2)) > 1e-6:
         yaw_deg = math.degrees(b.pose.yaw_rad)
         raise SceneError(f"the {b.object} has a yaw of {yaw_deg:.1f} degrees; it must be a multiple of 90.")
@@ -121,6 +129,11 @@ def _swept_into(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     low, high = corners.min(axis=0), corners.max(axis=0)
     (x, y), (size_x, size_y) = ((low + high) / 2).tolist(), np.subtract(high, low).tolist()
     return InZone(a.id, Zone(x, y, size_x, size_y), relative_to=b.id)
+
+
+def _check_two_objects(a: Placement, b: Placement) -> None:
+    if a.id == b.id:
+        raise SceneError(f"{a.texture} {a.object} cannot be in itself; name two objects.")
 
 
 _GOALS: dict[str, Callable[..., Goal]] = {
