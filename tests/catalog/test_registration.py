@@ -204,6 +204,7 @@ def test_an_open_mesh_is_drawn_from_both_sides_on_request() -> None:
         ({"profile": "oval"}, "profile"),
         ({"aliases": ("bowl",)}, "object 'bowl' already"),
         ({"aliases": "bar"}, "give a list"),
+        ({"aliases": None}, "aliases of object 'brick' are None; give a list"),
         ({"collision": (CORNERS + 100, TRIANGLES)}, "part 0 of the collision"),
         ({"collision": (CORNERS * (1, 1, 0), TRIANGLES)}, "is flat"),
     ],
@@ -219,6 +220,9 @@ def test_published_tasks_keep_their_pools() -> None:
         register_brick(tasks=("rotate",))
     with pytest.raises(LevelError, match="no level 'L9'"):
         register_brick(tasks=("mine",), levels=("L9",))
+    for names in ({"tasks": None}, {"levels": None}, {"tasks": "mine"}):
+        with pytest.raises(ConfigError, match=r"tasks and levels of object 'brick' are .*; give lists"):
+            register_brick(**names)
     register_brick(tasks=("mine",), levels=("train",), container=True)
     register_brick("plate", tasks=("mine",))
     assert pool("rotate", "train") == before and "brick" not in OBJECTS
@@ -273,6 +277,7 @@ def test_an_unfit_png_file_is_refused(tmp_path: Path, content: bytes, message: s
         (np.zeros((4, 4, 4), np.uint8), ShapeError),
         (np.zeros((0, 4, 3), np.uint8), AssetError),
         (np.zeros((1, 1025, 3), np.uint8), AssetError),
+        ([[1], [1, 2]], ShapeError),
     ],
 )
 def test_an_unfit_array_is_no_texture(image: np.ndarray, error: type[Exception]) -> None:

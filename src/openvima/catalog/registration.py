@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -96,8 +96,9 @@ def register_object(
     """
     what = f"object {echo(repr(name))}"
     _check_name(name, what, "object")
-    if len(aliases) > MAX_ALIASES or isinstance(aliases, str):
-        raise AssetError(f"{what} has {len(aliases)} aliases; give a list of at most {MAX_ALIASES}.")
+    if isinstance(aliases, str) or not isinstance(aliases, Collection) or len(aliases) > MAX_ALIASES:
+        given = echo(repr(aliases))
+        raise AssetError(f"aliases of {what} are {given}; give a list of at most {MAX_ALIASES} names.")
     for alias in aliases:
         _check_name(alias, f"alias {echo(repr(alias))} of {what}", "object", alias=True)
     _check_number("symmetry_deg", symmetry_deg, 0.0, 360.0, what)
@@ -151,7 +152,9 @@ def register_texture(name: str, image: np.ndarray | str | Path) -> TextureSpec:
     """
     what = f"texture {echo(repr(name))}"
     _check_name(name, what, "texture")
-    pixels = _read_png(Path(image).expanduser(), what) if isinstance(image, str | Path) else np.asarray(image)
+    pixels = (
+        _read_png(Path(image).expanduser(), what) if isinstance(image, str | Path) else _as_array(image, what)
+    )
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
         raise ShapeError(f"{what} is {pixels.dtype} of shape {pixels.shape}; it must be uint8 of (H, W, 3).")
     if not all(1 <= side <= MAX_TEXTURE_SIDE for side in pixels.shape[:2]):
@@ -233,8 +236,9 @@ def _check_number(field: str, value: float, least: float, most: float, what: str
 
 
 def _check_pools(tasks: Sequence[str], levels: Sequence[Level], what: str) -> None:
-    if isinstance(tasks, str) or isinstance(levels, str):
-        raise ConfigError(f"tasks and levels of {what} are lists of names.")
+    if any(isinstance(names, str) or not isinstance(names, Collection) for names in (tasks, levels)):
+        given = f"{echo(repr(tasks))} and {echo(repr(levels))}"
+        raise ConfigError(f"tasks and levels of {what} are {given}; give lists of names.")
     if published := [task for task in tasks if task in PUBLISHED_TASKS]:
         raise ConfigError(
             f"{what} cannot be added to the published task {published[0]!r}: every seed would give another "
@@ -264,6 +268,15 @@ def _digest(text: str, *arrays: np.ndarray) -> str:
 
 def _identifier(name: str) -> str:
     return name.upper().replace(" ", "_").replace("-", "_")
+
+
+def _as_array(image: object, what: str) -> np.ndarray:
+    try:
+        return np.asarray(image)
+    except (TypeError, ValueError):  # such as rows of unequal lengths
+        raise ShapeError(
+            f"{what} is a {type(image).__name__} that NumPy cannot convert; it must be uint8 of (H, W, 3)."
+        ) from None
 
 
 def _read_png(file: Path, what: str) -> np.ndarray:
