@@ -117,3 +117,16 @@ def test_every_task_takes_up_to_six_distractors(task: str) -> None:
         for problem in (none, most)
     )
     assert len(more) - len(fewer) == (0 if task in UNCHECKED else MAX_DISTRACTORS)
+
+
+@pytest.mark.parametrize(
+    ("task", "option", "value", "message"),
+    [
+        ("rearrange", "distractor_textures", ["x"], "no choice of distractor_textures"),
+        ("novel_adj", "meanings", 5, "meanings is 5; give some of shorter, taller"),
+        ("novel_adj", "adjectives", 5, "adjectives is 5; give a word or a list of words"),
+    ],
+)
+def test_an_option_of_another_type_is_named(task: str, option: str, value: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        sample_episode(task, seed=0, **{option: value})

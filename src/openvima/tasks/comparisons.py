@@ -1,6 +1,6 @@
 """Comparisons that define an invented adjective, and pairs of objects that differ in that attribute alone."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -160,6 +160,8 @@ def _image(object_name: str, texture: str, size: Vector3, scale: Vector3) -> Obj
 
 
 def _checked_meanings(table: TableSampler, meanings: str | Sequence[str]) -> tuple[str, ...]:
+    if not isinstance(meanings, Iterable):
+        raise ConfigError(f"meanings is {meanings!r}; give some of {', '.join(ALL_MEANINGS)}.")
     listed = (meanings,) if isinstance(meanings, str) else tuple(meanings)
     for meaning in listed or ("",):
         if meaning not in ALL_MEANINGS:

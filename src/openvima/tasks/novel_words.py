@@ -1,7 +1,7 @@
 """Invented words, and gray object images."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from openvima.catalog.textures import NEUTRAL_TEXTURE
@@ -28,6 +28,8 @@ def choose_words(
     Raises:
         ConfigError: The list is too short, or has duplicates or invalid words.
     """
+    if not isinstance(words, Iterable):
+        raise ConfigError(f"{option} is {words!r}; give a word or a list of words.")
     listed = (words,) if isinstance(words, str) else tuple(words)
     wrong = [word for word in listed if not (isinstance(word, str) and _WORD.fullmatch(word))]
     if wrong or len(set(listed)) < max(len(listed), count):

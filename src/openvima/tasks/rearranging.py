@@ -85,7 +85,7 @@ def sample_arrangement(
     check_difficulty(difficulty)
     check_fraction("conflict_rate", conflict_rate)
     textures_of = {"all": TEXTURE_SETS["T"], "pool": table.pool.dragged_textures}
-    if distractor_textures not in textures_of:
+    if not isinstance(distractor_textures, str) or distractor_textures not in textures_of:
         raise ConfigError(unknown_name("choice of distractor_textures", distractor_textures, textures_of))
     if num_objects is None:
         num_objects = 1 + int(table.rng.choice(MAX_OBJECTS, p=NUM_OBJECTS_WEIGHTS))
