@@ -3,15 +3,18 @@
 import re
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
-from openvima.catalog import Level, levels_of, pool
+from openvima.catalog import Level, Pool, levels_of, pool
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
-from openvima.tasks import list_tasks, register_task, sample_episode, task_spec
+from openvima.tasks import list_tasks, register_task, registry, sample_episode, task_spec
 from openvima.tasks.registry import MAX_EPISODE_STEPS
 
 TASKS = list_tasks()
+POOLS: dict[Level, Pool] = {"train": pool("rotate", "train")}
 
 
 def test_the_list_holds_the_tasks_in_order() -> None:
@@ -94,13 +97,11 @@ def test_a_name_can_be_registered_once_only() -> None:
 
 def test_a_new_task_may_bring_its_own_pools() -> None:
     pools: dict[Level, object] = {"train": pool("rotate", "train")}
-    register_task("test only", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample_episode)  # type: ignore[arg-type]
+    register_task("test_only", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample_episode)  # type: ignore[arg-type]
     try:
-        assert task_spec("test only").levels == ("train",)
+        assert task_spec("test_only").levels == ("train",)
     finally:
-        from openvima.tasks import registry
-
-        del registry._TASKS["test only"]
+        del registry._TASKS["test_only"]
 
 
 def test_a_new_task_needs_pools_of_known_levels() -> None:
@@ -109,6 +110,52 @@ def test_a_new_task_needs_pools_of_known_levels() -> None:
     pools = {"L5": pool("rotate", "train")}
     with pytest.raises(ConfigError, match="pools of task 'poolless': there is no level 'L5'"):
         register_task("poolless", family="x", template="x.", oracle_max_steps=1, pools=pools)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["hand task", "", "-x", "a/b", "größe", "x" * 101, 5])
+def test_a_task_has_a_plain_name(name: object) -> None:
+    with pytest.raises(ConfigError, match=r"a task is named .*; give 1 to 100 letters"):
+        register_task(name, family="x", template="x.", oracle_max_steps=1, pools=POOLS)  # type: ignore[arg-type]
+
+
+def test_a_task_has_a_known_end_effector() -> None:
+    with pytest.raises(
+        ConfigError, match=r"no end effector for task 'handy': 'hand'\. Allowed: suction, spatula"
+    ):
+        register_task(
+            "handy",
+            family="x",
+            template="x.",
+            oracle_max_steps=1,
+            pools=POOLS,
+            end_effector="hand",  # type: ignore[arg-type]
+        )
+
+
+def test_a_task_file_that_failed_can_be_loaded_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "broken.py"
+    file.write_text(
+        "from openvima.tasks import register_task, task_spec\n"
+        "rotate, steps = task_spec('rotate'), {'oracle_max_steps': 1}\n"
+        "register_task('broken', family='x', template='x.', pools=rotate.pools, **steps)(rotate.sample)\n"
+        "1 / 0\n",
+        encoding="utf-8",
+    )
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    monkeypatch.setenv(registry.TASK_FILES_VARIABLE, str(file))
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="ZeroDivisionError"):
+            registry._load_task_files.__wrapped__()
+    assert "broken" not in registry._TASKS
+
+
+def test_a_broken_plugin_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = EntryPoint("toys", "no_such_module", registry.ENTRY_POINTS)
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [broken])
+    with pytest.raises(
+        ConfigError, match=r"entry point toys = 'no_such_module' of openvima\.tasks raised ModuleNot"
+    ):
+        registry._load_task_files.__wrapped__()
 
 
 def test_the_list_of_tasks_needs_no_compiled_code() -> None:

@@ -1,5 +1,6 @@
 """Registry of tasks: each task file registers its `sample` function."""
 
+import contextlib
 import functools
 import importlib
 import importlib.metadata
@@ -7,7 +8,8 @@ import inspect
 import itertools
 import os
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,15 +18,16 @@ from openvima.brief import brief_repr
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
 from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.catalog.registration import with_registered
-from openvima.errors import ConfigError, LevelError, UnknownTaskError, unknown_name
-from openvima.scene import EndEffector, Problem
-from openvima.user_code import load_file
+from openvima.errors import ConfigError, LevelError, OpenVimaError, UnknownTaskError, echo, unknown_name
+from openvima.scene import END_EFFECTORS, EndEffector, Problem
+from openvima.user_code import described, load_file
 
 TASK_FILES_VARIABLE = "OPENVIMA_TASK_FILES"
 ENTRY_POINTS = "openvima.tasks"
 HELD_OUT = "heldout"  # stands for the tasks that are held out, as "all" does for all
 EXTRA_STEPS = 2  # of a policy beyond the oracle's
-MAX_EPISODE_STEPS = 20  # of a policy; the longest of the 17 tasks has 10
+MAX_EPISODE_STEPS = 20  # of a policy; the longest of the 17 tasks has 16
+_NAME = re.compile(r"\w[\w-]{0,99}", re.ASCII)  # file names and task options hold it
 SampleFunction = Callable[..., Problem]  # (table, *, options with defaults) -> Problem
 
 
@@ -112,7 +115,7 @@ def register_task(
     """Register a task; decorates its `sample` function.
 
     Args:
-        name: Name of the task.
+        name: Name of the task: up to 100 letters, digits, "_" and "-", of ASCII.
         family: Group of the paper under which results are reported, as in "visual_reasoning"; or several.
         template: The prompt with its slots.
         oracle_max_steps: Step limit of the oracle.
@@ -125,9 +128,16 @@ def register_task(
         The decorator, which returns the function unchanged.
 
     Raises:
-        ConfigError: The name is already registered, there are no pools, one is of no level, or episodes would
-            have more than 20 steps.
+        ConfigError: The name is already registered or no plain name, there are no pools, one is of no level,
+            there is no such end effector, or episodes would have more than 20 steps.
     """
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise ConfigError(
+            f"a task is named {echo(repr(name))}; give 1 to 100 letters, digits, '_' and '-', as 'my_task'."
+        )
+    if end_effector not in END_EFFECTORS:
+        kind = f"end effector for task {name!r}:"
+        raise ConfigError(unknown_name(kind, end_effector, END_EFFECTORS))
     check_steps(name, oracle_max_steps)
     if not pools and name not in PUBLISHED_TASKS:
         raise ConfigError(f"task {name!r} has no pools; give objects and textures of a level at least.")
@@ -215,6 +225,32 @@ def _load_task_files() -> None:
         if not module.name.endswith(".kernels"):  # Numba, imported when an episode is sampled
             importlib.import_module(module.name)
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        entry_point.load()
+        with _all_or_no_tasks():
+            _load_entry_point(entry_point)
     for path in filter(None, os.environ.get(TASK_FILES_VARIABLE, "").split(os.pathsep)):
-        load_file(Path(path), what=TASK_FILES_VARIABLE)
+        with _all_or_no_tasks():
+            load_file(Path(path), what=TASK_FILES_VARIABLE)
+
+
+@contextlib.contextmanager
+def _all_or_no_tasks() -> Iterator[None]:
+    """Forget the tasks that code registered before it failed, so that it can be loaded again."""
+    before = dict(_TASKS)
+    try:
+        yield
+    except BaseException:
+        _TASKS.clear()
+        _TASKS.update(before)
+        raise
+
+
+def _load_entry_point(entry_point: importlib.metadata.EntryPoint) -> None:
+    try:
+        entry_point.load()
+    except OpenVimaError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"the entry point {entry_point.name} = {entry_point.value!r} of {ENTRY_POINTS} raised "
+            f"{described(error)}; repair or uninstall its package."
+        ) from error
