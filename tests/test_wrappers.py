@@ -63,6 +63,7 @@ def test_a_flat_action_is_the_action_that_it_was_made_of() -> None:
     [
         (np.zeros(5), r"shape \(5,\) and dtype float64; it must be \(6,\)"),
         (np.zeros(6, int), "dtype int64"),
+        ([[1], [1, 2]], "dtype object"),
         (np.full(6, np.nan), r"the action is \(nan"),
         (np.array([0, 0, 0, 1.5, 0, 0]), r"1\.5, 0, 0\); each value must lie in -1 … 1"),
     ],
@@ -121,6 +122,9 @@ def test_too_few_rows_and_missing_images_are_named() -> None:
         FlatObservation(openvima.make("rotate", modalities=("rgb",)))
     with pytest.raises(ConfigError, match="rows are 0 and 16"):
         FlatObservation(openvima.make("rotate"), max_objects=0)
+    for rows in ("x", 4.5, True):
+        with pytest.raises(ConfigError, match=f"rows are {rows!r} and 16; give an integer of at least 1"):
+            FlatObservation(openvima.make("rotate"), max_objects=rows)
 
 
 def test_vectors_of_gymnasium_take_the_wrappers() -> None:

@@ -64,7 +64,10 @@ class FlatAction(gymnasium.ActionWrapper):
         Raises:
             ActionError: The shape is another, or a value is not in −1 … 1. Nothing was moved.
         """
-        values = np.asarray(action)
+        try:
+            values = np.asarray(action)
+        except (TypeError, ValueError):  # such as nested lists of unequal lengths, or a tensor on a device
+            values = np.empty(0, object)
         if values.shape != (ACTION_SIZE,) or values.dtype.kind != "f":
             raise ActionError(
                 f"the action has shape {values.shape} and dtype {values.dtype}; it must be "
@@ -117,7 +120,8 @@ class FlatObservation(gymnasium.Wrapper):
         max_prompt_objects: Rows for objects in the prompt's images.
 
     Raises:
-        ConfigError: The environment does not observe `rgb` and `segm`, or a number of rows is below 1.
+        ConfigError: The environment does not observe `rgb` and `segm`, or a number of rows is no integer
+            of at least 1.
     """
 
     def __init__(self, env: gymnasium.Env, *, max_objects: int = 16, max_prompt_objects: int = 16) -> None:
@@ -125,8 +129,9 @@ class FlatObservation(gymnasium.Wrapper):
         self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
         if not {"rgb", "segm"} <= set(self._base.modalities):
             raise ConfigError(f"modalities are {self._base.modalities}; FlatObservation needs rgb and segm.")
-        if min(max_objects, max_prompt_objects) < 1:
-            raise ConfigError(f"rows are {max_objects} and {max_prompt_objects}; give at least one each.")
+        if not all(_is_count(rows) for rows in (max_objects, max_prompt_objects)):
+            given = f"{max_objects!r} and {max_prompt_objects!r}"
+            raise ConfigError(f"rows are {given}; give an integer of at least 1 for each.")
         self.max_objects, self.max_prompt_objects = max_objects, max_prompt_objects
         size = (max_objects + max_prompt_objects) * OBJECT_SIZE + NUM_BUCKETS + 1
         size += TOOL_SIZE * (self._base.control == END_EFFECTOR)
@@ -229,6 +234,10 @@ class ProgressReward(gymnasium.Wrapper):
         before, self._potential = self._potential, _potential(info["progress"])
         gain = self.weight * (self._potential - before)
         return observation, float(reward) + gain, terminated, truncated, info
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 1
 
 
 def _scaled(points: np.ndarray) -> np.ndarray:
