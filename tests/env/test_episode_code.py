@@ -69,6 +69,9 @@ def test_python_makes_the_same_episode(tmp_path: Path) -> None:
     assert run(code) == sampled
     assert "sample_episode('rotate', level='train', seed=3, domain='eval', difficulty='hard')" in code
     assert "openvima.play(episode, 'runs/mine')" in code
+    hovering = sample_episode("rotate", seed=3, compat=True)
+    code = python_code(hovering, env_config=EnvConfig(compat=True))
+    assert run(code) == hovering and "openvima.play(episode, 'openvima-small', compat=True)" in code
     Image.new("RGB", (80, 50), "red").save(tmp_path / "photo.png")
     photo = openvima.compose(OBJECTS, "Put the {p}.", images={"p": tmp_path / "photo.png"})
     assert run(python_code(photo)) == photo

@@ -83,7 +83,8 @@ def python_code(episode: Episode, *, policy: str = POLICY, env_config: EnvConfig
     else:
         head = "import openvima\nfrom openvima.env.episode_file import episode_from_values\n"
         made = f"episode_from_values(\n    {_formatted(episode_values(episode))}\n)"
-    played = f"result = openvima.play(episode, {policy!r}{assets})\nprint(result.outcome)\n"
+    compat = ", compat=True" if env_config.compat else ""
+    played = f"result = openvima.play(episode, {policy!r}{assets}{compat})\nprint(result.outcome)\n"
     return f"{head}\nepisode = {made}\n{played}"
 
 
