@@ -32,6 +32,14 @@ def test_a_pack_is_returned_as_it_is():
     assert load_assets(pack) is pack
 
 
+@pytest.mark.parametrize("value", [None, 3, ["procedural"]])
+def test_what_is_no_pack_is_refused(value):
+    with pytest.raises(
+        AssetError, match=r"assets is a \w+; give a name, a folder, or an object with the methods"
+    ):
+        load_assets(value)
+
+
 def test_an_unknown_pack_is_refused_with_what_is_allowed():
     with pytest.raises(AssetError, match=r"Did you mean 'procedural'\?.*checkout of the original benchmark"):
         load_assets("proceduril")

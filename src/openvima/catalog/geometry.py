@@ -1,7 +1,7 @@
 """Shapes of asset packs: triangle meshes and convex collision shapes."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 import numpy as np
 
@@ -73,6 +73,11 @@ def protect(geometry: Geometry) -> Geometry:
     for array in (mesh.vertices, mesh.normals, mesh.uvs, *points):
         array.setflags(write=False)
     return geometry
+
+
+def is_pack(value: object) -> "TypeGuard[Assets]":
+    """Whether a value has the methods of an asset pack."""
+    return all(callable(getattr(value, name, None)) for name in ("geometry", "texture"))
 
 
 class Assets(Protocol):

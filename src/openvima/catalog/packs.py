@@ -4,7 +4,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from openvima.catalog.geometry import Assets
+from openvima.catalog.geometry import Assets, is_pack
 from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, unknown_name
 from openvima.user_code import is_code
@@ -25,7 +25,8 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
             is returned unchanged.
 
     Raises:
-        AssetError: The name is unknown, the folder contains no original pack, or none was imported.
+        AssetError: The name is unknown, the folder contains no original pack, none was imported, or an object
+            is no pack.
         ConfigError: There is no such function, or it fails.
 
     Example:
@@ -33,6 +34,11 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
         array([[[ 78, 121, 167]]], dtype=uint8)
     """
     if not isinstance(assets, str | Path):
+        if not is_pack(assets):
+            raise AssetError(
+                f"assets is a {type(assets).__name__}; give a name, a folder, or an object with the methods "
+                "geometry and texture."
+            )
         return assets
     if assets == "procedural":
         return procedural_assets()

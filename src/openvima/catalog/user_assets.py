@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 
-from openvima.catalog.geometry import Assets, Geometry, Vector3
+from openvima.catalog.geometry import Assets, Geometry, Vector3, is_pack
 from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, echo
 from openvima.user_code import call_function, is_code, with_absolute_path, without_folder
@@ -59,7 +59,7 @@ def load_user_assets(source: str) -> UserAssets:
     if whole in _packs:
         return _packs[whole]
     made = call_function(whole, what="assets")
-    if made is not None and not all(callable(getattr(made, name, None)) for name in ("geometry", "texture")):
+    if made is not None and not is_pack(made):
         raise AssetError(
             f"assets is {source!r}, whose function returned a {type(made).__name__}; return None, or an "
             "object with the methods geometry and texture."
