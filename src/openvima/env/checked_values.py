@@ -1,6 +1,5 @@
 """Checks of the plain values that users and their files give for a scene."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any  # of whatever type a user gives
 
@@ -60,7 +59,7 @@ def pair(value: Any, label: str) -> tuple[float, float]:
         raise SceneError(f"{label} is {shown(value)}; give x and y in metres, as in [0.45, -0.25].")
     for coordinate in value:
         is_number = isinstance(coordinate, int | float) and not isinstance(coordinate, bool)
-        if not is_number or not -1e6 < coordinate < 1e6 or not math.isfinite(coordinate):
+        if not is_number or not -1e6 < coordinate < 1e6:
             raise SceneError(f"{label} is {shown(value)}; give two finite numbers, x and y in metres.")
     return float(value[0]), float(value[1])
 

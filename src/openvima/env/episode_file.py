@@ -110,6 +110,7 @@ def load_episode(path: str | Path, *, assets: str | Path | Assets = "procedural"
     Raises:
         InputFileError: The file cannot be read, or holds no valid episode; the message names the field.
         SceneError, UnknownObjectError, UnknownTextureError: The scene is not possible.
+        ConfigError: The seed of the episode is not allowed, or a function for the assets fails.
     """
     path = Path(path)
     read = read_json if _checked_suffix(path) == ".json" else read_yaml
@@ -134,7 +135,8 @@ def episode_from_values(
         folder: Folder of PNG files; None: there may be none.
 
     Raises:
-        InputFileError, SceneError, UnknownObjectError, UnknownTextureError: As for `load_episode`.
+        InputFileError, SceneError, UnknownObjectError, UnknownTextureError, ConfigError: As for
+            `load_episode`.
     """
     if not isinstance(values, Mapping):
         raise InputFileError(f"an episode is {shown(values)}; it must be a mapping.")

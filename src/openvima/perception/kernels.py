@@ -1,6 +1,6 @@
 """Numba kernels of perception: extents of objects, area-resized crops, most interior points.
 
-Only loops over arrays that the caller prepared; `perception.py` checks shapes and owns the documentation.
+Only loops over arrays that the caller prepared; `objects.py` checks shapes and owns the documentation.
 """
 
 import numpy as np
@@ -66,7 +66,7 @@ def halve_frame(frame, half):
 def resize_square(square, size, scratch, crop):
     """Resize `square[:, :size, :size]` to `crop` (3, 32, 32) uint8 as OpenCV's area interpolation does.
 
-    `scratch` is float64 of shape (32, 256) at least.
+    `scratch` is float64 of shape (32, size) at least.
     """
     if size == CROP_SIZE:
         for channel in range(3):
