@@ -1,5 +1,6 @@
 """Assets by the function that makes them; records name it and never run it."""
 
+import contextlib
 import os
 import pickle
 import subprocess
@@ -11,14 +12,17 @@ import pytest
 
 from openvima.catalog import Pool, load_assets, registration, user_assets
 from openvima.catalog.user_assets import recorded_assets
+from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate, rerender
 from openvima.data.verification import VerifyConfig, replay, verify
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import AssetError, ConfigError, UnknownObjectError
 from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.evaluation.config import plan
 from openvima.evaluation.verification import verify_results
 from openvima.scene import AtPose, ObjectImage, Pose, Problem, Prompt, Tolerance
-from openvima.tasks import TableSampler, register_task, registry
+from openvima.tasks import TableSampler, register_task, registry, sample_episode
+from openvima.tasks.sampling import check_task_options, has_text_form
 
 FILE = Path(__file__).parents[1] / "user_shapes.py"
 BAR = f"{FILE}:bar"
@@ -50,10 +54,10 @@ def register_bar_task() -> None:
     pools = {"train": Pool(("test bar",), (), ("test gradient",), ())}
 
     @register_task("move_bar", family="own", template="Move {it}.", oracle_max_steps=1, pools=pools)
-    def sample(table: TableSampler) -> Problem:
+    def sample(table: TableSampler, *, goal_y: float = 0.3) -> Problem:
         draw = lambda: ("test bar", "test gradient")  # noqa: E731
         bar = table.place_one("bar", draw, reject=lambda p: p.pose.y > 0)
-        goal = AtPose(bar.id, Pose.planar(0.5, 0.3), Tolerance(0.05))
+        goal = AtPose(bar.id, Pose.planar(0.5, goal_y), Tolerance(0.05))
         return Problem(table.scene(), Prompt.parse("Move {it}.", it=ObjectImage(bar)), (goal,))
 
 
@@ -115,6 +119,48 @@ def test_demonstrations_of_own_assets_are_read_drawn_anew_and_replayed(
         GenerateConfig.from_record(tmp_path, {**config.record()})
     assert "test bar" not in registration.REGISTERED_OBJECTS
     assert verify(folder, VerifyConfig(assets=BAR)).is_clean
+
+
+def test_the_first_episode_has_the_pool_of_all_others(tmp_path: Path) -> None:
+    file = tmp_path / "toys.py"
+    file.write_text(
+        "from openvima.catalog import register_object\n"
+        "from user_shapes import CORNERS, TRIANGLES\n\n"
+        "def toys():\n"
+        "    mesh, size = (CORNERS, TRIANGLES), (0.12, 0.08, 0.04)\n"
+        "    register_object('test toy', mesh, size=size, tasks=('choose',))\n",
+        encoding="utf-8",
+    )
+    pools = []
+
+    @register_task(
+        "choose",
+        family="own",
+        template="Move {it}.",
+        oracle_max_steps=1,
+        pools={"train": Pool(("heart",), (), ("red",), ())},
+    )
+    def sample(table: TableSampler) -> Problem:
+        pools.append(table.pool.dragged_objects)
+        return registry.task_spec("rotate").sample(table)
+
+    with contextlib.suppress(ConfigError):  # the objects do not suit that task
+        sample_episode("choose", seed=0, assets=f"{file}:toys")
+    assert pools == [("heart", "test toy")]
+
+
+def test_runs_check_text_forms_and_options_with_the_assets_of_the_run(tmp_path: Path) -> None:
+    register_bar_task()
+    has_text_form.cache_clear()
+    check_task_options.cache_clear()
+    env_config = EnvConfig(assets=BAR, prompts="text", task_options="goal_y=0.2")
+    config = EvaluationConfig(("oracle",), ("move_bar",), ("train",), 1, env_config=env_config)
+    assert [batch.task for batch in plan(config)] == ["move_bar"]
+    forget()
+    check_task_options.cache_clear()
+    video = tmp_path / "bar.mp4"
+    words = ["--policy", "oracle", "--assets", BAR, "--task-options", "goal_y=0.2", "--out", str(video)]
+    assert main(["demo", "move_bar", *words]) == 0 and video.is_file()
 
 
 def test_an_object_that_is_not_registered_is_named_with_the_remedy() -> None:

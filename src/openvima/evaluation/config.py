@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from openvima.brief import brief_repr
-from openvima.catalog.packs import ASSET_PACKS
+from openvima.catalog.packs import ASSET_PACKS, load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
@@ -326,6 +326,8 @@ def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]
     for level in config.levels:
         if level not in LEVELS:
             raise LevelError(unknown_name("level", level, LEVELS))
+    if is_code(config.env_config.assets):
+        load_assets(config.env_config.assets)  # registers objects of the tasks that are sampled below
     prompts = config.env_config.prompts
     if "all" in config.tasks:
         known = IN_CONTEXT_TASKS if config.uses(IN_CONTEXT) else list_tasks()

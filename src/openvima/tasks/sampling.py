@@ -62,8 +62,9 @@ def sample_episode(
     spec = task_spec(task)
     level, number = spec.checked_level(level), checked_seed(seed)
     _check_options(spec, options)
+    pack = load_assets(assets)  # may register objects of the pool and of the text form
     check_text_form(task, prompts)
-    pool, pack = spec.pool(level), load_assets(assets)
+    pool = spec.pool(level)
     reason = SamplingError()
     for attempt in range(MAX_REDRAWS + 1):
         rng = make_rng(domain, task, level, number, "scene", attempt=attempt)
