@@ -2,6 +2,7 @@
 
 import functools
 import os
+import pickle
 import select
 import signal
 import subprocess
@@ -149,6 +150,16 @@ def test_a_call_at_the_wrong_time_is_refused_and_changes_nothing() -> None:
     with pytest.raises(gymnasium.error.AlreadyPendingCallError):
         envs.step_async(IDLE)
     assert envs.step_wait()[4]["num_steps"].tolist() == [1, 1]
+    envs.close()
+
+
+@pytest.mark.slow
+def test_an_argument_that_cannot_be_sent_is_refused_and_changes_nothing() -> None:
+    envs = build()
+    envs.reset(seed=0)
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        envs.call("prepare", lambda: 0)
+    assert envs.get_attr("step_s") == (0.0, 0.0)
     envs.close()
 
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.reduction import ForkingPickler
 from typing import Any  # actions, observations and infos are nested dictionaries
 
 import gymnasium
@@ -139,11 +140,7 @@ class AsyncTabletopEnvs(VectorEnv):
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """Wait for the results, for `timeout` seconds at most."""
-        results = [result for answer in self._wait("call", timeout) for result in answer]
-        for result in results:
-            if isinstance(result, _Failure):
-                raise result.error
-        return tuple(results)
+        return self._results("call", timeout)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return an attribute of every sub-environment."""
@@ -155,7 +152,7 @@ class AsyncTabletopEnvs(VectorEnv):
         if len(values) != self.num_envs:
             raise ValueError(f"got {len(values)} values for {self.num_envs} sub-environments; give one each.")
         self._send("set_attr", [(name, values[part]) for part in self._parts])
-        self._wait("set_attr", None)
+        self._results("set_attr", None)
 
     def render(self) -> tuple[Any, ...]:
         """Return the picture of every sub-environment."""
@@ -185,9 +182,11 @@ class AsyncTabletopEnvs(VectorEnv):
             raise ClosedEnvironmentError("the environments are closed; make new ones.")
         if self._pending:
             raise AlreadyPendingCallError(f"call `{self._pending}_wait` before `{name}`.", self._pending)
+        # Before anything is sent: what cannot be pickled is the caller's and harms no worker.
+        messages = [ForkingPickler.dumps((name, given)) for given in arguments]
         with self._close_on_error():
-            for pipe, given in zip(self._pipes, arguments, strict=True):
-                pipe.send((name, given))
+            for pipe, message in zip(self._pipes, messages, strict=True):
+                pipe.send_bytes(message)
         self._pending = name
 
     def _wait(self, name: str, timeout_s: float | None) -> list[Any]:
@@ -199,6 +198,14 @@ class AsyncTabletopEnvs(VectorEnv):
             answers = self._receive(timeout_s)
         self._pending = None
         return answers
+
+    def _results(self, name: str, timeout_s: float | None) -> tuple[Any, ...]:
+        """Return the result of every sub-environment; raise the first exception among them."""
+        results = [result for answer in self._wait(name, timeout_s) for result in answer]
+        for result in results:
+            if isinstance(result, _Failure):
+                raise result.error
+        return tuple(results)
 
     def _receive(self, timeout_s: float | None) -> list[Any]:
         """Return the answers of all workers; raise the first exception among them."""
@@ -340,10 +347,10 @@ class _Worker:
         """Return results, or what was raised instead."""
         return [env.attempt(name, args, kwargs) for env in self._numbered]
 
-    def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """Set an attribute."""
-        for env, value in zip(self._numbered, values, strict=True):
-            env.set_wrapper_attr(name, value)
+    def set_attr(self, name: str, values: Sequence[Any]) -> list[Any]:
+        """Set an attribute; return what was raised, if anything."""
+        pairs = zip(self._numbered, values, strict=True)
+        return [env.attempt("set_wrapper_attr", (name, value), {}) for env, value in pairs]
 
     def close(self) -> None:
         """Close them."""
