@@ -70,7 +70,8 @@ def test_joints_are_where_the_path_of_the_last_step_ended() -> None:
 
 
 @pytest.mark.parametrize(
-    ("modalities", "complaint"), [(("rgb", "depht"), "depth"), ("lidar", "lidar"), ((), "empty")]
+    ("modalities", "complaint"),
+    [(("rgb", "depht"), "depth"), ("lidar", "lidar"), ((), "empty"), (None, "modalities is None")],
 )
 def test_other_modalities_are_refused(modalities, complaint) -> None:
     with pytest.raises(ConfigError, match=complaint):

@@ -200,6 +200,11 @@ def wrong(**changes: object) -> dict[str, object]:
         (np.zeros(12, np.float32), "a mapping with keys .* not ndarray"),
         (None, "not NoneType"),
         (3, "not int"),
+        pytest.param(
+            Action(("a", 0.1), (0.5, 0)),
+            r"is Action\(.*'a'.*its values must be numbers",
+            id="text as numbers",
+        ),
     ],
 )
 def test_an_action_that_does_not_fit_changes_nothing(action: object, message: str) -> None:
@@ -268,6 +273,10 @@ def test_a_given_episode_is_loaded(rotate: TabletopEnv) -> None:
 def test_unknown_reset_options_are_refused(rotate: TabletopEnv) -> None:
     with pytest.raises(ConfigError, match="no option sede"):
         rotate.reset(options={"sede": 1})
+    with pytest.raises(ConfigError, match="no option 1, sede"):
+        rotate.reset(options={"sede": 1, 1: 2})
+    with pytest.raises(ConfigError, match="options is a int; give None or a mapping with 'episode'"):
+        rotate.reset(options=5)
     with pytest.raises(ConfigError, match="give an Episode"):
         rotate.reset(options={"episode": 3})
 

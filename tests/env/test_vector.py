@@ -10,8 +10,19 @@ from gymnasium.vector.utils import iterate
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import openvima
+from faulty_environments import Faulty
 from openvima.env import TabletopEnv, stack_actions
-from openvima.errors import ActionError, ConfigError, EpisodeError, LevelError, OracleError, UnknownTaskError
+from openvima.env.action_validation import ActionValidator
+from openvima.env.vector import SyncTabletopEnvs
+from openvima.errors import (
+    ActionError,
+    ConfigError,
+    EpisodeError,
+    LevelError,
+    OracleError,
+    SamplingError,
+    UnknownTaskError,
+)
 from openvima.policies import RandomPolicy
 from openvima.scene import Action
 
@@ -141,6 +152,9 @@ def test_a_batch_with_a_bad_action_moves_nothing_anywhere(
         ({"seed": -1}, "seed is -1"),
         ({"seed": [1, 2.5]}, "seed is 2.5"),
         ({"seed": [1, 2, 3]}, "3 seeds for 2 sub-environments"),
+        ({"seed": 2**63 - 1}, "seed is 9223372036854775808"),
+        ({"options": 5}, "options is a int; give None or a mapping with 'reset_mask'"),
+        ({"options": {1: 2, "mask": [True]}}, "no option 1, mask"),
         ({"options": {"mask": [True]}}, "no option mask"),
         ({"options": {"reset_mask": np.zeros(2, bool)}}, "at least one True"),
         ({"options": {"reset_mask": [True, False]}}, "dtype bool"),
@@ -160,6 +174,8 @@ def test_an_error_in_a_call_does_no_harm(pair: VectorEnv) -> None:
         pair.call("oracle_decision")
     with pytest.raises(AttributeError, match="scenery"):
         pair.get_attr("scenery")
+    with pytest.raises(ConfigError, match="no modality 'sound'"):
+        pair.set_attr("modalities", "sound")
     assert pair.reset(seed=np.int64(5))[1]["seed"].tolist() == [5, 6]
 
 
@@ -173,6 +189,16 @@ def test_prompts_and_observations_feed_a_policy(pair: VectorEnv) -> None:
     policy.reset([single.prompt])
     assert frozen(actions[1]) == frozen(policy.act([observation])[0])
     pair.step(stack_actions(actions))
+
+
+def test_after_a_reset_that_failed_no_step_moves_anything() -> None:
+    mode = AutoresetMode.NEXT_STEP
+    envs = SyncTabletopEnvs([Faulty, Faulty], ActionValidator(2, mode), mode)
+    envs.reset(seed=[1, 2])
+    with pytest.raises(SamplingError):
+        envs.reset(seed=[3, 13])
+    with pytest.raises(EpisodeError, match=r"0, 1 have no running episode; call reset\(\)"):
+        envs.step(stack_actions([None, None]))
 
 
 def test_a_missing_action_becomes_an_idle_one() -> None:
@@ -340,6 +366,12 @@ def test_what_cannot_be_built_is_refused_at_once(num_workers: int) -> None:
         build("rotate", 0)
     with pytest.raises(ConfigError, match="autoreset mode 'Never'"):
         build("rotate", 1, autoreset_mode="Never")
+    with pytest.raises(ConfigError, match="tasks is 5; give a name, or a list"):
+        build(5)
+    with pytest.raises(ConfigError, match="an entry of tasks is 5; give a name, or a mapping with 'task'"):
+        build([5])
+    with pytest.raises(ConfigError, match="seeds is 5; give a list of integers"):
+        build("rotate", 1, seeds=5)
 
 
 @pytest.mark.parametrize("num_workers", [-1, 3, True, 1.0])

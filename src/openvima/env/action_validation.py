@@ -51,16 +51,16 @@ class ActionValidator:
         elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
             seeds = [None if entry is None else checked_seed(entry) for entry in seed]
         else:
-            seeds = [checked_seed(seed) + index for index in range(self.num_envs)]
+            seeds = [checked_seed(checked_seed(seed) + index) for index in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ConfigError(f"got {len(seeds)} seeds for {self.num_envs} sub-environments; give one each.")
-        unknown = set(options or ()) - {RESET_MASK}
-        if unknown:
-            names = ", ".join(map(str, sorted(unknown, key=str)))
-            raise ConfigError(f"reset has no option {names} here; it takes '{RESET_MASK}'.")
-        mask = (options or {}).get(RESET_MASK)
+        mask = reset_option(options, RESET_MASK)
         self._reset_mask = np.ones(self.num_envs, dtype=bool) if mask is None else _checked_mask(mask, seeds)
         return seeds
+
+    def begin_reset(self) -> None:
+        """Record that the reset checked last begins; should it fail, some episodes are gone."""
+        self._needs_reset |= self._reset_mask
 
     def record_reset(self) -> None:
         """Record that the reset checked last was executed."""
@@ -96,6 +96,23 @@ class ActionValidator:
         """Record which episodes ended in a step, shape (num_envs,), bool."""
         if self._waits_for_reset:
             self._needs_reset = np.array(is_over)
+
+
+def reset_option(options: object, name: str) -> Any:
+    """Return the one option that a reset takes, or None.
+
+    Args:
+        options: None, or a mapping with the option or nothing.
+        name: The option.
+
+    Raises:
+        ConfigError: The options are no mapping, or there is another one.
+    """
+    if not isinstance(options, Mapping | None):
+        raise ConfigError(f"options is a {type(options).__name__}; give None or a mapping with {name!r}.")
+    if unknown := set(options or ()) - {name}:
+        raise ConfigError(f"reset has no option {', '.join(sorted(map(str, unknown)))}; it takes {name!r}.")
+    return (options or {}).get(name)
 
 
 def stack_actions(actions: Sequence[Mapping[str, Any] | Action | None]) -> dict[str, np.ndarray]:

@@ -14,6 +14,7 @@ from gymnasium import spaces
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
+from openvima.env.action_validation import reset_option
 from openvima.env.episode_file import episode_from_values, load_episode
 from openvima.env.object_names import ObjectNames
 from openvima.env.running_episode import (
@@ -394,6 +395,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
 
     @modalities.setter
     def modalities(self, names: Iterable[str]) -> None:
+        if not isinstance(names, Iterable):
+            raise ConfigError(f"modalities is {names!r}; give a list of {', '.join(MODALITIES)}.")
         names = (names,) if isinstance(names, str) else tuple(names)
         for name in names:
             if name not in MODALITIES:
@@ -566,11 +569,8 @@ def _draw_seed(rng: np.random.Generator) -> int:
     return int(rng.integers(_LARGEST_SEED))
 
 
-def _episode_option(options: Mapping[str, Any] | None, assets: Assets) -> Episode | None:
-    unknown = set(options or ()) - {"episode"}
-    if unknown:
-        raise ConfigError(f"reset has no option {', '.join(sorted(unknown))}; it takes 'episode'.")
-    episode = (options or {}).get("episode")
+def _episode_option(options: object, assets: Assets) -> Episode | None:
+    episode = reset_option(options, "episode")
     if isinstance(episode, str | Path):
         return load_episode(episode, assets=assets)
     if isinstance(episode, Mapping):

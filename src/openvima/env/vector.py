@@ -18,7 +18,7 @@ from openvima.env.registration import make
 from openvima.env.sub_environments import SubEnvironments, batch_infos
 from openvima.env.tabletop import TabletopEnv
 from openvima.env.workers import AsyncTabletopEnvs
-from openvima.errors import ConfigError, OpenVimaError, unknown_name
+from openvima.errors import ConfigError, OpenVimaError, echo, unknown_name
 from openvima.tasks.seeding import checked_seed
 
 
@@ -61,6 +61,8 @@ def make_vec(
         >>> observations["rgb"]["front"].shape
         (4, 3, 128, 256)
     """
+    if not isinstance(tasks, Iterable):
+        raise ConfigError(f"tasks is {echo(repr(tasks))}; give a name, or a list of names or mappings.")
     choices = [tasks] if isinstance(tasks, str) else list(tasks)
     num_envs = len(choices) if num_envs is None else num_envs
     if not choices or isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
@@ -113,6 +115,7 @@ class SyncTabletopEnvs(SyncVectorEnv):
             SamplingError: A task finds no start for its seed.
         """
         seeds = self._validator.check_reset(seed, options)
+        self._validator.begin_reset()
         infos = self._played.reset(seeds, (options or {}).get(RESET_MASK))
         self._validator.record_reset()
         return copy.deepcopy(self._observations), batch_infos(infos)
@@ -188,8 +191,8 @@ class FixedSeeds(gymnasium.Wrapper):
 def _env_factory(
     choice: str | Mapping[str, Any], options: Mapping[str, Any], seeds: tuple[int, ...]
 ) -> EnvFactory:
-    own = {"task": choice} if isinstance(choice, str) else dict(choice)
-    if "task" not in own:
+    own = {"task": choice} if isinstance(choice, str) else choice
+    if not isinstance(own, Mapping) or "task" not in own:
         raise ConfigError(f"an entry of tasks is {own}; give a name, or a mapping with 'task' and options.")
     return EnvFactory({**options, **own}, seeds)
 
@@ -223,6 +226,8 @@ def _split_seeds(seeds: Iterable[int] | None, num_envs: int) -> list[tuple[int, 
     """Distribute the seeds over the sub-environments, round robin."""
     if seeds is None:
         return [()] * num_envs
+    if not isinstance(seeds, Iterable):
+        raise ConfigError(f"seeds is {echo(repr(seeds))}; give a list of integers, or None.")
     numbers = tuple(checked_seed(seed) for seed in seeds)
     if len(numbers) < num_envs:
         raise ConfigError(
