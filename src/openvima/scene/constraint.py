@@ -35,7 +35,11 @@ class StepContext:
 
 
 class StepConstraint(Protocol):
-    """A constraint that depends on the goals and their progress; tested after every step."""
+    """A constraint that depends on the goals and their progress; tested after every step.
+
+    One that holds object ids needs `renumbered(new_of)`, which returns the same constraint for other ids:
+    sampling permutes ids, and the context has the new ones.
+    """
 
     def violation(self, context: StepContext, /) -> str:
         """Return one sentence on how the step violates the constraint, or an empty string."""

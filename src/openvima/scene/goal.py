@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeAlias, TypeGuard
+from typing import Protocol, TypeAlias, TypeGuard, TypeVar
 
 from openvima.scene.pose import Pose, angle_difference, rotate
 from openvima.scene.scene import Scene
@@ -24,7 +24,7 @@ class Condition(Protocol):
     | `renumbered(new_of)` | the same condition for other object ids, which `new_of` maps from old to new |
 
     Sampling permutes the ids of a problem's objects. A condition without `renumbered` goes on seeing the ids
-    with which it was made.
+    with which it was made; a `StepConstraint` does not.
     """
 
     def is_met(self, scene: Scene, /) -> bool:
@@ -140,8 +140,7 @@ class AtPose:
 
     def renumbered(self, new_of: Mapping[int, int]) -> "AtPose":
         """Return the goal for other object ids."""
-        relative_to = None if self.relative_to is None else new_of[self.relative_to]
-        return replace(self, object_id=new_of[self.object_id], relative_to=relative_to)
+        return _renumbered(self, new_of)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,12 +172,17 @@ class InZone:
 
     def renumbered(self, new_of: Mapping[int, int]) -> "InZone":
         """Return the goal for other object ids."""
-        relative_to = None if self.relative_to is None else new_of[self.relative_to]
-        return replace(self, object_id=new_of[self.object_id], relative_to=relative_to)
+        return _renumbered(self, new_of)
 
 
 OracleMove: TypeAlias = AtPose | InZone
 """Goals that the oracle pursues: by pick and place, and by sweeps."""
+_Move = TypeVar("_Move", AtPose, InZone)
+
+
+def _renumbered(goal: _Move, new_of: Mapping[int, int]) -> _Move:
+    relative_to = None if goal.relative_to is None else new_of[goal.relative_to]
+    return replace(goal, object_id=new_of[goal.object_id], relative_to=relative_to)
 
 
 def is_condition(value: object) -> TypeGuard[Condition]:
