@@ -73,3 +73,26 @@ def test_without_the_policy_the_recorded_actions_remain(evaluation: Path, tmp_pa
     (copy / "actions.arrow").unlink()
     with pytest.raises(PolicyError, match="kept no actions"):
         evaluated_episode(copy, "random", "rotate", "L1", 60).recorded_policy()
+
+
+def test_no_code_that_results_name_runs_unless_it_is_trusted(
+    evaluation: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evil.py").write_text("raise SystemExit('it ran')")
+    results = Results.read(evaluation)
+    for key in ("bundled", "preset"):
+        for name in ("evil.py:make", "openvima-huge"):
+            named = replace(results, policies={"random": {"kind": "run", key: name}})
+            assert find_source(tmp_path, named, "random") is None
+    nano = replace(results, policies={"random": {"kind": "untrained", "preset": "nano"}})
+    assert find_source(tmp_path, nano, "random") == "nano"
+    found = evaluated_episode(evaluation, "random", "rotate", "L1", 60)
+    with pytest.raises(PolicyError, match=r"'evil\.py:boxes'.*--trust-code"):
+        replace(found, batch=replace(found.batch, boxes="evil.py:boxes")).load_policy()
+
+
+def test_episodes_at_once_share_no_policy(evaluation: Path) -> None:
+    found = evaluated_episode(evaluation, "random", "rotate", "L1", 60)
+    first, second = (getattr(found.load_policy(), "_policy") for _ in range(2))  # noqa: B009
+    assert first is not second

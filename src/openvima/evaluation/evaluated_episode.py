@@ -15,9 +15,12 @@ from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
 from openvima.evaluation.sources import PolicySource, weights_hash
 from openvima.evaluation.verification import recorded_env_config
+from openvima.policies.bundled import BUNDLED
 from openvima.policies.file_names import CHECKPOINTS_FOLDER
+from openvima.policies.presets import PRESETS
 from openvima.scene import Episode
 from openvima.scene.command import PRIMITIVES
+from openvima.user_code import is_code
 
 _SEED_DOMAIN = "eval"
 
@@ -49,10 +52,10 @@ class EvaluatedEpisode:
         return batch.env_config.sample(batch.task, batch.level, batch.first_seed, domain=_SEED_DOMAIN)
 
     def load_policy(self) -> RolloutPolicy:
-        """Load the policy, with its input ablation, detector and precision.
+        """Load the policy, with its input ablation, detector and precision; no other episode shares it.
 
         Raises:
-            PolicyError: Nobody knows where the policy is.
+            PolicyError: Nobody knows where the policy is, or the detector is code, which is not trusted.
             UnknownPolicyError, CheckpointError, ServerError: As for `load_rollout_policy`.
         """
         if not self.batch.source:
@@ -60,8 +63,13 @@ class EvaluatedEpisode:
                 f"no folder near the results has the weights of {self.batch.policy!r}; name its run folder. "
                 "The recorded actions can be played without."
             )
+        if is_code(self.batch.boxes) and not self.batch.trust_code:
+            raise PolicyError(
+                f"the results name code as their detector, boxes {echo(repr(self.batch.boxes))}; if you "
+                "trust it, allow it with --trust-code. The recorded actions can be played without."
+            )
         PolicySource(self.batch.policy, self.batch.source, self.batch.trust_code).check()
-        return load_rollout_policy(self.batch)
+        return load_rollout_policy(self.batch, own=True)
 
     def recorded_policy(self) -> RolloutPolicy:
         """Return what repeats the recorded actions, without the policy.
@@ -158,9 +166,12 @@ def find_source(folder: Path, results: Results, policy: str) -> str | None:
         As for `openvima evaluate --policy`; None if it is not found.
     """
     what = results.policies.get(policy, {})
-    for key in ("bundled", "preset"):
-        if isinstance(what.get(key), str):
-            return what[key]
+    for key, known in (("bundled", BUNDLED), ("preset", PRESETS)):
+        named = what.get(key)
+        if isinstance(named, str) and named in known:  # any other name could be that of code, which would run
+            return named
+    if "preset" in what:  # of another version
+        return None
     kind, sha256 = what.get("kind"), what.get("sha256")
     if kind in ("oracle", "random", "untrained"):
         return str(kind)

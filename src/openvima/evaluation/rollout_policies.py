@@ -26,6 +26,7 @@ from openvima.serving.protocol import is_remote
 from openvima.user_code import described
 
 _MAX_SEEDS = 16  # that an error lists
+_PLACE_KINDS = ("in view", "first step", "prompt", "grid")  # of a `PlaceProbability`
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
 Explainer = Callable[[], Sequence[Explanation | None]]  # see `openvima.policies.Policy`
 Decision = Mapping[str, Any] | Action | np.ndarray | ToolCommand | OracleError | None
@@ -186,6 +187,8 @@ class PromptedRolloutPolicy:
                     f"explain() of {self._name} returned {echo(repr(found))}; give a list of an Explanation "
                     "or None for each episode, see docs/explain.md."
                 )
+            for fault in (fault for each in found if each is not None for fault in _faults_in(each)):
+                raise PolicyError(f"explain() of {self._name} returned {fault}; see docs/explain.md.")
             return list(found)
 
         return checked
@@ -195,13 +198,14 @@ class PromptedRolloutPolicy:
         return getattr(self._policy, "near_ties", ())
 
 
-def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
+def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = False) -> RolloutPolicy:
     """Load the policy of a batch of episodes.
 
     Args:
         batch: The episodes.
         fingerprint: Text that stands for the policy's weights; a policy that was loaded before is used again
             only if it is the same.
+        own: Load a policy that nobody else has a reference to, for several that play at once.
 
     Raises:
         UnknownPolicyError: There is no such policy or run folder.
@@ -211,8 +215,14 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
     """
     if batch.source == ORACLE:
         return OracleRolloutPolicy()
-    policy = _load_policy(
-        batch.source, fingerprint, batch.device, batch.precision, batch.boxes, batch.trust_code
+    options: dict[str, Any] = {  # Any: of several kinds
+        "device": batch.device,
+        "precision": batch.precision,
+        "boxes": batch.boxes,
+        "trust_code": batch.trust_code,
+    }
+    policy = (
+        _build_policy(batch.source, **options) if own else _load_policy(batch.source, fingerprint, **options)
     )
     return PromptedRolloutPolicy(policy, batch.ablation, name=batch.policy)
 
@@ -273,26 +283,40 @@ def load_own_rollout_policy(
 
 @lru_cache(maxsize=1)
 def _load_policy(
-    source: str, fingerprint: str, device: str, precision: str, boxes: str, trust_code: bool
-) -> Any:  # Any: see `PromptedRolloutPolicy`
+    source: str, fingerprint: str, **options: Any
+) -> Any:  # Any: see `PromptedRolloutPolicy`; options of several kinds
     if is_remote(source):
         _load_policy.cache_clear()  # ends the connection before: a server may let in one client only
-    options: dict[str, Any] = {}  # Any: of several kinds
-    if precision:
-        import torch
-
-        options["dtype"] = getattr(torch, precision)
-    return _build_policy(source, device=device, boxes=boxes, trust_code=trust_code, **options)
+    return _build_policy(source, **options)
 
 
-def _build_policy(source: str, *, boxes: str, **options: Any) -> Any:  # Any: see `PromptedRolloutPolicy`
+def _build_policy(
+    source: str, *, boxes: str, precision: str = "", **options: Any
+) -> Any:  # Any: as for `_load_policy`
     from openvima.policies import load_policy
 
     if is_remote(source):
         return RemotePolicy(source)
+    if precision:
+        import torch
+
+        options["dtype"] = getattr(torch, precision)
     if boxes:
         options["extractor"] = plugged_extractor(boxes)
     return load_policy(source, **options)
+
+
+def _faults_in(explanation: Explanation) -> Iterator[str]:
+    """Name what could not be drawn."""
+    for kind, weights in explanation.attention.items():
+        if len(weights) != len(explanation.prompt):
+            yield (
+                f"{len(weights)} weights of attention {echo(repr(kind))} to a prompt of "
+                f"{len(explanation.prompt)} parts"
+            )
+    for place in explanation.places:
+        if place.kind not in _PLACE_KINDS:
+            yield f"a place of kind {echo(repr(place.kind))}; allowed: {', '.join(_PLACE_KINDS)}"
 
 
 def _episodes(envs: Sequence[TabletopEnv]) -> str:
