@@ -316,6 +316,32 @@ def test_records_without_anything_that_says_what_they_are_stay_where_they_are(me
     assert contents(merged) == before
 
 
+def test_records_without_anything_to_compare_them_with_are_not_deleted(merged: Path) -> None:
+    path = merged / STACK
+    blank(path, 16, 500)
+    blank(path, path.stat().st_size - 200, 200)
+    (merged / "index.parquet").unlink()
+    before = contents(merged)
+    with pytest.raises(ShardError, match=rf"{STACK} has 3 whole records"):
+        repair(merged, NO_REPLAY)
+    assert contents(merged) == before
+
+
+@pytest.mark.parametrize("assets", ["procedural", "nowhere"])  # the task is not there, or the assets are not
+def test_records_without_images_that_cannot_be_rendered_are_not_deleted(
+    tmp_path: Path, made_up: MadeUp, info: ShardInfo, assets: str
+) -> None:
+    bare = dataclasses.replace(info, images=False, assets=assets)
+    demos = [made_up(seed, num_steps=1, num_images=1) for seed in range(2)]
+    path = write_folder(tmp_path, bare, [demos]) / STACK
+    blank(path, path.stat().st_size - 200, 200)
+    (tmp_path / "index.parquet").unlink()
+    before = contents(tmp_path)
+    with pytest.raises(ShardError, match=rf"{STACK}: without an index, its records cannot be compared"):
+        repair(tmp_path, NO_REPLAY)
+    assert contents(tmp_path) == before
+
+
 def test_cache_files_that_differ_from_the_demonstrations_are_found_and_deleted(
     folder: Path, capsys: pytest.CaptureFixture
 ) -> None:

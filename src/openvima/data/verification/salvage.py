@@ -30,13 +30,17 @@ def rewrite(path: Path, spans: list[Span] | None) -> set[str]:
         Content hashes of the records that were kept.
 
     Raises:
-        ShardError: There are whole records, but schema and footer are damaged.
+        ShardError: There are whole records, but schema and footer are damaged; or there is neither an index
+            nor an image, and the images that belong to the content hashes cannot be rendered.
     """
     if not path.is_file():
         return set()
     content = mapped(path) if path.stat().st_size else memoryview(b"")
     info = _info(path, content)
-    batches = list(_whole_records(content, info, spans))
+    try:
+        batches = list(_whole_records(content, info, spans))
+    except ShardError as error:
+        raise ShardError(f"{path}: {error}") from error
     if not batches:
         path.unlink()
     elif info is None:
@@ -85,6 +89,8 @@ def _whole_records(
             batch.validate(full=True)
             if known is None and not _has_own_hash(batch, info):
                 continue
+        except ShardError:
+            raise
         except (EOFError, *ODD_ERRORS):
             continue
         end = position + num_bytes
@@ -92,11 +98,26 @@ def _whole_records(
 
 
 def _has_own_hash(batch: pa.RecordBatch, info: ShardInfo | None) -> bool:
-    if info is None or batch.num_rows != 1:
+    """Whether a record is as it was written, as far as that can be known.
+
+    Raises:
+        ShardError: The record has no images, and they cannot be rendered as they were.
+    """
+    if batch.num_rows != 1:
         return False
+    if info is None:
+        return True  # `rewrite` refuses the shard: a record that cannot be compared is not deleted
     stored = batch.column("content_hash")[0].as_py()
     try:
         demo = decode(batch, info)
-        return (demo if info.images else rerendered(demo, info, stored)).content_hash() == stored
+        if info.images:
+            return demo.content_hash() == stored
     except OpenVimaError:
         return False
+    try:
+        return rerendered(demo, info, stored).content_hash() == stored
+    except OpenVimaError as error:  # which may lie with the renderer or the assets, not with the record
+        raise ShardError(
+            f"without an index, its records cannot be compared: {error} Restore index.parquet from a copy, "
+            "or repair with the versions and assets that wrote the records; none was deleted."
+        ) from error
