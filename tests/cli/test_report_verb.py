@@ -5,7 +5,9 @@ import json
 import pytest
 
 from openvima.cli.main import main
+from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.verification import verify_results
 
 
 def evaluation(solved: int) -> Results:
@@ -51,6 +53,18 @@ def test_tables_go_to_stdout_and_no_page_is_written(folders, capsys):
 def test_the_ending_of_the_file_decides_what_is_written(folders, name, sign):
     assert main(["report", "first", "--out", f"paper/{name}"]) == 0
     assert sign in (folders / "paper" / name).read_text(encoding="utf-8")
+
+
+def test_another_file_of_a_confirmed_folder_is_not_called_confirmed(tmp_path, capsys):
+    evaluate(EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=1, out=tmp_path))
+    verify_results(tmp_path)
+    text = (tmp_path / "results.json").read_text()
+    (tmp_path / "best.json").write_text(text.replace('"steps": 1', '"steps": 2'))
+    shown = {}
+    for name in ("results.json", "best.json"):
+        assert main(["report", str(tmp_path / name), "--markdown"]) == 0
+        shown[name] = "outcomes are confirmed by replay" in capsys.readouterr().out
+    assert shown == {"results.json": True, "best.json": False}
 
 
 def test_comparisons_are_printed_as_json(folders, capsys):

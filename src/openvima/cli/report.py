@@ -138,7 +138,7 @@ def _confirmations(evaluations: dict[Path, "Results"]) -> list["Confirmation"]:
     # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
     labels = run_labels([_folder(path) for path in evaluations]) if len(evaluations) > 1 else ["DIR"]
     return [
-        Confirmation.of(results, label, confirmed=is_marked_verified(_folder(path)))
+        Confirmation.of(results, label, confirmed=is_marked_verified(path))
         for label, (path, results) in zip(labels, evaluations.items(), strict=True)
     ]
 

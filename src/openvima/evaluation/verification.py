@@ -114,14 +114,18 @@ def verify_results(
     return found
 
 
-def is_marked_verified(folder: Path) -> bool:
-    """Whether `verify_results` has confirmed the results and actions that are in a folder now.
+def is_marked_verified(path: Path) -> bool:
+    """Whether `verify_results` has confirmed these results, with the actions that are beside them now.
 
     The mark of a folder that came from elsewhere is a claim.
+
+    Args:
+        path: Results, or the folder of an evaluation, which stands for its `results.json`.
     """
+    folder = path if path.is_dir() else path.parent
     try:
         mark = read_json(folder / VERIFICATION_NAME)["sha256"]
-        file = ResultsFile.read(folder / FILE_NAME)
+        file = ResultsFile.read(path)
         if mark != file.sha256 or next(_text_problems(file), None):
             return False
         return read_actions(folder, file.results.rows)[1] == file.results.actions_sha256

@@ -122,7 +122,7 @@ def policy_card(
         "tags": TAGS,
         **({} if scores is None else {"model-index": [_model_index(target, scores)]}),
     }
-    confirmed = file is not None and is_marked_verified(file.parent)
+    confirmed = file is not None and is_marked_verified(file)
     parts = [
         front_matter(metadata),
         f"# {target.repo.partition('/')[2]}\n",
