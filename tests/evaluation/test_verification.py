@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from forge_results import KINDS, forge, is_found
@@ -78,6 +79,15 @@ def test_the_mark_belongs_to_the_results_that_were_confirmed(copy):
     assert not is_marked_verified(copy)
 
 
+def test_the_mark_is_of_no_other_file_of_the_folder(copy):
+    verify_results(copy)
+    text = (copy / "results.json").read_text()
+    (copy / "best.json").write_text(text.replace('"success": true', '"success": false', 1))
+    (copy / "same.json").write_text(text)
+    marked = {path.name for path in copy.glob("*.json") if is_marked_verified(path)}
+    assert marked == {"results.json", "same.json"}
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_forgeries_are_found(copy, evaluation, kind):
     rng = random.Random(kind)
@@ -118,6 +128,27 @@ def test_damaged_actions_are_refused(copy):
     path = copy / ACTIONS_NAME
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(DatasetError, match="damaged"):
+        verify_results(copy)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_compressed_actions_are_refused_before_they_are_unpacked(copy, compression):
+    path = copy / ACTIONS_NAME
+    table = pa.ipc.open_file(path.read_bytes()).read_all()
+    options = pa.ipc.IpcWriteOptions(compression=compression)
+    with pa.ipc.new_file(path, table.schema, options=options) as writer:
+        writer.write_table(pa.concat_tables([table] * 1000).combine_chunks())
+    with pytest.raises(DatasetError, match=r"is damaged \(it is compressed"):
+        verify_results(copy)
+
+
+def test_actions_of_before_version_5_of_the_format_are_refused(copy):
+    path = copy / ACTIONS_NAME
+    table = pa.ipc.open_file(path.read_bytes()).read_all()
+    options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
+    with pa.ipc.new_file(path, table.schema, options=options) as writer:
+        writer.write_table(table)
+    with pytest.raises(DatasetError, match=r"before 1\.0"):
         verify_results(copy)
 
 
