@@ -137,9 +137,16 @@ def test_values_of_other_types_are_refused_and_named(results, tmp_path):
         ('"policy": "mine"', '"policy": ["mine"]'),
         ('"mujoco": "1.2.3"', '"mujoco": 1'),
         ('"actions_sha256": ""', '"actions_sha256": null'),
+        ('"kind": "run"', '"kind": []'),
+        (f'"sha256": "{"ab" * 32}"', '"sha256": 5'),
+        ('"kind": "oracle"', '"kind": "untrained", "preset": 5'),
     ):
         assert old in text
         path.write_text(text.replace(old, new, 1))
+        with pytest.raises(DatasetError, match=r"is damaged .*stands for a value of type"):
+            Results.read(path)
+    for config in ({"tasks": 5}, {"tasks": [1]}, {"levels": "L1"}, {"ablations": [None]}):
+        path.write_text(json.dumps({**json.loads(text), "config": config}))
         with pytest.raises(DatasetError, match=r"is damaged .*stands for a value of type"):
             Results.read(path)
     content = json.loads(text)

@@ -21,6 +21,8 @@ SCHEMA = 1
 FILE_NAME = "results.json"
 _MAX_BYTES = 1 << 28  # a million episodes
 BAD_ACTION = "invalid action"  # kind of failure
+_LISTS = ("tasks", "levels", "ablations")  # of names, in the configuration
+_TEXTS = ("kind", "sha256", "weights_sha256", "preset", "bundled", "source")  # on a policy
 # What replaying the actions cannot prove.
 DECLARED = "who acted (policies) and what they observed (ablation, boxes, device, precision, near_ties)"
 
@@ -332,6 +334,10 @@ def _from_content(content: Mapping[str, Any]) -> Results:
     _check_types(described, dict)
     _check_types(content["versions"].values(), str)
     _check_types(content["policies"].values(), dict)
+    lists = [content["config"][key] for key in _LISTS if key in content["config"]]
+    _check_types(lists, list)
+    _check_types((name for names in lists for name in names), str)
+    _check_types((what[key] for what in content["policies"].values() for key in _TEXTS if key in what), str)
     sha256 = content.get("actions_sha256", "")
     _check_types([sha256], str)
     return Results(rows, *described, sha256)
