@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -161,6 +162,12 @@ def test_the_page_suits_phones_and_dark_screens(text):
     assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in text
     assert "@media (prefers-color-scheme: dark)" in text
     assert ".scroll { overflow-x: auto;" in text
+
+
+def test_a_name_with_dollar_signs_is_no_formula(results, tmp_path):
+    rows = tuple(replace(row, task="a$\\nosuch{$") for row in results.rows if row.task == "rotate")
+    path = write_report(replace(results, rows=rows), tmp_path / "a.html")
+    assert "nosuch" in section(path.read_text(encoding="utf-8"), "results")
 
 
 def test_charts_take_their_colours_from_the_page(text):
@@ -346,6 +353,18 @@ def test_no_videos_are_no_error_but_lost_ones_are(clip, tmp_path):
         load_clips(tmp_path)
 
 
+def test_an_index_of_videos_that_others_wrote_reads_no_other_file(clip, tmp_path):
+    save_clips([replace(clip, policy="mine")], tmp_path)
+    index = tmp_path / "videos" / "clips.json"
+    record = json.loads(index.read_text())
+    (tmp_path / "secret_rotate_L1_9.mp4").write_bytes(b"elsewhere")
+    outside = json.dumps([record[0] | {"policy": "../secret"}])
+    for content in (outside, '["x"]', '{"a": 1}', "[null]", "[" * 100_000):
+        index.write_text(content)
+        with pytest.raises(DatasetError, match=r"clips\.json is damaged"):
+            load_clips(tmp_path)
+
+
 def test_curves_are_grouped_by_kind(metrics):
     assert [(chart.title, list(chart.curves)) for chart in read_charts(metrics)] == [
         ("Training: loss", ["training data", "held out"]),
@@ -401,6 +420,21 @@ def test_a_damaged_training_record_names_the_line(tmp_path):
         read_charts(tmp_path / "metrics.jsonl")
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xff\xfe\x00",
+        b'{"step": 1, "loss": ' + b"9" * 400 + b"}",
+        b'{"step": ' + b"9" * 400 + b"}",
+        b"[" * 10**5,
+    ],
+)
+def test_a_training_record_of_other_content_is_refused(tmp_path, content):
+    (tmp_path / "metrics.jsonl").write_bytes(content)
+    with pytest.raises(DatasetError, match=r"metrics\.jsonl"):
+        read_charts(tmp_path / "metrics.jsonl")
+
+
 def test_charts_with_curves_of_the_same_name_have_names_of_their_own():
     curves = {"training data": [(0, 1.0), (1, 0.5)], "held out": [(0, 1.0), (1, 0.8)]}
     names = [
@@ -420,6 +454,16 @@ def test_the_command_names_what_policies_are_whatever_they_are_called(results):
     command = default_command(replace(results, policies=kinds, config=config))
     assert "--policy mine=ws://HOST:PORT,oracle,random=nano --tasks" in command
     assert "--boxes 'my boxes.py:make'" in command
+
+
+def test_the_command_of_results_that_others_wrote_runs_nothing_else(results):
+    hostile = "$(id); rm -rf ~"
+    names = {"tasks": [hostile], "levels": [hostile], "ablations": [hostile]}
+    config = {**results.config, **names, "episodes": hostile, "seed": hostile}
+    words = shlex.split(default_command(replace(results, config=config)))
+    options = ("--tasks", "--levels", "--ablations", "--episodes", "--seed")
+    assert [words[words.index(option) + 1] for option in options] == [hostile] * 5
+    assert words.count(hostile) == 5
 
 
 def test_a_single_episode_is_counted_in_the_singular(results, tmp_path):

@@ -96,15 +96,19 @@ def read_charts(metrics: Path) -> list[Chart]:
         DatasetError: The file is not of that form.
     """
     stages: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for number, line in enumerate(metrics.read_text(encoding="utf-8").splitlines(), start=1):
+    try:
+        lines = metrics.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{metrics} is no text with a record a line ({error}).") from error
+    for number, line in enumerate(lines, start=1):
         try:
             record = json.loads(line)
             step, stage = float(record["step"]), str(record.get("name", "training"))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            for name, value in record.items():
+                if isinstance(value, int | float) and not isinstance(value, bool):
+                    stages.setdefault(stage, {}).setdefault(name, []).append((step, float(value)))
+        except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
             raise DatasetError(f"{metrics}, line {number}, is no record with a step ({error!r}).") from error
-        for name, value in record.items():
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                stages.setdefault(stage, {}).setdefault(name, []).append((step, float(value)))
     charts = []
     for stage, values in stages.items():
         for kind, percent in _KINDS:

@@ -230,7 +230,10 @@ def _themed(figure: Any, name: str, title: str, variables: Iterable[str]) -> str
         variables: CSS variables of the series' colours.
     """
     from matplotlib import rc_context
+    from matplotlib.text import Text
 
+    for words in figure.findobj(Text):
+        words.set_parse_math(False)  # a $ in a name is no formula
     text = io.StringIO()
     with rc_context(_STYLE):
         metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))

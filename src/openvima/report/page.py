@@ -135,9 +135,9 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
     ]
     words = [
         f"openvima evaluate --policy {shlex.quote(','.join(policies))}",
-        f"--tasks {','.join(config.get('tasks', ['all']))}",
-        f"--levels {','.join(config.get('levels', results.levels()))} --episodes {config.get('episodes', 0)}",
-        f"--seed {config.get('seed', 0)}",
+        f"--tasks {shlex.quote(','.join(config.get('tasks', ['all'])))}",
+        f"--levels {shlex.quote(','.join(config.get('levels', results.levels())))}",
+        *[f"--{name} {shlex.quote(str(config.get(name, 0)))}" for name in ("episodes", "seed")],
         *[
             f"--{name.replace('_', '-')} {shlex.quote(str(config[name]))}"
             for name, usual in _OPTIONS.items()
@@ -145,7 +145,7 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
         ],
         *(["--compat"] if config.get("compat") else []),
         *(["--trust-code"] if any("code" in what for what in results.policies.values()) else []),
-        *([f"--ablations {','.join(config['ablations'])}"] if config.get("ablations") else []),
+        *([f"--ablations {shlex.quote(','.join(config['ablations']))}"] if config.get("ablations") else []),
         "--out DIR",
     ]
     return " ".join(words)

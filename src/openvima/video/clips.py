@@ -11,7 +11,7 @@ from typing import Any
 from PIL import Image
 
 from openvima.atomic_io import atomic_write_file
-from openvima.errors import DatasetError
+from openvima.errors import DatasetError, echo
 
 FOLDER = "videos"
 _INDEX = "clips.json"
@@ -74,14 +74,14 @@ def load_clips(folder: Path) -> tuple[Clip, ...]:
     """Read the clips of an evaluation's folder; none if nothing was recorded.
 
     Raises:
-        DatasetError: The index is damaged or a video is missing.
+        DatasetError: The index is damaged or leads out of the folder, or a video is missing.
     """
     index = folder / FOLDER / _INDEX
     if not index.is_file():
         return ()
     try:
         return tuple(_clip(record, index.parent) for record in json.loads(index.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DatasetError(
             f"{index} is damaged ({error}); delete {index.parent} and evaluate again."
         ) from error
@@ -98,6 +98,8 @@ def _clip(record: dict[str, Any], folder: Path) -> Clip:  # Any: JSON
     prompt = tuple(part if isinstance(part, str) else _bytes(part["png"]) for part in record.pop("prompt"))
     poster = _bytes(record.pop("poster"))
     clip = Clip(**record, prompt=prompt, video=b"", poster=poster)
+    if Path(clip.file_name).name != clip.file_name:
+        raise ValueError(f"{echo(repr(clip.file_name))} leads out of the folder")
     return Clip(**record, prompt=prompt, poster=poster, video=(folder / clip.file_name).read_bytes())
 
 
