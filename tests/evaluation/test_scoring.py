@@ -76,3 +76,9 @@ def test_harder_episodes_leave_out_other_tasks_and_moved_boxes_need_a_network():
     ]
     with pytest.raises(ConfigError, match="policy idle extracts objects by code of its own"):
         score({"idle": Idle()}, **cells, ablations=("noisy_boxes:3+masked_words:0.2",))
+
+
+@pytest.mark.parametrize("name", ["x=oracle", "my policy", "runs/a", "ws://host:1"])
+def test_a_name_that_could_be_a_source_is_refused(name):
+    with pytest.raises(ConfigError, match=f"polic.*{name.partition('=')[0]}"):
+        score({name: RandomPolicy()}, tasks="rotate", levels="L1", episodes=1)

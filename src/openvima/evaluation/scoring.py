@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from openvima.env.config import EnvConfig
-from openvima.errors import ConfigError, PolicyError
+from openvima.errors import ConfigError, PolicyError, echo
 from openvima.evaluation.ablations import NOISY_BOXES
 from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import EpisodeOutcome, Results
@@ -48,7 +48,7 @@ def score(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
-        ConfigError: There is no episode, or a task option or an ablation does not fit.
+        ConfigError: There is no episode, or the name of a policy, a task option or an ablation does not fit.
         PolicyError: A policy lacks a method, raises, or gives something else than an action for each episode.
 
     Example:
@@ -69,6 +69,10 @@ def score(
         env_config=EnvConfig(prompts=prompts, task_options=task_options, control=control),
         ablations=ablations,
     )
+    if wrong := set(policies) - {source.name for source in config.sources}:
+        raise ConfigError(
+            f"policy {echo(repr(min(wrong)))}: names are of letters, digits, dots, hyphens and underscores."
+        )
     if config.uses(NOISY_BOXES) and (own := [n for n, p in policies.items() if not hasattr(p, "processor")]):
         raise ConfigError(
             f"policy {', '.join(own)} extracts objects by code of its own, which the ablation {NOISY_BOXES} "
