@@ -149,3 +149,14 @@ def test_whoever_watches_sees_every_step():
     env, seen = Env({}, {}, {"success": True}), []
     play([env], [0], RolloutPolicy(), after_step=lambda env: seen.append(env.steps))
     assert seen == [1, 2, 3]
+
+
+def test_whoever_watches_sees_no_action_that_was_refused():
+    class BadAtLast(RolloutPolicy):
+        def decide(self, observations):
+            super().decide(observations)
+            return ["go" if len(self.asked) == 1 else "bad"]
+
+    env, seen = Env({}, {}), []
+    (outcome,) = play([env], [0], BadAtLast(), after_step=lambda env: seen.append(env.steps))
+    assert (outcome.kind, outcome.steps, seen) == (BAD_ACTION, 1, [1])

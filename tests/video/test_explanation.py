@@ -1,5 +1,6 @@
 """Explanations drawn beside a video."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -9,6 +10,7 @@ import pytest
 from openvima.env import TabletopEnv
 from openvima.errors import PolicyError
 from openvima.evaluation.recording import record_episode
+from openvima.evaluation.results import BAD_ACTION
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, PromptedRolloutPolicy
 from openvima.policies import RandomPolicy
 from openvima.render import TOP, project
@@ -117,3 +119,36 @@ def test_a_policy_without_explanations_is_refused_before_it_acts(env, policy, tm
     with pytest.raises(PolicyError, match=r"no explain.*openvima-small.*nano"):
         record_episode(env, policy, 0, tmp_path / "video.mp4", explain=True)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_explained_episode_without_a_step_has_a_video_of_its_start(tmp_path: Path) -> None:
+    class Wrong(RandomPolicy):
+        def act(self, observations):
+            nowhere = {"pose0_position": np.full(2, np.nan, np.float32)}
+            return [action | nowhere for action in super().act(observations)]
+
+        def explain(self):
+            raise AssertionError("there is nothing to explain")
+
+    env = TabletopEnv("visual_manipulation", realtime=True)
+    path = tmp_path / "video.mp4"
+    outcome = record_episode(env, PromptedRolloutPolicy(Wrong()), 0, path, title="rotate", explain=True)
+    assert (outcome.kind, outcome.steps) == (BAD_ACTION, 0)
+    with av.open(str(path)) as container:
+        assert next(container.decode(video=0)).width == 768
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"attention": {"pick": np.full(3, 1 / 3)}}, "3 weights of attention 'pick' to a prompt of 8 parts"),
+        ({"places": (PlaceProbability("moon", (0.5, 0.0), 1.0),)}, "kind 'moon'; allowed: in view, first"),
+    ],
+)
+def test_an_explanation_that_cannot_be_drawn_is_refused(env, change: dict, message: str) -> None:
+    class Explaining(RandomPolicy):
+        def explain(self):
+            return [replace(pointing(env), **change)]
+
+    with pytest.raises(PolicyError, match=message):
+        PromptedRolloutPolicy(Explaining()).explainer()()

@@ -107,7 +107,8 @@ def play(
         envs: Environments of one task and level.
         starts: Seed of the episode of each, or the episode.
         policy: Decides the actions; its `modalities` become those of the environments.
-        after_step: Called with an environment after each of its steps, for recording.
+        after_step: Called with an environment after each of its steps, for recording; an action that is
+            refused is no step.
 
     Returns:
         How each episode ended, in the order of `starts`.
@@ -126,7 +127,8 @@ def play(
         for slot, decision, is_near_tie in zip(slots, decisions, near_ties, strict=True):
             if slot.outcome is None:
                 slot.near_ties += is_near_tie
+                steps = slot.steps
                 slot.step(decision)
-                if after_step is not None:
+                if after_step is not None and slot.steps > steps:
                     after_step(slot.env)
     return [slot.outcome for slot in slots if slot.outcome is not None]

@@ -82,11 +82,10 @@ class EpisodeRecorder:
         self._strip: np.ndarray | None = None
         self._video: VideoWriter | None = None
         self._last = VideoFrame(env.scene, HOME)
-        if explain is not None:
-            return  # what the frames hold besides the scene follows from the first explanation
         if with_prompt:
             self._strip = draw_prompt_strip(env.prompt, width=self._width)
-        self._start()
+        if explain is None:  # else what the frames hold besides the scene follows from the first explanation
+            self._start()
 
     def record_step(self, env: TabletopEnv) -> None:
         """Append the frames of the environment's last step, with an explanation after a still of it."""
@@ -107,6 +106,8 @@ class EpisodeRecorder:
         taken = f"{steps} step{'' if steps == 1 else 's'}"
         outcome = taken if success is None else f"solved in {taken}" if success else "not solved"
         colour = MUTED if success is None else _GOOD if success else _BAD
+        if self._video is None:  # no step was taken that could be explained
+            self._start()
         caption = _caption(self._title, self._width, outcome, colour)
         self._write(self._compose(caption), _STILL_END_S)
 
@@ -135,7 +136,7 @@ class EpisodeRecorder:
         self._video.write(first, repeat=math.ceil(_STILL_START_S * FRAMES_PER_SECOND))
 
     def _write(self, frame: np.ndarray, seconds: float = 0.0) -> None:
-        assert self._video is not None, "record_step comes first"
+        assert self._video is not None  # it was started
         self._video.write(frame, repeat=max(1, math.ceil(seconds * FRAMES_PER_SECOND)))
 
     def __enter__(self) -> "EpisodeRecorder":
