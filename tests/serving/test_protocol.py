@@ -71,6 +71,7 @@ def test_a_prompt_may_be_text_alone_and_an_observation_lack_the_segmentation() -
         (("images", 0, "name"), None, "image 0: name is None"),
         (("images", 0, "kind"), "photo", "allowed: object, scene"),
         (("images", 0, "kind"), [], "allowed: object, scene"),
+        (("images", 0, "kind"), np.zeros(3), "allowed: object, scene"),
         (("images", 0, "rgb"), [1], "rgb is a list; it must be a map"),
         (("images", 0, "rgb", "top"), b"", "rgb 'top' is b''; it must be an array"),
         (("images", 0, "rgb", "top"), np.zeros((4, 8), np.uint8), r"\(3, height, width\)"),

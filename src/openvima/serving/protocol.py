@@ -230,16 +230,17 @@ def check_protocol(protocol: object, *, theirs: str, ours: str) -> None:
     Raises:
         MessageError: It is another one, or none that is known.
     """
-    if protocol != PROTOCOL:
+    if not isinstance(protocol, str) or protocol != PROTOCOL:  # an array is not compared
         raise MessageError(
             f"{theirs} speaks {_shown(protocol)}, {ours} {PROTOCOL!r}; use versions of openvima that speak "
             "the same on both sides."
         )
 
 
-def type_of(message: object) -> object:
-    """The type of a request or reply; None where it names none."""
-    return message.get("type") if isinstance(message, dict) else None
+def type_of(message: object) -> str | None:
+    """The type of a request or reply; None where it names none, or one that is no text."""
+    kind = message.get("type") if isinstance(message, dict) else None
+    return kind if isinstance(kind, str) else None
 
 
 def _encode_image(image: PromptImage) -> dict[str, Any]:  # Any: see `encode_prompt`
@@ -251,7 +252,8 @@ def _encode_image(image: PromptImage) -> dict[str, Any]:  # Any: see `encode_pro
 def _decode_image(message: object, where: str) -> PromptImage:
     fields = _map(message, where, required=("name", "kind", "rgb", "segm"), optional=("objects",))
     name = _typed(fields["name"], str, f"{where}: name")
-    kind: Literal["object", "scene"] | None = next((k for k in _KINDS if k == fields["kind"]), None)
+    given = fields["kind"] if isinstance(fields["kind"], str) else None
+    kind: Literal["object", "scene"] | None = next((k for k in _KINDS if k == given), None)
     if kind is None:
         raise MessageError(f"{where}: kind is {_shown(fields['kind'])}; allowed: {', '.join(_KINDS)}.")
     _check_views(fields, where)
