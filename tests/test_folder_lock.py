@@ -89,7 +89,7 @@ def test_a_forked_child_neither_keeps_nor_releases_the_lock(tmp_path) -> None:
 
 
 def test_an_owner_on_another_host_counts_as_long_as_it_touches_its_file(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(module, "HEARTBEAT_S", 0.02)
+    monkeypatch.setattr(module, "HEARTBEAT_S", 0.2)  # on a busy machine a thread may wait for 0.1 s
     file, stop = write_owner(tmp_path, "elsewhere", 7), threading.Event()
 
     def beat() -> None:
@@ -98,10 +98,12 @@ def test_an_owner_on_another_host_counts_as_long_as_it_touches_its_file(tmp_path
 
     thread = threading.Thread(target=beat)
     thread.start()
-    with pytest.raises(FolderLockedError, match="process 7 on elsewhere"):
-        folder_lock(tmp_path).__enter__()
-    stop.set()
-    thread.join()
+    try:
+        with pytest.raises(FolderLockedError, match="process 7 on elsewhere"):
+            folder_lock(tmp_path).__enter__()
+    finally:
+        stop.set()
+        thread.join()
     with folder_lock(tmp_path):
         assert not file.exists()
 
@@ -121,7 +123,26 @@ def test_without_record_locks_the_process_decides(tmp_path, monkeypatch, runs: b
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{", '{"host": 1}', "x" * 10_000])
+OWNER = '{"host": "elsewhere", "process": 1, "command": "x", "since": 0.0, "part": [0, 9]}'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        "{",
+        '{"host": 1}',
+        "x" * 10_000,
+        "[" * 4000,
+        OWNER.replace('"elsewhere"', "[1]"),
+        OWNER.replace("1,", "1e999,"),
+        OWNER.replace("0.0", "NaN"),
+        OWNER.replace("0.0", "1e999"),
+        OWNER.replace("[0, 9]", "[]"),
+        OWNER.replace("[0, 9]", "[1e999, 9]"),
+    ],
+)
 def test_whatever_an_owner_s_file_holds_locks_nobody_out(tmp_path, content: str) -> None:
     (tmp_path / f"{LOCK_NAME}.elsewhere.1").write_text(content)
     with folder_lock(tmp_path):

@@ -9,6 +9,7 @@ import contextlib
 import errno
 import json
 import logging
+import math
 import os
 import re
 import shlex
@@ -38,6 +39,15 @@ _POLL_S = 0.1
 _MAX_TEXT = 120  # characters of a command that a message shows
 _MAX_BYTES = 4096  # of an owner's file, which could be anything
 _END = 1 << 62
+_NO_OWNER = (  # errors of a file that names none
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    AttributeError,
+    RecursionError,
+)
 
 Part = tuple[int, int]
 T = TypeVar("T")
@@ -246,7 +256,7 @@ def _others(path: Path, own: Owner) -> list[tuple[Path, Owner]]:
     """Return the owners of overlapping parts, each with its file."""
     found = []
     for file in sorted(path.parent.glob(f"{LOCK_NAME}.*")):
-        with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        with contextlib.suppress(*_NO_OWNER):
             if file.is_symlink() or not file.is_file() or file.stat().st_size > _MAX_BYTES:
                 continue
             entry = json.loads(file.read_bytes())
@@ -257,7 +267,7 @@ def _others(path: Path, own: Owner) -> list[tuple[Path, Owner]]:
                 float(entry["since"]),
                 (int(entry["part"][0]), int(entry["part"][1])),
             )
-            if owner.part[0] < own.part[1] and own.part[0] < owner.part[1]:
+            if math.isfinite(owner.since) and owner.part[0] < own.part[1] and own.part[0] < owner.part[1]:
                 found.append((file, owner))
     return found
 
