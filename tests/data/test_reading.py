@@ -244,3 +244,10 @@ def test_naming_no_task_is_an_error(tmp_path: Path, info: ShardInfo, made_up: Ma
     write_folder(tmp_path, info, [[made_up(1)]])
     with pytest.raises(DatasetError, match=r"no task is named; .* has stack\."):
         Dataset(tmp_path, tasks=[])
+
+
+def test_a_column_may_be_named_twice_and_poses_with_their_steps(shard: Shard) -> None:
+    for columns in (["poses", "steps"], ["steps", "poses"], ["seed", "seed"]):
+        found = shard.read(0, columns)
+        assert found.keys() == {*columns}
+        assert all(np.array_equal(found[name], shard.read(0, [name])[name]) for name in columns)

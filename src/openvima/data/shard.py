@@ -89,7 +89,7 @@ class Shard:
             DatasetError: There is no such column.
             ShardError: The row is damaged.
         """
-        needed = (*columns, "steps") if "poses" in columns else tuple(columns)
+        needed = tuple(dict.fromkeys((*columns, "steps") if "poses" in columns else columns))
         checked, span = self._checked
         if checked == row and span is not None:
             batch = self._decoded(row, span, needed)
