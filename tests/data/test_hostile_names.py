@@ -163,3 +163,10 @@ def test_a_shard_that_calls_itself_a_path_is_refused(
 def test_a_shard_whose_description_has_other_types_is_refused(info: ShardInfo, change: dict) -> None:
     with pytest.raises(OpenVimaError, match="what it says of itself is damaged"):
         ShardInfo.from_metadata(replace(info, **change).to_metadata())
+
+
+@pytest.mark.parametrize("count", [-1, 2**63, 10**30])
+def test_a_count_that_no_index_could_hold_is_refused(folder: Path, count: int) -> None:
+    edit_manifest(folder, lambda manifest: manifest["shards"][SHARD].update(episodes=count))
+    with pytest.raises(DatasetError, match=rf"it lacks episodes of {SHARD}"):
+        _ = Dataset(folder).index

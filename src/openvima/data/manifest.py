@@ -309,8 +309,13 @@ def _lacking(manifest: Mapping[str, Any]) -> list[str]:  # Any: JSON
         f"{key} of {name}"
         for name, entry, keys in entries
         for key, kind in keys.items()
-        if not isinstance(entry, dict) or not isinstance(entry.get(key), kind)
+        if not isinstance(entry, dict) or not _is_value(entry.get(key), kind)
     ]
+
+
+def _is_value(value: object, kind: Any) -> bool:  # Any: see `_TASK_KEYS`
+    """Whether a value has a type, and is no whole number that a count or an index could not hold."""
+    return isinstance(value, kind) and (not isinstance(value, int) or 0 <= value < 2**63)
 
 
 def _check_names(names: Iterable[str]) -> None:

@@ -136,6 +136,20 @@ def test_a_member_with_a_wrong_head_is_named(
     assert archive.files(places["vima_v6/rotate/000003"]) == EPISODES["rotate/000003"]
 
 
+@pytest.mark.parametrize("offset", [2**31, 2**63 + 5, 2**64 - 1])
+def test_a_member_beyond_the_end_is_named(tmp_path: Path, offset: int) -> None:
+    name = b"rotate/000001/obs.pkl"
+    extra = struct.pack("<HHQ", 1, 8, offset)
+    head = struct.pack("<4s2B4HL2L2H", b"PK\3\4", 20, 0, 0, 0, 0, 0, 0, 1, 1, len(name), 0) + name + b"x"
+    lengths = (len(name), len(extra), 0, 0, 0)
+    entry = struct.pack("<4s4B4H3L5H2L", b"PK\1\2", 20, 0, 20, 0, 0, 0, 0, 0, 0, 1, 1, *lengths, 0, 2**32 - 1)
+    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 1, 1, len(entry + name + extra), len(head), 0)
+    (tmp_path / "a.zip").write_bytes(head + entry + name + extra + end)
+    archive = ZipArchive(tmp_path / "a.zip")
+    with pytest.raises(MemberError, match=r"obs\.pkl is not where the archive's directory says"):
+        archive.files(archive.episodes()["rotate/000001"])
+
+
 def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     """It claims to be small, but would unpack to much more."""
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:

@@ -99,7 +99,7 @@ class ZipArchive:
             Path within the episode's folder, such as "rgb_top/0.jpg", to content.
 
         Raises:
-            MemberError: A member is damaged or too large.
+            MemberError: A member is damaged, too large or beyond the end.
         """
         with open(self.path, "rb") as file:
             members = {}
@@ -107,6 +107,9 @@ class ZipArchive:
                 file.seek(start)
                 found = _members(file.read(end - start))
                 members |= {member.name: member for member in found if is_episode_file(member.name)}
+            for member in members.values():
+                if member.offset + self._shift >= self._end:
+                    raise MemberError(f"{member.name} is not where the archive's directory says.")
             total = sum(max(member.num_bytes, member.packed_bytes) for member in members.values())
             if total > MAX_EPISODE_BYTES:
                 raise MemberError(f"it claims {total:,} bytes; episodes have at most {MAX_EPISODE_BYTES:,}.")
