@@ -10,10 +10,11 @@ import pytest
 from openvima.catalog import TEXTURE_SETS
 from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.appearance_stats import ROLES, appearance_record, appearance_text, appearances_of, seeds_of
+from openvima.data.appearance_stats import ROLES, appearance_record, appearance_text, appearances_of
 from openvima.data.leakage import leaks, training_appearances
 from openvima.data.manifest import MANIFEST_NAME
 from openvima.errors import LevelError
+from recorded_seeds import seeds_of
 
 TASKS = ("rearrange", "visual_manipulation", "novel_noun", "sweep_without_exceeding")
 

@@ -9,11 +9,12 @@ import pytest
 
 import openvima
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
-from openvima.data.appearance_stats import appearances_of, seeds_of
+from openvima.data.appearance_stats import appearances_of
 from openvima.data.leakage import leaks
 from openvima.scene import ObjectImage, Placement, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.seeding import make_rng
+from recorded_seeds import seeds_of
 
 FOLDER = Path(openvima.__file__).parent / "policies" / "trained" / "openvima-small"
 RECORD = json.loads((FOLDER / "training_data.json").read_text(encoding="utf-8"))

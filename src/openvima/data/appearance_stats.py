@@ -97,11 +97,6 @@ def appearances_of(role: Mapping[str, Any]) -> frozenset[Appearance]:  # Any: JS
     )
 
 
-def seeds_of(entry: Mapping[str, Any]) -> list[int]:  # Any: JSON
-    """Return all seeds of a task in the record."""
-    return [seed for first, last in entry["seeds"] for seed in range(first, last + 1)]
-
-
 def _roles(row: Row) -> Iterator[tuple[str, Appearance]]:
     """Yield role and appearance of all objects of an episode."""
     scene_images = [image for image in row["prompt_images"] if image["name"] == _SCENE_IMAGE]

@@ -254,20 +254,14 @@ class EpisodeSession:
         return explanation
 
 
-def first_difference(
-    first: Sequence[SessionStep],
-    second: Sequence[SessionStep],
-    *,
-    position_m: float = SAME_POSITION_M,
-    yaw_rad: float = SAME_YAW_RAD,
-) -> int | None:
+def first_difference(first: Sequence[SessionStep], second: Sequence[SessionStep]) -> int | None:
     """Return the index of the first step at which two runs of an episode differ.
+
+    Positions that are farther apart than `SAME_POSITION_M` differ, and rotations than `SAME_YAW_RAD`.
 
     Args:
         first: Steps of one session.
         second: Steps of the other.
-        position_m: Pick or place positions that are farther apart differ.
-        yaw_rad: Rotations that are farther apart differ.
 
     Returns:
         Index of the step; None if the steps that both have taken are equal.
@@ -278,7 +272,7 @@ def first_difference(
             math.dist(one.action.pose1_position, other.action.pose1_position),
         )
         turned = _rotation(one.action) - _rotation(other.action)
-        if far > position_m or abs(math.remainder(turned, 2 * math.pi)) > yaw_rad:
+        if far > SAME_POSITION_M or abs(math.remainder(turned, 2 * math.pi)) > SAME_YAW_RAD:
             return index
     return None
 

@@ -27,18 +27,14 @@ _TRIES = 20  # seeds, until the oracle solves an episode
 def save_task_gallery(
     folder: Path,
     *,
-    tasks: Sequence[str] = (),
     env_config: EnvConfig = DEFAULT_ENV_CONFIG,
-    seed: int = 0,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Path:
     """Write a page with a solved episode of each task, its images, and all of them on one sheet.
 
     Args:
         folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
-        tasks: Names of tasks; by default all.
         env_config: Settings of the environments.
-        seed: First seed to try for each task; the gallery contains the first episode that the oracle solves.
         report: Called with tasks done, tasks in all, and the task's name.
 
     Returns:
@@ -46,11 +42,11 @@ def save_task_gallery(
     """
     require_extra()
     folder.mkdir(parents=True, exist_ok=True)
-    specs = [task_spec(name) for name in tasks or list_tasks()]
+    specs = [task_spec(name) for name in list_tasks()]
     panels = []
     for number, spec in enumerate(specs):
         env = env_config.make(spec.name, spec.levels[0], domain="user")
-        solved = _first_solved(env, seed)
+        solved = _first_solved(env)
         save_episode_image(env, folder / f"{spec.name}.png", seed=solved)
         panels.append(_panel(env, spec.name, solved))
         if report is not None:
@@ -59,12 +55,12 @@ def save_task_gallery(
     return atomic_write_file(folder / PAGE_NAME, render_page("tasks", tasks=specs))
 
 
-def _first_solved(env: TabletopEnv, seed: int) -> int:
-    for candidate in range(seed, seed + _TRIES):
+def _first_solved(env: TabletopEnv) -> int:
+    for candidate in range(_TRIES):
         (outcome,) = play([env], [candidate], OracleRolloutPolicy())
         if outcome.success:
             return candidate
-    return seed
+    return 0
 
 
 def _panel(env: TabletopEnv, title: str, seed: int) -> Image.Image:

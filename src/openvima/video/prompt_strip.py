@@ -69,8 +69,6 @@ def draw_prompt_strip(
     width: int,
     image_height: int = 64,
     font_size: int = 22,
-    paper: Colour = PAPER,
-    ink: Colour = INK,
     weights: Sequence[tuple[Colour, np.ndarray]] = (),
 ) -> np.ndarray:
     """Draw a prompt as a strip of words and thumbnails, wrapped to a width.
@@ -80,8 +78,6 @@ def draw_prompt_strip(
         width: Width of the strip in pixels.
         image_height: Height of the thumbnails in pixels.
         font_size: Font size in pixels.
-        paper: Background colour.
-        ink: Text colour.
         weights: Attention to draw below the words and images, one row each: its colour, and a weight from 0
             to 1 for each piece; one more weight stands for the end of the prompt.
 
@@ -97,7 +93,7 @@ def draw_prompt_strip(
     heights = [max(piece.height for piece in line) for line in lines]
     attended = _ROW_HEIGHT * len(weights) + (4 if weights else 0)
     total = sum(heights) + margin * (len(lines) + 1) + attended * len(lines)
-    strip = Image.new("RGB", (width, total + total % 2), paper)
+    strip = Image.new("RGB", (width, total + total % 2), PAPER)
     draw = ImageDraw.Draw(strip)
     top, number = margin, 0
     for line, height in zip(lines, heights, strict=True):
@@ -106,7 +102,7 @@ def draw_prompt_strip(
             left += piece.space if index else 0
             middle = top + height // 2
             if isinstance(piece.content, str):
-                draw.text((left, middle), piece.content, font=typeface, fill=ink, anchor="lm")
+                draw.text((left, middle), piece.content, font=typeface, fill=INK, anchor="lm")
             else:
                 strip.paste(piece.content, (left, middle - piece.height // 2))
             for row, (colour, shares) in enumerate(weights):
