@@ -49,8 +49,8 @@ class ComposePanel:
             with gui.add_form("Sentence") as sentence:
                 self._add_sentence_fields(gui)
             sentence.on_submit(session.callback(self._rewrite))
-            with gui.add_folder("Picture for a {placeholder}", expand_by_default=False):
-                self._add_picture_fields(gui)
+            with gui.add_folder("Image for a {placeholder}", expand_by_default=False):
+                self._add_image_fields(gui)
             with gui.add_folder("File", expand_by_default=False):
                 self._path = gui.add_text("file", "scene.yaml")
                 session.add_buttons("", {"save": self._save, "load": self._load})
@@ -81,8 +81,8 @@ class ComposePanel:
         self._steps = gui.add_number("steps", 10, min=1, max=1000, step=1)
         gui.add_button("apply").on_click(self.session.callback(self._rewrite))
 
-    def _add_picture_fields(self, gui: viser.GuiApi) -> None:
-        self._slot = gui.add_text("placeholder", "c", hint="a name for the picture, without braces")
+    def _add_image_fields(self, gui: viser.GuiApi) -> None:
+        self._slot = gui.add_text("placeholder", "c", hint="a name for the image, without braces")
         shape = lambda: self._insert((self._object.value, self._texture.value))  # noqa: E731
         scene = lambda: self._insert(self._present().scene_image())  # noqa: E731
         self.session.add_buttons("shows", {"shape above": shape, "scene as it is": scene})
