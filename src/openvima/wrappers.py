@@ -237,7 +237,7 @@ class ProgressReward(gymnasium.Wrapper):
 
 
 def _is_count(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 1
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 1
 
 
 def _scaled(points: np.ndarray) -> np.ndarray:
