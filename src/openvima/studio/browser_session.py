@@ -38,7 +38,7 @@ class StudioConfig:
         record: Folder that demonstrations of users are written to; None: none are recorded.
         env_config: Settings of the environments.
         device: Where networks compute.
-        trust_code: Run the code that run folders name.
+        trust_code: Run the code that run folders name, and results as their detector.
         host: Interface to listen on. Any but the loopback interface needs a token.
         port: TCP port; 0 takes a free one.
         token: Word that browsers are asked for.
