@@ -47,8 +47,8 @@ def main(
         prompts: multimodal, text or mixed, as for `openvima demo`.
         task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them.
         device: Where networks compute: cpu, in float64, or cuda, in float32.
-        trust_code: Run the code that run folders name, as those of learners of your own do, and results as the
-            detector of an evaluation.
+        trust_code: Run the code that run folders name, as those of learners of your own do, and
+            that which results name as their detector.
         host: Interface to listen on. Any but the loopback interface needs a token.
         token: Word that the page asks for; by default that of the environment variable OPENVIMA_SERVE_TOKEN.
             Who knows it can run code on this machine.
