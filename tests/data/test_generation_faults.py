@@ -17,7 +17,7 @@ import pytest
 
 import generation_server
 from openvima.cli.main import main
-from openvima.data import Dataset, GenerateConfig, GenerationProgress, generate
+from openvima.data import Dataset, GenerationProgress, generate
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, ShardError, StorageError
 from small_data_sets import contents
@@ -279,11 +279,3 @@ def test_a_full_disk_ends_with_a_message_and_loses_nothing(whole: Path, tmp_path
     assert (tmp_path / "read_only.status").read_text().strip() in ("1", "2")
     assert "Read-only file system" in (tmp_path / "read_only.log").read_text()
     assert contents(tmp_path / "read_only") == contents(whole)
-
-
-def test_a_file_in_place_of_the_folder_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    for out in (tmp_path / "file", tmp_path / "file" / "demos"):
-        with pytest.raises(StorageError, match=f"cannot write to {out}"):
-            generate(GenerateConfig(out=out, tasks=("rotate",), episodes=1))
-    assert (tmp_path / "file").read_text() == ""

@@ -47,6 +47,7 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
         config = replace(config, out=config.out.absolute())
     blocks = plan(config)
     own = blocks if config.shard_range is None else parts_in_range(blocks, config.shard_range)
+    config.out.mkdir(parents=True, exist_ok=True)
     try:
         with folder_lock(config.out, config.shard_range):
             if config.force:
