@@ -39,6 +39,7 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
         DatasetError: The folder holds a data set of other settings or versions, or a larger one.
         ShardError: A shard in the folder is damaged.
         StorageError: The disk is full, or the folder cannot be written to.
+        OSError: `out` cannot be a folder, as where a file has that name.
         FolderLockedError: Another process writes to the folder, or to the same shards of it.
         WorkerError: A worker died.
         OracleError: The oracle solved too few episodes.
