@@ -20,13 +20,12 @@ from openvima.policies.own_code import checked_policy
 from openvima.policies.sources import is_own_code
 from openvima.scene import Action
 from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand
-from openvima.scene.explanation import Explanation
+from openvima.scene.explanation import PLACE_KINDS, Explanation
 from openvima.serving.client import RemotePolicy
 from openvima.serving.protocol import is_remote
 from openvima.user_code import described
 
 _MAX_SEEDS = 16  # that an error lists
-_PLACE_KINDS = ("in view", "first step", "prompt", "grid")  # of a `PlaceProbability`
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
 Explainer = Callable[[], Sequence[Explanation | None]]  # see `openvima.policies.Policy`
 Decision = Mapping[str, Any] | Action | np.ndarray | ToolCommand | OracleError | None
@@ -315,8 +314,8 @@ def _faults_in(explanation: Explanation) -> Iterator[str]:
                 f"{len(explanation.prompt)} parts"
             )
     for place in explanation.places:
-        if place.kind not in _PLACE_KINDS:
-            yield f"a place of kind {echo(repr(place.kind))}; allowed: {', '.join(_PLACE_KINDS)}"
+        if place.kind not in PLACE_KINDS:
+            yield f"a place of kind {echo(repr(place.kind))}; allowed: {', '.join(PLACE_KINDS)}"
 
 
 def _episodes(envs: Sequence[TabletopEnv]) -> str:

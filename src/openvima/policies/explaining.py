@@ -11,13 +11,12 @@ from openvima.perception.preprocessing import extract_observation
 from openvima.policies.batch import WORD, PromptBatch
 from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.nn.step_trace import StepTrace
-from openvima.policies.pointer.candidates import KINDS
 from openvima.policies.pointer.coreference import coreference
 from openvima.policies.pointer.geometry import bin_to_yaw
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
 from openvima.scene import RenderedPrompt
-from openvima.scene.explanation import Explanation, ObjectProbability, PlaceProbability
+from openvima.scene.explanation import PLACE_KINDS, Explanation, ObjectProbability, PlaceProbability
 from openvima.video.prompt_strip import prompt_pieces
 
 COMPONENTS = tuple(
@@ -74,7 +73,7 @@ def explain_row(
         attention,
         tuple(_objects(found, picks, has_ids=processor.extractor is None)),
         tuple(
-            PlaceProbability(KINDS[trace.kinds_C[index]], (x, y), float(places[index]))
+            PlaceProbability(PLACE_KINDS[trace.kinds_C[index]], (x, y), float(places[index]))
             for index, (x, y) in enumerate(trace.positions_BC2[row].tolist())
             if trace.masks_BC[row, index]
         ),

@@ -9,6 +9,7 @@ import numpy as np
 from openvima.scene.action import WORKSPACE_HIGH, WORKSPACE_LOW
 
 SAME_PLACE_M = 0.02  # place candidates this near to each other count as one
+PLACE_KINDS = ("in view", "first step", "prompt", "grid")  # where place candidates come from
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,9 +34,9 @@ class PlaceProbability:
     """A place candidate, and how probable it was, given the picked object.
 
     Args:
-        kind: Where it comes from: "in view", an object in view; "first step", an object where it was at the
-            first step; "prompt", an object where an image of the prompt shows it; "grid", a point of the
-            table.
+        kind: Where it comes from, one of `PLACE_KINDS`: "in view", an object in view; "first step", an object
+            where it was at the first step; "prompt", an object where an image of the prompt shows it; "grid",
+            a point of the table.
         position: x and y in metres. The policy adds an offset to it.
         probability: Probability of placing there.
     """

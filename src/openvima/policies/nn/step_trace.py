@@ -18,7 +18,7 @@ class StepTrace:
         attention: Kind of attention to weights of the prompt's positions, (B, L), which sum to 1.
         positions_BC2: Positions of the place candidates, metres; None without any.
         masks_BC: Which of them exist.
-        kinds_C: Kind of each, an index of `pointer.candidates.KINDS`.
+        kinds_C: Kind of each, an index of `PLACE_KINDS`.
     """
 
     logits: Sequence[torch.Tensor]

@@ -16,7 +16,6 @@ from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
 from openvima.policies.nn.mlp import mlp
 from openvima.policies.nn.step_trace import Replay, StepTrace, normalized
 from openvima.policies.pointer.candidates import (
-    KINDS,
     NUM_GEOMETRY,
     GridCandidates,
     PlaceCandidates,
@@ -40,6 +39,7 @@ from openvima.policies.pointer.geometry import (
 from openvima.policies.pointer.grounding import TextGrounding, attention_scores
 from openvima.policies.pointer.inputs import HeadInputs, PointerPrompt, at, mask_scores
 from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
+from openvima.scene.explanation import PLACE_KINDS
 
 _ON_TOP_M = 0.04  # scale within which an object is in or on another one
 _MAX_DISTANCE = 10.0  # in units of offsets; larger distances are clipped
@@ -80,7 +80,7 @@ class CandidatePointerHead(nn.Module):
         self.pick = PickPointer(config, width, attributes)
         self.place = PlacePointer(config, width)
         self.grid = GridCandidates(width)
-        self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
+        self.values = nn.ModuleList(nn.Linear(width, width) for _ in PLACE_KINDS)
         self.relation = mlp((3 * width + 8, config.hidden_width, config.hidden_width))
         self.offset = nn.Linear(config.hidden_width, 2)
         self.yaw = nn.Linear(config.hidden_width, config.num_yaw_bins)
@@ -315,13 +315,13 @@ class PlacePointer(nn.Module):
         self.step_embedding = nn.Embedding(config.num_index_embeddings, width)
         self.image_embedding = nn.Embedding(config.num_index_embeddings, width)
         self.query = nn.Linear(width, width)
-        self.keys = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
+        self.keys = nn.ModuleList(nn.Linear(width, width) for _ in PLACE_KINDS)
         self.prompt_query = nn.Linear(width, width)
         self.prompt_key = nn.Linear(width, width)
         self.grounding = TextGrounding(width)
         # For each kind of candidate: weights of both similarities, and a bias.
         self.picked_scale, self.prompt_scale, self.kind_bias = (
-            nn.Linear(width, len(KINDS)) for _ in range(3)
+            nn.Linear(width, len(PLACE_KINDS)) for _ in range(3)
         )
         self.geometry = nn.Linear(width, NUM_GEOMETRY)
         self.same = nn.Linear(width, 1)  # logit of the place of the picked object itself

@@ -13,8 +13,8 @@ from torch.nn import functional as F
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.pointer.geometry import OFFSET_UNIT_M
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at
+from openvima.scene.explanation import PLACE_KINDS
 
-KINDS = ("in view", "first step", "prompt", "grid")  # where candidates come from
 NUM_GEOMETRY = 6
 # A candidate this near to the demonstrated place is right. Boxes of rotated objects have their centres up to
 # 36 mm from where the old centre goes; in 300 demonstrations nothing else was within 50 mm of a place that
@@ -66,7 +66,7 @@ class PlaceCandidates:
     Attributes:
         masks_BTC: Which candidates exist.
         positions_BTC2: Their positions, metres.
-        kinds_C: Where each comes from, as an index of `KINDS`, int64.
+        kinds_C: Where each comes from, as an index of `PLACE_KINDS`, int64.
         tokens_BKD, appearance_BKA, image_index_BK: Of those that are the same at every step.
     """
 
@@ -138,7 +138,7 @@ class PlaceCandidates:
             Which candidates are right, (B, T, C), at least one; and whether that follows from what is known,
             (B, T): a grid point is one of many that would do.
         """
-        masks_BTC, is_grid_C = self.masks_BTC, self.kinds_C == KINDS.index("grid")
+        masks_BTC, is_grid_C = self.masks_BTC, self.kinds_C == PLACE_KINDS.index("grid")
         is_named_BT = targets.place_BT >= 0
         distance_BTC = (self.positions_BTC2 - goal_BT2[:, :, None]).norm(dim=-1)
         count = masks_BTC.shape[-1]
