@@ -18,6 +18,10 @@ from reliability_page import PAGE, PROMISES, page
 ROOT = Path(__file__).parents[1]
 needs_notices = pytest.mark.skipif(not is_supported(), reason="the system gives no notice of system calls")
 LIGHT = "data merge demos others out --force,assets import"
+SAMPLES = (  # of `CASES`: two jobs of like length; all are played by benchmarks/faults.py
+    "generate,data ,verify-results,report evaluation --out out.html",
+    "train,policies convert,detector convert,demo rotate --out,studio",
+)
 
 # Commands that break the promises, run as a case is.
 CARELESS = """
@@ -106,11 +110,13 @@ def test_careless_writers_are_found_and_careful_ones_are_not(tmp_path: Path) -> 
 
 @needs_notices
 @pytest.mark.slow
-def test_verbs_hold_their_promises_at_a_sample_of_points(tmp_path: Path) -> None:
-    kinds = "kill,power cut,full disk,I/O error"
-    for case in campaign(tmp_path / "faults.json", "--max-points", "2", "--kinds", kinds):
+@pytest.mark.parametrize("cases", SAMPLES)
+def test_verbs_hold_their_promises_at_a_sample_of_points(tmp_path: Path, cases: str) -> None:
+    kinds = "kill,power cut,full disk"
+    options = ("--cases", cases, "--max-points", "2", "--kinds", kinds)
+    for case in campaign(tmp_path / "faults.json", *options):
         assert case["points"] == 2
-        assert sum(count["injected"] for count in case["kinds"].values()) >= 4
+        assert sum(count["injected"] for count in case["kinds"].values()) >= 3
 
 
 @needs_notices

@@ -1,18 +1,28 @@
 """The verb `policies`: the list, one policy, and published files made into folders."""
 
 import json
+from collections.abc import Iterator
+from functools import cache
 
 import pytest
 
 torch = pytest.importorskip("torch")
 
 from openvima.cli.main import main  # noqa: E402
-from openvima.policies import PRESETS, load_policy, preset  # noqa: E402
+from openvima.policies import PRESETS, load_policy, parameter_counts, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
 from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE  # noqa: E402
 from openvima.policies.parameter_counts import policy_size  # noqa: E402
 from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
+
+
+@pytest.fixture(scope="module", autouse=True)
+def count_each_preset_once() -> Iterator[None]:
+    """Of the presets, each list counts all."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parameter_counts, "policy_size", cache(policy_size))
+        yield
 
 
 @pytest.fixture

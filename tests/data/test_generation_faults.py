@@ -23,7 +23,7 @@ from openvima.errors import DatasetError, ShardError, StorageError
 from small_data_sets import contents
 from small_generations import TASKS, config
 
-NUM_KILLS = 10  # for each of two beginnings
+NUM_KILLS = 6  # for each of two beginnings
 
 
 @pytest.fixture(scope="module")

@@ -202,4 +202,4 @@ def test_workers_that_prepare_play_the_episodes_of_one_process(seeds: range | No
         envs.close()
         return seen
 
-    assert play(2) == play(1) == play(0)
+    assert play(2) == play(0)

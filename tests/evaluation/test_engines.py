@@ -27,9 +27,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_four_workers_do_not_change_a_byte(whole: Path, tmp_path: Path) -> None:
-    """Two are compared with one in `test_runner.py`; starting processes with torch takes seconds each."""
-    assert evaluate(replace(NETWORK, out=tmp_path, workers=4)).read_bytes() == whole.read_bytes()
+def test_two_workers_do_not_change_a_byte(whole: Path, tmp_path: Path) -> None:
+    assert evaluate(replace(NETWORK, out=tmp_path, workers=2)).read_bytes() == whole.read_bytes()
 
 
 @pytest.mark.slow

@@ -42,6 +42,7 @@ def network_of(name: str) -> PolicyNetwork:
 
 
 FAST = ("nano", "small")
+for_two_networks = pytest.mark.parametrize("policy", FAST, indirect=True)  # what all share
 
 
 @pytest.fixture(
@@ -329,11 +330,13 @@ def test_acting_before_a_reset_is_refused(small_sizes, pool) -> None:
         policy.act([pool[0]])
 
 
+@for_two_networks
 def test_a_reset_without_prompts_is_refused(policy) -> None:
     with pytest.raises(PolicyError, match="reset got no prompts"):
         policy.reset([])
 
 
+@for_two_networks
 def test_one_prompt_or_observation_is_no_batch(policy, prompts, pool) -> None:
     for wrong in (prompts[0], ["Put it there."]):
         with pytest.raises(
@@ -345,6 +348,7 @@ def test_one_prompt_or_observation_is_no_batch(policy, prompts, pool) -> None:
         policy.act(pool[0])
 
 
+@for_two_networks
 def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(policy, prompts) -> None:
     prompt = replace(prompts[0], text=f"Juggle {prompts[0].text} Wildly!")
     with pytest.warns(UnknownWordWarning, match="in training: 'juggle', 'wildly'[.]") as caught:
@@ -354,6 +358,7 @@ def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(po
         session.reset([replace(prompt, text=prompt.text + " Juggle!")])  # a warning would be an error
 
 
+@for_two_networks
 def test_a_placeholder_without_an_image_is_refused(policy, prompts) -> None:
     name, _ = next(iter(prompts[0].images.items()))
     images = {key: image for key, image in prompts[0].images.items() if key != name}
@@ -361,6 +366,7 @@ def test_a_placeholder_without_an_image_is_refused(policy, prompts) -> None:
         policy.reset([RenderedPrompt(prompts[0].text, images)])
 
 
+@for_two_networks
 def test_a_prompt_longer_than_the_position_table_is_refused_before_it_is_encoded(
     policy, prompts, monkeypatch
 ) -> None:
@@ -371,6 +377,7 @@ def test_a_prompt_longer_than_the_position_table_is_refused_before_it_is_encoded
         policy.reset([prompts[1], RenderedPrompt(text, prompts[0].images)])
 
 
+@for_two_networks
 def test_a_prompt_of_hundreds_of_kilobytes_is_refused_before_it_is_split(policy, monkeypatch) -> None:
     monkeypatch.setattr("openvima.policies.processor.preprocess_prompt", lambda *_: pytest.fail("split"))
     with pytest.raises(PromptError, match="the prompt has 400,000 characters; this policy takes 4,096"):
@@ -379,6 +386,7 @@ def test_a_prompt_of_hundreds_of_kilobytes_is_refused_before_it_is_split(policy,
         policy.reset([RenderedPrompt("{a}" * 1300, {})])
 
 
+@for_two_networks
 def test_a_batch_too_large_for_its_longest_prompt_is_refused_before_it_is_encoded(
     policy, prompts, monkeypatch
 ) -> None:
@@ -391,6 +399,7 @@ def test_a_batch_too_large_for_its_longest_prompt_is_refused_before_it_is_encode
         policy.reset([long] + [prompts[1]] * 39)
 
 
+@for_two_networks
 def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, pool) -> None:
     policy.reset([prompts[0]])
     with pytest.raises(PolicyError, match=rf"history has 5\d\d tokens; this policy takes {MAX_POSITIONS}"):
@@ -398,6 +407,7 @@ def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, po
             policy.act([pool[-1]])
 
 
+@for_two_networks
 def test_histories_that_take_too_much_together_are_refused(policy, prompts, pool, monkeypatch) -> None:
     monkeypatch.setattr("openvima.policies.inference.MAX_CACHED_TOKENS", 60)
     policy = policy.new_session()

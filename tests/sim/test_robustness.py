@@ -14,7 +14,7 @@ from openvima.scene import Action
 from openvima.sim import World
 from sim_tables import ASSETS, random_action, random_table, table
 
-SEEDS = range(30)
+SEEDS = range(12)
 NUM_ACTIONS = 4
 
 

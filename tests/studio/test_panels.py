@@ -11,7 +11,7 @@ import pytest
 
 from openvima import training
 from openvima.cli import quickstart
-from openvima.data import Dataset
+from openvima.data import Dataset, GenerateConfig, generate
 from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.evaluation.evaluated_episode import evaluated_episode
 from openvima.scene import Pose
@@ -253,10 +253,11 @@ def test_a_failure_of_the_first_command_is_played_again_by_the_policy_trained_th
     assert all(step.proposal.explanation is not None for step in steps)
 
 
-def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, recorded: Path) -> None:
+def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, tmp_path: Path) -> None:
+    demos = generate(GenerateConfig(out=tmp_path / "demos", tasks=("rotate",), episodes=1))
     session = newest(studio)
     page.tab("Browse")
-    page.fill("folder", str(recorded))
+    page.fill("folder", str(demos))
     page.wait_for("1 of 1 found")
     page.wait_for("step 0 of 1")
     slider = (
@@ -268,5 +269,5 @@ def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, recorded:
     slider.press("Enter")
     page.wait_for("step 1 of 1")
     settle(session)
-    demo = Dataset(recorded)[0]
+    demo = Dataset(demos)[0]
     assert np.array_equal(session.table.shown.joints, demo.joint_paths[0][-1])

@@ -53,7 +53,7 @@ def settings(data: Path, tmp_path: Path, monkeypatch) -> dict:
         "schedule.steps": 6,
         "loader.batch_size": 6,
         "pretraining.steps": 4,
-        "pretraining.num_scenes": 30,
+        "pretraining.num_scenes": 16,
         "pretraining.batch_size": 16,
         "loader.validation_fraction": 0.2,
         "schedule.checkpoint_every": 2,
