@@ -33,7 +33,7 @@ from openvima.report.typesetting import Line, Table, markdown
 from tables import tables
 from weights import facts, settings, ship, shipped
 
-OUT = Path("results/2026-11-24_small")
+OUT = Path("results/2026-11-26_small")
 IMAGES = Path("docs/images")
 MARK = "<!-- small:{name} -->"
 END = "<!-- /small:{name} -->"

@@ -110,7 +110,7 @@ def test_tables_show_ours_beside_the_published_and_the_previous(findings: Findin
     assert lines_of(made["levels"])["openvima-small"][2].startswith("90.0 (")
     settings = lines_of(made["settings"])
     assert settings["procedural assets"][2].startswith("90.0")
-    assert settings["previous weights"][0] == "8.5M"
+    assert settings["previous weights"][0] == "7.3M"
     assert settings["previous weights"][2].startswith("60.0")
     assert "no prompt" in made["controls"] and "swapped" not in made["controls"]
     assert lines_of(made["controls"])["a guess in place of the policy"][0].startswith("20.0 (")
