@@ -1,6 +1,6 @@
 """Speed of inference and training of the policies, on one CPU core and on a GPU if available.
 
-    python benchmarks/policy.py [--quick] [--decisions] [--rounds R] [--json FILE]
+    python benchmarks/policy.py [--quick] [--decisions] [--gpu] [--rounds R] [--json FILE]
 
 Weights are random and word ids are hashes; neither affects the time. Observations come from oracle rollouts.
 The CPU benchmarks run in float32, as the original does; single steps of a preset are also measured in
@@ -12,6 +12,9 @@ equal crops encoded once, and the original implementation (cached prompt and tok
 Only the first one includes cropping. Alternatives run in alternating rounds; medians are reported. Times of a
 single step are also given as CPU time, which is less sensitive to other load, and with the 90th percentile
 over episodes and rounds. `--decisions` measures nothing else.
+
+On a GPU training steps of 128 demonstrations and decisions of 1 to 256 episodes at once are measured;
+`--gpu` measures nothing else. There matrix products are in bfloat16.
 """
 
 import argparse
@@ -24,6 +27,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +65,9 @@ TRAINING_TASKS = (
 NUM_TRAJECTORIES = 12
 FIRST_SEED = 2_000_000
 DECIDING = ("nano", "small")  # presets, besides the largest, whose single decisions are timed
+GPU_PRESETS = ("small", "vima-2m", "vima-20m", "vima-200m")
+GPU_BATCH = 128
+GPU_ENVS = (1, 8, 64, 256)
 PEAK_SIZE = {"cpu": 2048, "cuda": 8192}  # of the square matrices whose product shows what the machine can do
 
 
@@ -275,21 +282,22 @@ def _milliseconds(taken: Sequence[tuple[float, float]]) -> dict[str, float]:
     }
 
 
+def acting(policy: NetworkPolicy, group: Sequence[Demonstration]) -> float:
+    """Time the first five decisions of some episodes together."""
+    policy.reset([episode.prompt for episode in group])
+    return sum(
+        seconds(lambda t=t: policy.act([episode.observation(t) for episode in group]), policy.device.type)
+        for t in range(HISTORY)
+    )
+
+
 def measure_batch(
     policy: NetworkPolicy, episodes: Sequence[Demonstration], num_rounds: int
 ) -> dict[str, float]:
     """Time the first five decisions of all episodes, one after the other and together."""
-
-    def acting(group: Sequence[Demonstration]) -> float:
-        policy.reset([episode.prompt for episode in group])
-        return sum(
-            seconds(lambda t=t: policy.act([episode.observation(t) for episode in group]), policy.device.type)
-            for t in range(HISTORY)
-        )
-
     works = {
-        "singles": lambda: sum(acting([episode]) for episode in episodes),
-        "batch": lambda: acting(episodes),
+        "singles": lambda: sum(acting(policy, [episode]) for episode in episodes),
+        "batch": lambda: acting(policy, episodes),
     }
     times = in_turns(works, num_rounds)
     number = HISTORY * len(episodes)
@@ -301,10 +309,9 @@ def measure_batch(
 
 
 def measure_training(
-    network: PolicyNetwork, demos: Sequence[Demonstration], num_rounds: int, device: str = "cpu"
+    training: Training, num_demos: int, num_rounds: int, device: str = "cpu"
 ) -> dict[str, float]:
     """Time training steps and, in turns with them, the machine's matrix products."""
-    training = Training(network, demos, device)
     precision = torch.float32 if device == "cpu" else torch.bfloat16
     size = PEAK_SIZE[device]
     matrix = torch.randn(size, size, dtype=precision, device=device)
@@ -315,7 +322,7 @@ def measure_training(
     times = in_turns(works, num_rounds)
     peak = 2 * size**3 / 1e12 / times["product"]
     return {
-        "trajectories_per_s": round(len(demos) / times["step"], 2),
+        "trajectories_per_s": round(num_demos / times["step"], 2),
         "tflop_per_step": round(training.tflop, 4),
         "peak_tflop_per_s": round(peak, 4),
         "share_of_peak": round(training.tflop / times["step"] / peak, 3),
@@ -346,7 +353,7 @@ def measure(large: str, *, quick: bool, num_rounds: int) -> dict[str, Any]:
     for name in dict.fromkeys(("nano", *trained, large)):
         network = random_network(name)
         if name in trained:
-            training[name] = measure_training(network, demos, num_rounds)
+            training[name] = measure_training(Training(network, demos, "cpu"), len(demos), num_rounds)
             show(name, "training", training[name])
         policy = NetworkPolicy(network, tokenizer=tokenizer_of(network), dtype=torch.float32)
         acting[name] = measure_batch(policy, episodes, max(1, num_rounds - 1))
@@ -369,16 +376,39 @@ def ratios(name: str, times: dict[str, float]) -> dict[str, float]:
 
 
 def measure_gpu(num_rounds: int) -> dict[str, Any]:
-    """Measure training and acting of the largest preset on the GPU, in bfloat16."""
-    demos = demonstrations(TRAINING_TASKS, 32, min_steps=1)
-    training = measure_training(random_network("vima-200m"), demos, num_rounds, "cuda")
-    network = random_network("vima-200m")
-    policy = NetworkPolicy(network, tokenizer=tokenizer_of(network), device="cuda", dtype=torch.bfloat16)
+    """Measure training and acting on the GPU, in bfloat16."""
+    demos = demonstrations(TRAINING_TASKS, GPU_BATCH, min_steps=1)
     episodes = demonstrations(ACTING_TASKS, NUM_ENVS, min_steps=HISTORY - 1)
-    acting = measure_batch(policy, episodes, num_rounds)
-    result = {"device": torch.cuda.get_device_name(), "training": training, "acting": acting}
-    show("vima-200m on the GPU", "bfloat16", training | acting)
+    result: dict[str, Any] = {"device": torch.cuda.get_device_name()}
+    for name in GPU_PRESETS:
+        training = Training(random_network(name), demos, "cuda")
+        values = measure_training(training, len(demos), num_rounds, "cuda")
+        values["share_of_time_in_kernels"] = share_in_kernels(training)
+        network = random_network(name)
+        policy = NetworkPolicy(network, tokenizer=tokenizer_of(network), device="cuda", dtype=torch.bfloat16)
+        result[name] = values | {"decisions_per_s": measure_acting(policy, episodes, num_rounds)}
+        show(f"{name} on the GPU", "bfloat16", result[name])
     return result
+
+
+def measure_acting(
+    policy: NetworkPolicy, episodes: Sequence[Demonstration], num_rounds: int
+) -> dict[str, float]:
+    """Return decisions per second by the number of episodes at once."""
+    groups = {str(count): [episodes[i % len(episodes)] for i in range(count)] for count in GPU_ENVS}
+    works = {count: partial(acting, policy, group) for count, group in groups.items()}
+    times = in_turns(works, num_rounds)
+    return {count: round(HISTORY * len(groups[count]) / times[count], 1) for count in times}
+
+
+def share_in_kernels(training: Training) -> float:
+    """Return the share of the time of a training step in which the GPU computes; else it waits for Python."""
+    training.step()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profiler:
+        training.step()
+        torch.cuda.synchronize()
+    kernels = sum(event.self_device_time_total for event in profiler.key_averages()) / 1e6
+    return round(kernels / seconds(training.step, "cuda"), 3)
 
 
 def show(name: str, what: str, values: dict[str, float]) -> None:
@@ -392,6 +422,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--quick", action="store_true", help="smaller presets, to try it out")
     parser.add_argument("--decisions", action="store_true", help="only decisions of nano and small")
+    parser.add_argument("--gpu", action="store_true", help="only on a GPU")
     parser.add_argument(
         "--rounds", type=int, default=3, help="alternating rounds, after a first that warms up"
     )
@@ -401,12 +432,13 @@ def main() -> None:
     where = circumstances() | {"torch": torch.__version__, "threads": 1, "rounds": options.rounds}
     print(", ".join(f"{name}: {value}" for name, value in where.items()))
     large = "vima-2m" if options.quick else "vima-200m"
+    results: dict[str, Any] = {}
     if options.decisions:
         episodes = demonstrations(ACTING_TASKS, NUM_ENVS, min_steps=HISTORY - 1)
-        results: dict[str, Any] = {"decisions": measure_decisions(None, episodes, options.rounds)}
-    else:
+        results = {"decisions": measure_decisions(None, episodes, options.rounds)}
+    elif not options.gpu:
         results = measure(large, quick=options.quick, num_rounds=options.rounds)
-    if torch.cuda.is_available() and not (options.quick or options.decisions):
+    if options.gpu or (torch.cuda.is_available() and not (options.quick or options.decisions)):
         results["gpu"] = measure_gpu(options.rounds)
     for key, value in results.items():
         if not isinstance(value, dict):

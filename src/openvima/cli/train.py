@@ -49,6 +49,7 @@ def run(words: Sequence[str]) -> int:
     """
     import tyro
 
+    from openvima.multiprocess import num_cpus
     from openvima.training import TrainingConfig, train
     from openvima.training.processes import joined_by
     from openvima.training.recipes import default_recipe, overridden, read_settings, recipe_settings
@@ -71,6 +72,7 @@ def run(words: Sequence[str]) -> int:
         settings = overridden(settings, {"init_from": known.init_from})
     if preset:
         settings["preset"] = preset  # so that the defaults are consistent before it is parsed again
+    settings.setdefault("runtime.workers", num_cpus())
     default = TrainingConfig.of({"data": Path(), "out": Path(), **settings})
     for name in {"data", "out"} - settings.keys():
         object.__setattr__(default, name, tyro.MISSING)  # required, but a config checks that it is a path
@@ -82,7 +84,7 @@ def run(words: Sequence[str]) -> int:
         default=default,
     )
     is_first = os.environ.get("RANK", "0") == "0"
-    others = config.runtime.processes - 1 if "WORLD_SIZE" not in os.environ else 0
+    others = _num_processes(config) - 1 if "WORLD_SIZE" not in os.environ else 0
     with (
         joined_by(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
         progress_bar("training") if is_first else nullcontext() as report,
@@ -98,6 +100,16 @@ def run(words: Sequence[str]) -> int:
     print(hint, file=sys.stderr)
     print(folder)
     return 0
+
+
+def _num_processes(config: "TrainingConfig") -> int:
+    """Return how many processes to start: on GPUs at most one on each."""
+    import torch
+
+    runtime = config.runtime
+    if runtime.device in ("auto", "cuda") and (num_gpus := torch.cuda.device_count()):
+        return min(runtime.processes, num_gpus)
+    return runtime.processes
 
 
 def _rollout(config: "TrainingConfig") -> "OnlineEval":

@@ -16,7 +16,7 @@ _NOT_IDENTITY = {
     "": ("data", "out", "force", "object_cache", "t5", "rollout"),
     "loader": ("num_workers",),
     "schedule": ("checkpoint_every", "keep_every"),
-    "runtime": ("device", "compile", "sharding", "threads", "tensorboard", "wandb"),
+    "runtime": ("device", "compile", "sharding", "threads", "workers", "tensorboard", "wandb"),
 }
 
 
@@ -263,9 +263,12 @@ class RuntimeConfig:
         device: "auto" takes a GPU where there is one; or "cpu", "cuda", "cuda:1".
         precision: "float32", or "bfloat16" for matrix products, with weights in float32.
         compile: Compile the layers of the network with torch.compile.
-        processes: Processes that share each batch, on this machine; for several, see `torchrun`.
+        processes: Processes that share each batch, on this machine; for several, see `torchrun`. On GPUs at
+            most one on each.
         sharding: Several processes replicate the network ("ddp") or shard it ("fsdp").
         threads: CPU threads; equal numbers give equal weights.
+        workers: Processes that render the scenes of pretraining and write object caches, before the steps;
+            fewer where there is little to do. `openvima train` takes all CPUs.
         tensorboard: Also write TensorBoard events, if it is installed.
         wandb: Project of Weights & Biases to log to as well; empty logs nothing there.
     """
@@ -276,6 +279,7 @@ class RuntimeConfig:
     processes: Annotated[int, Range(1, 64)] = 1
     sharding: Literal["ddp", "fsdp"] = "ddp"
     threads: Annotated[int, Range(1, 1024)] = 1
+    workers: Annotated[int, Range(1, 1024)] = 1
     tensorboard: bool = True
     wandb: str = ""
 

@@ -35,6 +35,9 @@ from openvima.training.source import (
 )
 from openvima.training.vocabulary import training_texts
 
+# Their start takes as long as a worker needs for so many.
+_SCENES_PER_WORKER, _DEMONSTRATIONS_PER_WORKER = 200, 500
+
 
 def train(
     config: TrainingConfig,
@@ -152,6 +155,7 @@ class _Stages:
             with_attributes=with_attributes,
             report=self._say,
             parallel=self.parallel,
+            workers=self._workers(config.num_scenes // _SCENES_PER_WORKER),
         )
         encode = self.learner.processor.tokenizer.encode
         return ContrastivePretraining(network, config, self.config.seed, pairs, self.parallel, encode)
@@ -209,7 +213,10 @@ class _Stages:
         """
         loader, folder, kind = self.config.loader, self.config.object_cache, self.learner.input_kind
         timeout_s = math.inf  # another training may write the cache now
-        opened = partial(open_object_cache, self.dataset, kind, folder=folder, timeout_s=timeout_s)
+        workers = self._workers(len(self.dataset) // _DEMONSTRATIONS_PER_WORKER)
+        opened = partial(
+            open_object_cache, self.dataset, kind, folder=folder, timeout_s=timeout_s, workers=workers
+        )
         detected_prob, caches = loader.detected_prob or 0.0, []
         if not self.parallel.is_first:
             self.parallel.wait()
@@ -227,6 +234,9 @@ class _Stages:
         if self.parallel.is_first:
             self.parallel.wait()
         return caches
+
+    def _workers(self, most: int) -> int:
+        return max(1, min(self.config.runtime.workers, most))
 
     def _say_rerendering(self, done: int, total: int, note: str) -> None:
         self._say(done, total, note or "rendering with random appearance")

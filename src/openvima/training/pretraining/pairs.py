@@ -7,6 +7,7 @@ another training texture of its role, and a prompt image of its own. Nothing com
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading
+from openvima.multiprocess import imap_unordered
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.policies.nn.tensor_record import TensorRecord, map_tensors
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
@@ -30,6 +32,7 @@ from openvima.training.pretraining.attribute_labels import AttributeLabeller, At
 from openvima.training.schedule import step_seed
 
 _NUM_COLUMNS, _NUM_VIEW_COLUMNS = 8, 3  # of `Pairs` without its other records, and of `SecondView`
+_CHUNK = 100  # scenes of a job
 _DOMAIN = "user"  # neither training nor evaluation episodes are reused
 
 
@@ -140,10 +143,11 @@ def render_pairs(
     with_attributes: bool = False,
     report: Callable[[int, int, str], None] | None = None,
     parallel: Parallel = ONE_PROCESS,
+    workers: int = 1,
 ) -> Pairs:
     """Sample and render scenes, and prompt images of all objects in them.
 
-    The pairs do not depend on the number of processes.
+    The pairs do not depend on the number of processes or workers.
 
     Args:
         tasks: Tasks whose training partition and layouts are used, in turn.
@@ -153,15 +157,36 @@ def render_pairs(
         augmentation: Augmentation of the scenes.
         with_attributes: Label what objects are like; needs a second view.
         report: Called with scenes done, scenes in all, and a note.
-        parallel: Processes that share the scenes; each returns all pairs, on its device.
+        parallel: Processes of the run that share the scenes; each returns all pairs, on its device.
+        workers: Processes that render for them.
     """
+    numbers = parallel.part_of(num_scenes)
+    workers = max(1, workers // parallel.num_ranks)
+    chunks = [numbers[start : start + _CHUNK] for start in range(0, len(numbers), _CHUNK)]
+    job = partial(_columns_of_scenes, tuple(tasks), seed, assets, augmentation, with_attributes)
+    say = report and (lambda done: report(done, len(numbers), "rendering scenes"))
+    found = {chunk.start: columns for chunk, columns in imap_unordered(job, chunks, workers, report=say)}
+    columns = zip(*(found[chunk.start] for chunk in chunks), strict=True)
+    pairs = _record([torch.from_numpy(np.concatenate(column)) for column in columns])
+    return map_tensors(pairs.to(parallel.device), parallel.rows_of_all)
+
+
+def _columns_of_scenes(
+    tasks: Sequence[str],
+    seed: int,
+    assets: str,
+    augmentation: SceneAugmentation,
+    with_attributes: bool,
+    numbers: range,
+    count: Callable[..., None],
+) -> list[np.ndarray]:
+    """Render some scenes; return the fields of their pairs, see `pairs_of_scene`, each as one array."""
     pack = load_assets(assets)
     rasteriser = Rasteriser(RandomAppearanceAssets(pack))
     labeller = AttributeLabeller(rasteriser.assets) if with_attributes else None
     pools = {task: task_spec(task).pool("train") for task in tasks}
     shades = {name for names in pools.values() for name in names.dragged_textures}
     rows: list[tuple] = []
-    numbers = parallel.part_of(num_scenes)
     for number in numbers:
         task = tasks[number % len(tasks)]
         episode_seed = step_seed(seed, "pretraining scene", number)
@@ -172,18 +197,25 @@ def render_pairs(
         scene = augmentation(scene, shades, rasteriser.assets, rng)
         view = rearranged(scene, rng) if augmentation.second_view else None
         is_grayscale = draw_grayscale(len(scene.placements), augmentation.grayscale_prob, rng)
-        magnifications = _magnifications(episode)
         rows += pairs_of_scene(
-            scene, magnifications, rasteriser, number, view, is_grayscale=is_grayscale, labeller=labeller
+            scene,
+            _magnifications(episode),
+            rasteriser,
+            number,
+            view,
+            is_grayscale=is_grayscale,
+            labeller=labeller,
         )
-        if report and number % 50 == 0:
-            report(number - numbers.start, len(numbers), "rendering scenes")
-    return map_tensors(stacked(rows).to(parallel.device), parallel.rows_of_all)
+        count(number - numbers.start + 1)
+    return [np.stack(column) for column in zip(*rows, strict=True)]
 
 
 def stacked(rows: Sequence[tuple]) -> Pairs:
     """Stack the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
-    columns = [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
+    return _record([torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)])
+
+
+def _record(columns: Sequence[torch.Tensor]) -> Pairs:
     first, others = columns[:_NUM_COLUMNS], columns[_NUM_COLUMNS:]
     view, labels = others[:_NUM_VIEW_COLUMNS], others[_NUM_VIEW_COLUMNS:]
     return Pairs(
