@@ -17,8 +17,8 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device"),
 ]
-# The last bits of a GPU differ, and grow from step to step.
-TOLERANCE = {"float32": 1e-3, "bfloat16": 0.05}
+# Convolutions in float32 multiply in TF32, and differences grow from step to step.
+TOLERANCE = {"float32": 0.01, "bfloat16": 0.05}
 NAMES = ("small", "vima-2m", "gato-2m", "flamingo-2m", "gpt-2m", "midas-2m")
 
 

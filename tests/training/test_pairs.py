@@ -56,6 +56,21 @@ def test_pairs_follow_from_the_seed():
     )
 
 
+@pytest.mark.slow
+def test_workers_change_nothing(monkeypatch):
+    monkeypatch.setattr(pairs_module, "_CHUNK", 3)
+    augmentation = SceneAugmentation(second_view=True, hard_negative_prob=0.5)
+    one, three = (
+        render_pairs(
+            TASKS, num_scenes=7, seed=0, assets="procedural", augmentation=augmentation, workers=workers
+        )
+        for workers in (1, 3)
+    )
+    for name in ("prompt_crops", "scene_crops", "appearances", "scenes", "is_grayscale"):
+        assert torch.equal(getattr(one, name), getattr(three, name)), name
+    assert torch.equal(one.second_view.crops, three.second_view.crops)
+
+
 def test_processes_share_the_scenes(monkeypatch):
     """Gathering their rows is tested in `test_parallel.py`."""
     monkeypatch.setattr(Parallel, "rows_of_all", lambda self, rows: rows)

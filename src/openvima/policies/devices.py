@@ -11,6 +11,9 @@ from openvima.errors import PolicyError
 def usable_device(device: torch.device | str) -> torch.device:
     """Return a device after checking that it works.
 
+    For a GPU, cuDNN's attention is turned off in this process: it plans anew for each shape, and those of
+    prompts and histories vary (`results/2026-11-26_gpu.md`).
+
     Raises:
         PolicyError: The device is not available.
     """
@@ -22,6 +25,8 @@ def usable_device(device: torch.device | str) -> torch.device:
             f"device {str(device)!r} cannot be used here; allowed: cpu, and cuda on a machine with a GPU for "
             "which torch is installed."
         ) from error
+    if found.type == "cuda":
+        torch.backends.cuda.enable_cudnn_sdp(False)
     return found
 
 
