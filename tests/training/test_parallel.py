@@ -11,6 +11,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from torch.utils import backend_registration  # noqa: E402
+
 from noisy_extractor import HOOK  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
@@ -185,6 +187,33 @@ def test_half_precision_trains_nearly_equally(bins, tmp_path) -> None:
         if "loss" in a:
             assert a["loss"] != b["loss"]
             assert a["loss"] == pytest.approx(b["loss"], rel=0.02)
+
+
+@pytest.mark.skipif(
+    not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"), reason="torch is older"
+)
+@pytest.mark.parametrize("preset", ["small", "tiny-bins"])
+def test_another_device_trains_equally(preset, bins, tmp_path, monkeypatch) -> None:
+    """No GPU is needed to see that all tensors are on one device."""
+    if preset == "small":
+        sizes = presets.preset(preset)
+        sizes = replace(sizes, decoder=replace(sizes.decoder, dropout=0.0))  # it draws otherwise there
+        monkeypatch.setitem(presets.PRESETS, preset, lambda: sizes)
+        attributes = {"pretraining.steps": 2, "pretraining.attribute_loss_weight": 0.5}
+        bins |= {"preset": preset, "schedule.steps": 2, "pretraining.hard_negative_prob": 0.4, **attributes}
+        bins |= {"augmentation.text_description_prob": 0.3, "augmentation.distractor_prob": 0.5}
+    here = train(TrainingConfig.of({**bins, "out": tmp_path / "here"}))
+    there = {**bins, "out": tmp_path / "there", "runtime.device": "python"}
+    option, program, settings = script_arguments(there)
+    tests = Path(__file__).parents[1]
+    subprocess.run(
+        [sys.executable, option, "import python_device\n" + program, settings],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tests), os.environ.get("PYTHONPATH", "")])},
+        check=True,
+    )
+    for a, b in zip(losses(here), losses(there["out"]), strict=True):
+        for name in ("stage", "step", "loss", "validation_loss"):
+            assert a.get(name) == (pytest.approx(b[name], rel=1e-3) if name in b else None)
 
 
 def test_a_missing_device_is_named() -> None:

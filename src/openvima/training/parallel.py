@@ -91,10 +91,11 @@ class Parallel:
             return loss
         return loss + 0.0 * torch.stack([parameter.sum() for parameter in parameters]).sum()
 
-    def autocast(self, precision: str) -> torch.autocast:
+    def autocast(self, precision: str) -> contextlib.AbstractContextManager[Any]:
         """Return a context for mixed precision, "float32" or "bfloat16"."""
-        is_half = precision == "bfloat16"
-        return torch.autocast(self.device.type, torch.bfloat16 if is_half else None, enabled=is_half)
+        if precision == "float32":
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, torch.bfloat16)
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
         """Average metrics over all processes; a missing metric counts as 0."""
