@@ -20,8 +20,9 @@ POLICY_FILES = {
         for name in ("config.yaml", "metrics.jsonl", "sessions_log.jsonl", "timings_log.jsonl")
     ),
 }
+DETECTOR_FILES = {"model.safetensors", "config.yaml", "MODEL_CARD.md"}
 TRAINED = {
-    *(f"openvima/detector/trained/{name}" for name in ("model.safetensors", "config.yaml")),
+    *(f"openvima/detector/trained/{name}" for name in DETECTOR_FILES),
     *(f"openvima/policies/trained/openvima-small/{name}" for name in POLICY_FILES),
 }
 
@@ -54,7 +55,7 @@ def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
     pytest.importorskip("torch")
     from openvima.detector import BUNDLED, load_detector
 
-    assert {file.name for file in BUNDLED.iterdir()} == {"model.safetensors", "config.yaml"}
+    assert {file.name for file in BUNDLED.iterdir()} == DETECTOR_FILES
     assert sum(file.stat().st_size for file in BUNDLED.iterdir()) <= 8e6
     assert load_detector().network.config
 
