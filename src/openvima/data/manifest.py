@@ -288,7 +288,8 @@ def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:  # Any
     if hashlib.sha256(content).hexdigest() != manifest["index"].get("sha256"):
         raise DatasetError("it is damaged (its checksum is wrong)")
     try:
-        index = pq.read_table(BytesIO(content), use_threads=False)
+        # Arrow's I/O threads, which `read_table` starts, can abort the interpreter as it exits.
+        index = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"it is no Parquet file ({error})") from None
     if not index.schema.equals(INDEX_SCHEMA):

@@ -202,7 +202,7 @@ def _table(values: dict[str, np.ndarray], schema: pa.Schema) -> pa.Table:
 
 def _read(path: Path, name: str) -> np.ndarray:
     """Read a column of numbers, shape (N, D)."""
-    column = pq.read_table(path, columns=[name], use_threads=False).column(0).combine_chunks()
+    column = pq.ParquetFile(path).read(columns=[name], use_threads=False).column(0).combine_chunks()
     num_rows = len(column)
     if pa.types.is_fixed_size_list(column.type):
         column = column.flatten()
