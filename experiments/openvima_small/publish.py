@@ -22,7 +22,7 @@ from typing import Any
 
 from failures import draw_failures
 from figures import save_all
-from findings import Findings, Training, find, level_means
+from findings import POLICY, Findings, Training, find, level_means
 from openvima.atomic_io import atomic_write_file
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.actions import ACTIONS_NAME
@@ -106,6 +106,15 @@ def _training_record(training: Training) -> dict[str, Any]:  # Any: plain JSON v
     }
 
 
+def recorded_means(recorded: Mapping[str, Any]) -> dict[str, LevelMean]:  # Any: JSON
+    """Return success by level of the bundled weights, from a record; empty where it has none."""
+    levels = recorded.get("scores", {}).get("default", {}).get("levels", [])
+    return {
+        each["level"]: LevelMean(POLICY, each["level"], each["mean"], tuple(each["interval"]), ())
+        for each in levels
+    }
+
+
 def fill(text: str, fragments: Mapping[str, str | None], *, where: str) -> str:
     """Put fragments between their marks.
 
@@ -168,7 +177,7 @@ def write(
     drawn |= {name: images / file for name, file in _DRAWN_ELSEWHERE.items() if (images / file).exists()}
     if evaluation and (file := draw_failures(evaluation, images / "openvima_small_failures.png")):
         drawn["failures"] = file
-    made = {name: text or absent for name, text in tables(findings).items()}
+    made = {name: text or absent for name, text in tables(findings, recorded_means(recorded)).items()}
     made |= weights_tables(BUNDLED[SMALL].folder)
     page = out.with_suffix(".md")
     if not page.exists():

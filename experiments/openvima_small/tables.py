@@ -35,8 +35,13 @@ _LEAST_SOLVED = 0.95  # tasks below are listed with their failures
 _MOST_KINDS = 2  # of failures of a task
 
 
-def tables(findings: Findings) -> dict[str, str]:
-    """Return all tables, by the name of their place; those without data are empty or say so."""
+def tables(findings: Findings, recorded: Mapping[str, LevelMean]) -> dict[str, str]:
+    """Return all tables, by the name of their place; those without data are empty or say so.
+
+    Args:
+        findings: What was found.
+        recorded: Means by level of the bundled weights, as in the record, for lack of a new score.
+    """
     of, whole = findings.scores, published_models()
     beside = [next(m for m in whole if (m.model, m.size, m.data_fraction) == (*name, 1)) for name in _BESIDE]
     others = [model for model in leading_models() if model not in beside]
@@ -53,7 +58,7 @@ def tables(findings: Findings) -> dict[str, str]:
         "controls": _control_table(of.get("controls"), findings.guesses),
         "swapped_attribute": _swapped_table(of.get("controls")),
         "failures": _failure_table(of.get("default")),
-        "baselines": _baseline_table(findings) if findings.baselines else None,
+        "baselines": _baseline_table(findings, recorded) if findings.baselines else None,
     }
     written = {
         name: markdown([table]).strip() if table and table.lines else "" for name, table in made.items()
@@ -158,7 +163,7 @@ def _failure_table(results: Results | None) -> Table | None:
     return Table("failures", caption, ("task", "solved", "most frequent failures"), tuple(lines))
 
 
-def _baseline_table(findings: Findings) -> Table:
+def _baseline_table(findings: Findings, recorded: Mapping[str, LevelMean]) -> Table:
     """Architectures that were trained on the same demonstrations for the same time, and ours."""
     trainings, own = findings.baselines, shipped(BUNDLED[POLICY].folder)
     levels = list(dict.fromkeys(level for training in trainings for level in training.means()))
@@ -169,7 +174,7 @@ def _baseline_table(findings: Findings) -> Table:
             " + ".join(f"{each:,}" for each in own.steps),
             f"{own.hours:.1f}",
         )
-        lines = [Line(POLICY, (*cells, *_cells(findings.means(), levels)))]
+        lines = [Line(POLICY, (*cells, *_cells(findings.means() or recorded, levels)))]
     lines += [
         Line(
             training.what,

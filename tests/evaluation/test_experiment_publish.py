@@ -103,7 +103,7 @@ def lines_of(table: str) -> dict[str, list[str]]:
 
 
 def test_tables_show_ours_beside_the_published_and_the_previous(findings: Findings) -> None:
-    made = tables(findings)
+    made = tables(findings, {})
     lines = lines_of(made["simulator"])
     assert lines["openvima-small"][4].startswith("75.0 (") and lines["openvima-small"][2] == "–"
     assert lines["MIDAS, published"][2:] == ["97.8", "97.9", "93.4", "59.1"]
@@ -160,7 +160,10 @@ def test_everything_is_written_and_pages_keep_their_words(tmp_path: Path, findin
     assert "commit `abc`" in result and "particular to vima" in result
     write(Findings({}, {"ablations": "| no head | −3.0 |"}), tmp_path / "out", images, [page], WHERE)
     assert page.read_text() == text
+    before = (tmp_path / "out.md").read_text()
+    write(Findings({}, baselines=findings.baselines), tmp_path / "out", images, [page], WHERE)
     after = (tmp_path / "out.md").read_text()
+    assert after == before and "| 90.0" in after.split("<!-- small:baselines -->")[1]
     assert "particular to vima" in after and "| no head | −3.0 |" in after and "no relative" not in after
     assert set(json.loads((tmp_path / "out.json").read_text())["scores"]) == set(findings.scores)
     with pytest.raises(ConfigError, match="has the evaluations controls, previous, simulator, which are abs"):

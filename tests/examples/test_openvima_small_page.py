@@ -22,7 +22,7 @@ CARD = BUNDLED[SMALL].model_card
 TEXT = (DOCS / "openvima_small.md").read_text(encoding="utf-8")
 MARKS = {
     *(f"{name}-figure" for name in _FIGURES),
-    *(*weights_tables(BUNDLED[SMALL].folder), *tables(Findings({}))),
+    *(*weights_tables(BUNDLED[SMALL].folder), *tables(Findings({}), {})),
 }
 
 
