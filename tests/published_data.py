@@ -257,6 +257,9 @@ def _classes(package: str) -> dict[str, Any]:
         SQUARE_LIKE = 0
         CIRCLE_LIKE = 1
 
+        def __reduce_ex__(self, protocol: int) -> tuple[type, tuple[int]]:
+            return self.__class__, (self.value,)  # as published files do; Python 3.11.2 has `getattr` there
+
     def _kit_obj_common(fname: str) -> None:
         raise AssertionError(fname)
 

@@ -61,7 +61,7 @@ _NAMES = frozenset(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # with slots, Python 3.11.2 would replace `__setstate__` by its own
 class Global:
     """A class or function that a pickle only refers to, by its dotted name; nothing is imported."""
 
