@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from openvima.data.object_cache.cache import ObjectCache
 from openvima.data.object_cache.episode_batch import EpisodeBatch
@@ -18,6 +19,7 @@ from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.config import config_to_dict
 from openvima.policies.file_names import TOKENIZER_FOLDER, WEIGHTS_FILE
+from openvima.policies.nn.linear import rounded_rows
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
@@ -135,8 +137,10 @@ class PolicyLearner(Learner):
     def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Return the loss of the action head, and its metrics."""
         network, features = self.network, self.features
-        if batch.images is not None:
-            features = network.encode_images(batch.images)
+        if (images := batch.images) is not None:
+            if self.training:
+                images = F.pad(images, (0, 0) * 3 + (0, rounded_rows(len(images)) - len(images)))
+            features = network.encode_images(images)
         assert features is not None  # batches lack images only where there are features
         prompt = network.encode_prompt(batch.prompts, features)
         return network.loss(prompt, batch.history, features, batch.targets)

@@ -30,6 +30,7 @@ from openvima.training.source import (
     ExampleSource,
     alternative_source,
     check_words,
+    demonstrated_actions,
     open_demonstrations,
     split_examples,
 )
@@ -177,6 +178,8 @@ class _Stages:
                     inverse_dynamics_prob=prob,
                     describes=describes,
                 )
+            if not (config.init_from or self.trainer.progress.step):
+                learner.network.fit_prior(demonstrated_actions(self._examples[0]))
             if freezes_crops(learner.network, config):
                 freeze_crops(learner, caches, self.parallel)
         if config.runtime.compile:

@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from openvima.data.batching import BatchOrder
 from openvima.data.hash_split import split_hashes
@@ -21,6 +22,8 @@ from openvima.training.augmentation.distractor_insertion import allows_distracto
 from openvima.training.dataset import Example, StoredEpisode
 from openvima.training.learner import Collate
 from openvima.training.provenance import held_out_demonstrations
+
+_PRIOR_DEMONSTRATIONS = 10_000  # enough for the marginals of 100 bins
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,6 +215,13 @@ def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: i
     lengths = cache.lengths()
     rows = source.rows[lengths[source.rows, 0] > 0]
     return ExampleSource(cache, rows, bases, lengths[rows])
+
+
+def demonstrated_actions(source: ExampleSource) -> torch.Tensor:
+    """Return the actions of evenly spaced demonstrations, (N, 12), for the prior of an action head."""
+    stride = max(1, len(source) // _PRIOR_DEMONSTRATIONS)
+    rows = range(0, len(source), stride)
+    return torch.from_numpy(np.concatenate([source[row].episode.actions for row in rows]))
 
 
 def check_words(cache: ObjectCache, processor: Processor, *, describes: bool = False) -> None:

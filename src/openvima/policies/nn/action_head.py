@@ -15,7 +15,7 @@ from openvima.policies.nn.history import ObservationTokens, action_segment, deco
 class ActionHead(nn.Module):
     """Decodes each step's action from its query; a past action is one token of the history.
 
-    A head defines `action_loss` and `action`.
+    A head defines `action_loss`, `action` and `fit_prior`.
 
     Attributes:
         score: The metric that selects the best checkpoint, a fraction of 1.
@@ -35,6 +35,10 @@ class ActionHead(nn.Module):
 
     def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
         """Return actions in metres and quaternions, (B, T, C), within bounds."""
+        raise NotImplementedError
+
+    def fit_prior(self, actions_NC: torch.Tensor) -> None:
+        """Set the biases of the fresh output layer by the distribution of demonstrated actions (N, 12)."""
         raise NotImplementedError
 
     def past_actions(self, actions_BTC: torch.Tensor) -> torch.Tensor:

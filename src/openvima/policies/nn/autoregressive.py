@@ -21,6 +21,7 @@ from openvima.policies.nn.bins import (
     bin_classifiers,
     bins_loss,
     encode_bins,
+    fit_bins,
 )
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
 from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations
@@ -59,6 +60,10 @@ class AutoregressiveHead(nn.Module):
         super().__init__()
         self.actions = actions
         self.classifiers = bin_classifiers(hidden_width, width)
+
+    def fit_prior(self, actions_NC: torch.Tensor) -> None:
+        """Start from the marginal distribution of these actions; see `fit_bins`."""
+        fit_bins(self.classifiers, actions_NC)
 
     def loss(
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets

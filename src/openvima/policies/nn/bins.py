@@ -23,7 +23,7 @@ from openvima.policies.nn.actions import (
     nll,
     to_unit_range,
 )
-from openvima.policies.nn.mlp import mlp, scale_last
+from openvima.policies.nn.mlp import last_bias, mlp, scale_last
 
 NUM_BINS = (50, 100, 50, 50, 50, 50) * 2  # x, y, quaternion of pose0, then of pose1
 SCORE = "component_accuracy"  # all twelve right is rare, and says little, until late in training
@@ -66,6 +66,10 @@ class BinsHead(ActionHead):
         """Map past actions to the bins that the head would have given, in unit range; float64."""
         return decode_bins(encode_bins(super().past_actions(actions_BTC)), torch.float64)
 
+    def fit_prior(self, actions_NC: torch.Tensor) -> None:
+        """Start from the marginal distribution of these actions; see `fit_bins`."""
+        fit_bins(self.classifiers, actions_NC)
+
     def logits(self, query_BTD: torch.Tensor) -> list[torch.Tensor]:
         """Return one tensor (B, T, K) for each of the twelve components."""
         return [classifier(query_BTD) for classifier in self.classifiers]
@@ -76,6 +80,24 @@ def bin_classifiers(hidden_width: int, width: int) -> nn.ModuleList:
     return nn.ModuleList(
         scale_last(mlp((width, hidden_width, hidden_width, count)), gain=0.01) for count in NUM_BINS
     )
+
+
+@torch.no_grad()
+def fit_bins(classifiers: nn.ModuleList, actions_NC: torch.Tensor) -> None:
+    """Set the biases of fresh classifiers to the log-frequencies of the bins, smoothed by a 1% uniform part.
+
+    Uniform classifiers get the same large gradient from every example, which drives post-norm blocks to a
+    constant output within the first hundred steps, from which they hardly recover. See docs/train_vima.md.
+
+    Args:
+        classifiers: One for each component.
+        actions_NC: Demonstrated actions, metres and quaternions.
+    """
+    bins_NC = encode_bins(to_unit_range(actions_NC))
+    for component, classifier in enumerate(classifiers):
+        counts = torch.bincount(bins_NC[:, component], minlength=NUM_BINS[component]).to(torch.float64)
+        frequencies = 0.99 * counts / counts.sum() + 0.01 / len(counts)
+        last_bias(classifier).copy_(frequencies.log())
 
 
 def bins_loss(

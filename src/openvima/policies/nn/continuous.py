@@ -26,7 +26,7 @@ from openvima.policies.nn.actions import (
     masked_mean,
     to_unit_range,
 )
-from openvima.policies.nn.mlp import mlp, scale_last
+from openvima.policies.nn.mlp import last_bias, mlp, scale_last
 
 SCORE = "accuracy"
 NEAR_M = 0.02  # position error, and
@@ -100,7 +100,7 @@ class MixtureHead(ActionHead):
         # Of each component: means, cosine and sine, logarithms of the five standard deviations.
         count = config.num_components * (_POSITIONS + 2 + _POSITIONS + 1)
         self.out = scale_last(mlp((*hidden, count)), gain=0.01)
-        bias = _last_bias(self.out).view(config.num_components, -1)
+        bias = last_bias(self.out).view(config.num_components, -1)
         with torch.no_grad():
             nn.init.uniform_(bias[:, :_POSITIONS])  # equal components would stay equal
             bias[:, _POSITIONS] = 1.0
@@ -114,6 +114,20 @@ class MixtureHead(ActionHead):
         with torch.no_grad():
             actions_BTC = self.action(query_BTD, greedy)
         return loss, {"loss/action": loss.detach(), **_metrics(actions_BTC, targets)}
+
+    @torch.no_grad()
+    def fit_prior(self, actions_NC: torch.Tensor) -> None:
+        """Start with components at evenly spaced actions of these, as wide as all of them together."""
+        positions_NP, yaws_N2 = _planar(actions_NC, torch.float32)
+        places = torch.linspace(0, len(actions_NC) - 1, self.num_components).long()
+        spread_P = positions_NP.std(dim=0, correction=0).clamp(min=self.min_std)
+        mean_2 = yaws_N2.mean(dim=0)
+        # Standard deviation of the wrapped normal distribution with this mean vector.
+        yaw_std = (-2 * mean_2.norm().clamp(1e-3, 1 - 1e-3).log()).sqrt().clamp(self.min_std, 1.0)
+        bias = last_bias(self.out).view(self.num_components, -1)
+        bias[:, :_POSITIONS] = positions_NP[places]
+        bias[:, _POSITIONS : _POSITIONS + 2] = F.normalize(mean_2, dim=-1)
+        bias[:, _POSITIONS + 2 :] = torch.cat([spread_P, yaw_std[None]]).log()
 
     def log_density(self, query_BTD: torch.Tensor, actions_BTC: torch.Tensor) -> torch.Tensor:
         """Return the logarithm of the density, (B, T), per unit range of each position and radian."""
@@ -154,10 +168,15 @@ class RegressionHead(ActionHead):
         self.huber_delta = config.huber_delta
         hidden = config.hidden_width
         self.out = scale_last(mlp((width, hidden, hidden, _POSITIONS + 2)), gain=0.01)
-        bias = _last_bias(self.out)
+        bias = last_bias(self.out)
         with torch.no_grad():
             bias[:_POSITIONS] = 0.5
             bias[_POSITIONS] = 1.0
+
+    @torch.no_grad()
+    def fit_prior(self, actions_NC: torch.Tensor) -> None:
+        """Start from the mean of these actions."""
+        last_bias(self.out).copy_(torch.cat(_planar(actions_NC, torch.float32), dim=-1).mean(dim=0))
 
     def action_loss(
         self, query_BTD: torch.Tensor, targets: ActionTargets
@@ -182,12 +201,6 @@ class RegressionHead(ActionHead):
     def _huber(self, values: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
         loss = F.huber_loss(values, targets, reduction="none", delta=self.huber_delta)
         return loss.sum(-1) / self.huber_delta
-
-
-def _last_bias(layers: nn.Sequential) -> torch.Tensor:
-    last = layers[-1]
-    assert isinstance(last, nn.Linear)
-    return last.bias
 
 
 def _of(values_BTKX: torch.Tensor, chosen_BT: torch.Tensor) -> torch.Tensor:

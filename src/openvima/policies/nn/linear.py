@@ -1,5 +1,11 @@
-"""A linear layer that is fast for few rows."""
+"""A linear layer that is fast on CPUs: for few rows in inference, and in training.
 
+Training uses oneDNN, which takes half the time of torch's default library on AMD processors (results/
+2026-11-28_training_step.md); both compute in float32. Its kernels are compiled for each number of rows, so
+`rounded_rows` keeps these few.
+"""
+
+import os
 from typing import Any
 
 import torch
@@ -13,14 +19,19 @@ _MAX_ROWS = 128
 _MIN_WEIGHTS = 500_000  # smaller matrices stay in the cache of a core
 _PACKED_FOR_ROWS = 16
 
+_MIN_TRAINING_ROWS = 256  # of fewer rows there are too many numbers to compile for
+# oneDNN keeps compiled kernels; its default of 1,024 is fewer than one training step of all layers uses. It is
+# read at the first use.
+os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
+
 # Private operations that torch.compile uses; there is no public API for them.
 _CAN_PACK = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
 class Linear(nn.Linear):
-    """`nn.Linear` with prepacked weights for few rows on a CPU, as in inference with a dozen tokens per step.
+    """`nn.Linear` with oneDNN on a CPU: in training, and for the few rows of a step in inference.
 
-    Weights are packed at the first such call in inference mode, repacked when they change, and dropped for
+    For the latter, weights are packed at the first such call in inference mode, repacked when they change, and dropped for
     training. Results are equal up to rounding.
     """
 
@@ -34,6 +45,8 @@ class Linear(nn.Linear):
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Map (..., in) to (..., out)."""
         if not (self._is_large and self._has_few_rows(input)):
+            if self._has_training_rows(input):
+                return _OneDnnLinear.apply(input, self.weight, self.bias)  # type: ignore[no-any-return]
             return F.linear(input, self.weight, self.bias)
         version = (self.weight.data_ptr(), self.weight._version)
         if version != self._packed_version:
@@ -51,6 +64,17 @@ class Linear(nn.Linear):
         """Exclude the packed copy from copies and pickles."""
         return {**self.__dict__, "_packed": None, "_packed_version": None}
 
+    def _has_training_rows(self, x: torch.Tensor) -> bool:
+        return (
+            _CAN_PACK
+            and torch.is_grad_enabled()
+            and x.numel() >= _MIN_TRAINING_ROWS * self.in_features
+            and x.dtype == self.weight.dtype == torch.float32
+            and x.device.type == "cpu"
+            and not torch.is_autocast_enabled("cpu")
+            and not torch.compiler.is_compiling()
+        )
+
     def _has_few_rows(self, x: torch.Tensor) -> bool:
         return (
             _CAN_PACK
@@ -61,3 +85,38 @@ class Linear(nn.Linear):
             and x.device.type == "cpu"
             and not self.weight.is_inference()  # such tensors have no version
         )
+
+
+class _OneDnnLinear(torch.autograd.Function):
+    """x Wᵀ + b and its gradients; each is a product of the form that oneDNN's linear layer computes."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None
+    ) -> torch.Tensor:
+        ctx.save_for_backward(x, weight)
+        ctx.has_bias = bias is not None
+        return _product(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        (gradient,), (x, weight) = gradients, ctx.saved_tensors
+        rows = gradient.reshape(-1, gradient.shape[-1])
+        needs_x, needs_weight, _ = ctx.needs_input_grad
+        return (
+            _product(gradient, weight.T) if needs_x else None,
+            _product(rows.T, x.reshape(-1, x.shape[-1]).T) if needs_weight else None,
+            rows.sum(0) if ctx.has_bias else None,
+        )
+
+
+def _product(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+
+
+def rounded_rows(count: int) -> int:
+    """Round a number of rows up to one of 16 in each octave, if it is large."""
+    if count < _MIN_TRAINING_ROWS:
+        return count
+    step = 1 << (count.bit_length() - 5)
+    return -(-count // step) * step

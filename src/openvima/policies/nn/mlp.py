@@ -40,3 +40,9 @@ def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:
     with torch.no_grad():
         nn.init.orthogonal_(last.weight, gain=gain)
     return stack
+
+
+def last_bias(stack: nn.Module) -> torch.Tensor:
+    """Return the bias of the last layer of an MLP."""
+    assert isinstance(stack, nn.Sequential) and isinstance(stack[-1], nn.Linear)
+    return stack[-1].bias

@@ -18,6 +18,9 @@ from openvima.policies.nn.vit import VisionTransformer, VitConfig
 
 NUM_VIEWS = 2
 _BOX_UNITS = (256.0, 128.0, 128.0, 256.0)  # centre x, centre y, height, width; of a 128 × 256 image
+# Of objects on the table in demonstrations of the training tasks, in these units, both views together.
+_BOX_MEAN = (0.49, 0.55, 0.23, 0.13)
+_BOX_STD = (0.19, 0.16, 0.10, 0.06)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +89,22 @@ class ObjectEncoder(nn.Module):
             self.appearance = nn.Linear(NUM_VIEWS * features, config.appearance_width)
         if config.rotation_bins:
             self.rotation = RelativeRotation(features, config.rotation_bins)
+
+    @torch.no_grad()
+    def standardize_boxes(self) -> None:
+        """Fold the mean and spread of boxes into the fresh box encoders, and scale their output to about 1.
+
+        As fractions of the image, boxes vary so little that a token hardly tells where its object is.
+        """
+        mean, std = torch.tensor(_BOX_MEAN), torch.tensor(_BOX_STD)
+        for encoder in self.box_encoders:
+            first, last = encoder[0], encoder[-1]
+            if first.weight.is_meta:  # weights are loaded later
+                return
+            first.weight.div_(std)
+            first.bias.sub_(first.weight @ mean)
+            # Orthogonal layers of gain √2 map four numbers of variance 1 to vectors of length √8.
+            last.weight.mul_((len(last.bias) / 8) ** 0.5)
 
     def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
         """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""

@@ -88,6 +88,10 @@ class PolicyNetwork(nn.Module):
         """
         raise NotImplementedError
 
+    def fit_prior(self, actions_NC: torch.Tensor) -> None:
+        """Let a fresh action head start from the distribution of demonstrated actions, (N, 12)."""
+        self.head.fit_prior(actions_NC)
+
     def init_cache(self, prompt: Any) -> Any:  # Any: the model's own
         """Return the state of decoding after the prompt and before the first step."""
         return self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)

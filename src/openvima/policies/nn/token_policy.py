@@ -82,6 +82,8 @@ class TokenPolicy(PolicyNetwork):
         has_objects = isinstance(images, ObjectEncoderConfig)
         self.config = config
         self.images = ObjectEncoder(images) if has_objects else VisionTransformer(images)
+        if isinstance(self.images, ObjectEncoder):
+            self.images.standardize_boxes()
         self.resampler = Resampler(config.resampler, width) if config.resampler else None
         token_width = width if has_objects or not images.class_token else NUM_VIEWS * width
         self.prompt = PromptEncoder(config.prompt, image_token_width=token_width, width=width)

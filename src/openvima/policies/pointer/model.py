@@ -165,6 +165,9 @@ class Pointer(PolicyNetwork):
             describes_BL if self.training or describes_BL.any() else None,
         )
 
+    def fit_prior(self, actions_NC: torch.Tensor) -> None:
+        """Leave the head as it is: candidates differ from demonstration to demonstration."""
+
     def init_cache(self, prompt: PointerPrompt) -> DecodingState:
         """Return the state of decoding after the prompt and before the first step."""
         cache = self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)
