@@ -11,6 +11,7 @@ from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
 from openvima.policies.nn.action_encoder import ActionEncoder  # noqa: E402
+from openvima.policies.nn.action_head import spread  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
     ActionTargets,
@@ -47,7 +48,7 @@ def observations(query) -> ObservationTokens:
 
 def loss_of(network: BinsHead, query, targets: ActionTargets):
     """Loss and metrics given the decoder's outputs at the action queries."""
-    return network.loss(Identity(), None, observations(query), targets)
+    return network.loss(Identity(), None, observations(query), targets)[:2]
 
 
 def head(width: int = 6) -> BinsHead:
@@ -157,27 +158,23 @@ def test_a_position_counts_as_much_as_a_rotation_of_twice_its_length():
     assert sum(metrics[f"loss/{name}"] for name in ACTION_PARTS).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_accuracies_count_whole_actions_parts_and_components():
+def test_the_prior_is_the_frequency_of_the_bins():
     network = head()
-    for parameter in network.parameters():
-        torch.nn.init.zeros_(parameter)
-    actions = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2).repeat(1, 4, 1)
-    bins = encode_bins(to_unit_range(actions))
-    with torch.no_grad():  # it always decides for the first step's bins
-        for component, classifier in enumerate(network.classifiers):
-            classifier[-1].bias[bins[0, 0, component]] = 1.0
-    actions[0, 1, 0] = 0.7  # one component of the first position
-    actions[0, 2, 8:] = torch.tensor([0.0, 0.0, 1.0, 0.0])  # two of the last rotation
-    actions[0, 3] = 0.3  # does not exist
-    exists, slots = torch.tensor([[True, True, True, False]]), torch.zeros(1, 4, dtype=torch.int64)
-    _, metrics = loss_of(network, torch.zeros(1, 4, 6), ActionTargets(actions, slots, slots, exists))
-    expected = {
-        "accuracy": 1 / 3,
-        "component_accuracy": 33 / 36,
-        "pose0_position_accuracy": 2 / 3,
-        "pose0_rotation_accuracy": 1,
-        "pose1_position_accuracy": 1,
-        "pose1_rotation_accuracy": 2 / 3,
-    }
-    shares = {name: value.item() for name, value in metrics.items() if not name.startswith("loss/")}
-    assert shares == pytest.approx(expected)
+    actions = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2).repeat(4, 1)
+    actions[3, 0] = 0.7
+    network.fit_prior(actions)
+    with torch.no_grad():
+        network.classifiers[0][-1].weight.zero_()
+        probabilities = network.logits(torch.ones(1, 1, 6))[0][0, 0].softmax(-1)
+    bins = encode_bins(to_unit_range(actions))[:, 0]
+    assert probabilities[bins[0]].item() == pytest.approx(0.99 * 0.75 + 0.01 / 50)
+    assert probabilities[bins[3]].item() == pytest.approx(0.99 * 0.25 + 0.01 / 50)
+    assert probabilities.min().item() == pytest.approx(0.01 / 50)
+
+
+def test_equal_queries_have_no_spread_and_opposite_ones_the_whole():
+    exists = torch.tensor([[True, True, False]])
+    query = torch.tensor([[[1.0, -2.0], [1.0, -2.0], [9.0, 9.0]]])
+    assert spread(query, exists) == 0
+    query[0, 1] *= -1
+    assert spread(query, exists) == 1

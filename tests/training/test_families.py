@@ -84,7 +84,7 @@ def test_without_an_appearance_embedding_there_is_no_pretraining_and_the_image_e
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert {line["name"] for line in lines} == {"2-cloning"}
     metrics = {name for line in lines for name in line}
-    assert {"accuracy", "component_accuracy", "pose1_rotation_accuracy"} <= metrics
+    assert {"accuracy", "place_accuracy", "validation_rotation_accuracy", "query_spread"} <= metrics
     fresh = build_network(presets.preset("gpt-nano"), seed=step_seed(0, "weights", 0)).state_dict()
     trained = load_file(tmp_path / f"checkpoints/2-cloning-{STEPS:06d}/model.safetensors")
     images = [name for name in fresh if name.startswith("images.")]

@@ -50,8 +50,9 @@ def test_the_paper_recipe_is_that_of_the_paper() -> None:
     assert config.augmentation.false_positive_prob == 0.05
 
 
-def test_nano_presets_and_custom_learners_have_the_nano_recipe() -> None:
-    assert default_recipe("vima-nano") == default_recipe("mine:learner") == "nano"
+def test_every_preset_has_a_recipe_that_trains_it() -> None:
+    assert default_recipe("vima-nano") == default_recipe("midas-nano") == "papers"
+    assert default_recipe("nano") == default_recipe("mine:learner") == "nano"
     assert default_recipe("small:learner") == default_recipe("nano-bins") == "nano"
     assert default_recipe("vima-20m") == default_recipe(None) == "paper"
     with pytest.raises(ConfigError, match="Did you mean 'paper'"):

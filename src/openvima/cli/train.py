@@ -1,6 +1,7 @@
 """`openvima train`: train a policy on demonstrations."""
 
 import argparse
+import logging
 import os
 import shlex
 import sys
@@ -83,6 +84,10 @@ def run(words: Sequence[str]) -> int:
         args=rest,
         default=default,
     )
+    log = logging.getLogger("openvima.training")
+    log.setLevel(logging.INFO)
+    if not log.handlers:
+        log.addHandler(_Lines())
     is_first = os.environ.get("RANK", "0") == "0"
     others = _num_processes(config) - 1 if "WORLD_SIZE" not in os.environ else 0
     with (
@@ -100,6 +105,14 @@ def run(words: Sequence[str]) -> int:
     print(hint, file=sys.stderr)
     print(folder)
     return 0
+
+
+class _Lines(logging.Handler):
+    """Writes to what stderr is now: above the progress bar, while one is shown."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        prefix = "openvima: warning: " if record.levelno >= logging.WARNING else ""
+        print(prefix + record.getMessage(), file=sys.stderr)
 
 
 def _num_processes(config: "TrainingConfig") -> int:

@@ -4,6 +4,7 @@ Contrastive pretraining, behaviour cloning and the training of detectors are sta
 computes gradients; the loop does the rest.
 """
 
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -40,6 +41,21 @@ Rollout = Callable[[Path], Metrics]
 Animate = Callable[[Path], Sequence[Animation]]
 
 LOG_EVERY = 20  # steps
+COLLAPSED_SPREAD = 0.02  # see `openvima.policies.nn.action_head.spread`
+OVERFIT_RATIO = 1.25  # of the loss on held-out demonstrations to that in training
+
+logger = logging.getLogger(__name__)
+# What the terminal shows of the metrics.
+_LABELS = {
+    "loss": "loss",
+    "pick_accuracy": "pick",
+    "object_accuracy": "object",
+    "place_accuracy": "place",
+    "rotation_accuracy": "rotation",
+    "yaw_accuracy": "rotation",
+    "contrastive_accuracy": "retrieval",
+    "retrieval_accuracy": "retrieval",
+}
 
 
 class Stage(Protocol):
@@ -131,6 +147,7 @@ class Trainer:
         parallel.wait()
         self._started, self._cpu_started = time.monotonic(), time.process_time()
         self._last = (0, self._started)  # step and time of the last line of metrics
+        self._training_loss = math.nan
         self.progress = self.run.resume(learner)
         learner.to(parallel.device)
         self._stages: Sequence[PlannedStage] = ()
@@ -219,9 +236,15 @@ class Trainer:
         now, step = time.monotonic(), self.progress.step
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
-        shown = [(name, value) for name, value in metrics.items() if "/" not in name][:3]
-        note = "  ".join(f"{name} {value:.3f}" for name, value in shown)
-        self.report(f"{stage.name}: {note}  {rate:.1f} steps/s")
+        self.report(f"{stage.name}: {_shown(metrics)}  {rate:.1f} steps/s")
+        self._training_loss = metrics.get("loss", math.nan)
+        if metrics.get("query_spread", 1.0) < COLLAPSED_SPREAD and self.parallel.is_first:
+            logger.warning(
+                "step %d: the network gives almost one action for all inputs (spread of the action query "
+                "%.3f). It rarely recovers; start again with a lower optimizer.learning_rate.",
+                step,
+                metrics["query_spread"],
+            )
 
     def _log_times(self) -> None:
         seconds = round(time.monotonic() - self._started, 2)
@@ -238,6 +261,7 @@ class Trainer:
         self.learner.eval()
         metrics = stage.validate()
         self._write(stage, {f"validation_{name}": value for name, value in metrics.items()})
+        self._say_validation(stage, metrics)
         name = f"{stage.name}-{self.progress.step:06d}"
         is_last_stage = self.progress.stage == len(self._stages) - 1
         score, error = metrics.get("score", 0.0), metrics.get("score_error", 0.0)
@@ -257,6 +281,20 @@ class Trainer:
                     for tracker in self._trackers:
                         tracker.add_animations(stage.name, animations, self._done())
         self.parallel.wait()
+
+    def _say_validation(self, stage: Stage, metrics: Metrics) -> None:
+        if not (metrics and self.parallel.is_first):
+            return
+        step, loss = self.progress.step, metrics.get("loss", math.nan)
+        logger.info("%s, step %d, held out: %s", stage.name, step, _shown(metrics))
+        if loss - self._training_loss > (OVERFIT_RATIO - 1) * abs(self._training_loss):
+            logger.warning(
+                "step %d: the loss is %.2f in training and %.2f on held-out demonstrations: the network "
+                "overfits. More demonstrations or augmentation help; a longer training does not.",
+                step,
+                self._training_loss,
+                loss,
+            )
 
     def _write(self, stage: Stage, metrics: Metrics) -> None:
         """Append metrics to `metrics.jsonl`, and to the experiment trackers."""
@@ -291,6 +329,11 @@ def _optimizer(learner: Learner, stage: Stage, weight_decay: float) -> torch.opt
     others = [p for p in stage.parameters if p.ndim <= 1 or id(p) in tables]
     groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
     return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=weight_decay, fused=True)
+
+
+def _shown(metrics: Metrics) -> str:
+    shown = {label: metrics[name] for name, label in _LABELS.items() if name in metrics}
+    return "  ".join(f"{n} {v:.2f}" if n == "loss" else f"{n} {v:.0%}" for n, v in shown.items())
 
 
 def _mean(window: Sequence[Metrics]) -> Metrics:

@@ -11,26 +11,22 @@ from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
 from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations, shift_actions
 
+# The loss, a mean over all steps; its parts as `loss/<name>`; and the decoded actions, (B, T, C).
+ActionLoss = tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]
+
 
 class ActionHead(nn.Module):
     """Decodes each step's action from its query; a past action is one token of the history.
 
     A head defines `action_loss`, `action` and `fit_prior`.
-
-    Attributes:
-        score: The metric that selects the best checkpoint, a fraction of 1.
     """
-
-    score: str
 
     def __init__(self, actions: ActionEncoder) -> None:
         super().__init__()
         self.actions = actions
 
-    def action_loss(
-        self, query_BTD: torch.Tensor, targets: ActionTargets
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the loss of the demonstrated actions, a mean over all steps, and its metrics."""
+    def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
+        """Return the loss of the demonstrated actions, its parts, and what would be done instead."""
         raise NotImplementedError
 
     def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
@@ -47,11 +43,13 @@ class ActionHead(nn.Module):
 
     def loss(
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the loss of whole histories and its metrics; see `action_loss`."""
+    ) -> ActionLoss:
+        """Return the loss of whole histories; see `action_loss`. `query_spread` is one of the metrics."""
         previous = self._segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
         outputs_BTQD, _ = decode_observations(decoder, cache, observations, previous)
-        return self.action_loss(observations.query(outputs_BTQD), targets)
+        query_BTD = observations.query(outputs_BTQD)
+        loss, metrics, actions_BTC = self.action_loss(query_BTD, targets)
+        return loss, {**metrics, "query_spread": spread(query_BTD, targets.steps_BT)}, actions_BTC
 
     def decode_step(
         self,
@@ -71,3 +69,13 @@ class ActionHead(nn.Module):
         self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
     ) -> TokenSegment:
         return action_segment(self.actions(self.past_actions(actions_BTC).to(dtype))[:, :, None], exists_BT)
+
+
+@torch.no_grad()
+def spread(query_BTD: torch.Tensor, steps_BT: torch.Tensor) -> torch.Tensor:
+    """Return the standard deviation of action queries over a batch, by their root mean square.
+
+    Where it is near 0, all inputs give the same action: the decoder has collapsed.
+    """
+    query_ND = query_BTD[steps_BT]
+    return query_ND.std(dim=0, correction=0).square().mean().sqrt() / query_ND.square().mean().sqrt()

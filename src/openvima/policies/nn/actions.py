@@ -3,6 +3,7 @@
 Shape suffixes: B batch, T steps, N objects in view, C components of an action.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -18,16 +19,20 @@ __all__ = [
     "ACTION_WIDTH",
     "ActionTargets",
     "DecodingStrategy",
+    "action_metrics",
     "from_unit_range",
     "greedy",
     "masked_mean",
     "nll",
     "sampling",
     "to_unit_range",
+    "yaw_between",
 ]
 
 # Decoding strategy: logits (B, ..., classes) to class indices (B, ...).
 DecodingStrategy = Callable[[torch.Tensor], torch.Tensor]
+
+PICK_NEAR_M, PLACE_NEAR_M, ROTATION_NEAR_RAD = 0.02, 0.04, math.radians(15)
 
 _LOW = (*WORKSPACE_LOW, -1.0, -1.0, -1.0, -1.0)
 _HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
@@ -91,6 +96,53 @@ def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Mean of the values where the mask is true; 0 where it is true nowhere."""
     weights = mask.to(values.dtype)
     return (values * weights).sum() / weights.sum().clamp(min=1)
+
+
+def yaw_between(actions: torch.Tensor) -> torch.Tensor:
+    """Return the rotation from pick to place, radians in (−2π, 2π), of actions (..., 12)."""
+    x, y, z, w = actions.unflatten(-1, (2, 6))[..., 2:].unbind(-1)
+    yaws = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return yaws[..., 1] - yaws[..., 0]
+
+
+@torch.no_grad()
+def action_metrics(
+    actions_BTC: torch.Tensor, targets: ActionTargets, points_BTN2: torch.Tensor, exist_BTN: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Compare actions with the demonstrated ones, as fractions of the steps.
+
+    Args:
+        actions_BTC: Decoded actions, metres and quaternions.
+        targets: The demonstrated actions.
+        points_BTN2: Where objects can be grasped, metres.
+        exist_BTN: Which objects are in view; with whole frames none is.
+
+    Returns:
+        "pick_accuracy", within 2 cm; "object_accuracy", the object nearest to the pick is the right one;
+        "place_accuracy", within 4 cm; "rotation_accuracy", within 15°; "accuracy", all but the object.
+    """
+    dtype, wanted_BTC = actions_BTC.dtype, targets.actions_BTC.to(actions_BTC.dtype)
+    pick, place = ACTION_PARTS["pose0_position"], ACTION_PARTS["pose1_position"]
+    turn_BT = yaw_between(actions_BTC) - yaw_between(wanted_BTC)
+    is_right_BT = {
+        "pick": (actions_BTC - wanted_BTC)[..., pick].norm(dim=-1) <= PICK_NEAR_M,
+        "place": (actions_BTC - wanted_BTC)[..., place].norm(dim=-1) <= PLACE_NEAR_M,
+        "rotation": turn_BT.cos() >= math.cos(ROTATION_NEAR_RAD),
+    }
+    is_all_BT = torch.stack(list(is_right_BT.values())).all(0)
+    metrics = {"accuracy": masked_mean(is_all_BT.to(dtype), targets.steps_BT)}
+    if exist_BTN.any():
+        nearest = [
+            (points_BTN2.to(dtype) - each[:, :, None, pick])
+            .norm(dim=-1)
+            .masked_fill(~exist_BTN, math.inf)
+            .argmin(-1)
+            for each in (actions_BTC, wanted_BTC)
+        ]
+        is_right_BT["object"] = nearest[0] == nearest[1]
+    for name, each_BT in is_right_BT.items():
+        metrics[f"{name}_accuracy"] = masked_mean(each_BT.to(dtype), targets.steps_BT)
+    return metrics
 
 
 def nll(logits_BTN: torch.Tensor, target_BT: torch.Tensor) -> torch.Tensor:

@@ -13,10 +13,10 @@ import torch
 from torch import nn
 
 from openvima.errors import ConfigError
+from openvima.policies.nn.action_head import ActionLoss, spread
 from openvima.policies.nn.actions import ACTION_WIDTH, ActionTargets, DecodingStrategy, greedy, to_unit_range
 from openvima.policies.nn.bins import (
     NUM_BINS,
-    SCORE,
     actions_from_bins,
     bin_classifiers,
     bins_loss,
@@ -54,8 +54,6 @@ class AutoregressiveHead(nn.Module):
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
 
-    score = SCORE
-
     def __init__(self, hidden_width: int, width: int, actions: "ComponentTokens") -> None:
         super().__init__()
         self.actions = actions
@@ -67,14 +65,20 @@ class AutoregressiveHead(nn.Module):
 
     def loss(
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the loss of whole histories and its metrics, with teacher forcing; see `bins_loss`."""
+    ) -> ActionLoss:
+        """Return the loss of whole histories, with teacher forcing also within an action; see `bins_loss`.
+
+        So the actions returned are more accurate than those of `decode_step`.
+        """
         segments = [observations.segment(), self._segment(targets.actions_BTC, targets.steps_BT)]
         (outputs_BTQD, actions_BTCD), _ = decoder.decode_segments(cache, segments)
         query_BT1D = observations.query(outputs_BTQD)[:, :, None]
         outputs_BTCD = torch.cat([query_BT1D, actions_BTCD[:, :, :-1]], dim=2)
         pairs = zip(self.classifiers, outputs_BTCD.unbind(2), strict=True)
-        return bins_loss([classifier(output) for classifier, output in pairs], targets)
+        logits = [classifier(output) for classifier, output in pairs]
+        loss, metrics, bins_BTC = bins_loss(logits, targets)
+        metrics["query_spread"] = spread(query_BT1D.squeeze(2), targets.steps_BT)
+        return loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
 
     def decode_step(
         self,

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from openvima.policies.nn.action_encoder import ActionEncoder
-from openvima.policies.nn.action_head import ActionHead
+from openvima.policies.nn.action_head import ActionHead, ActionLoss
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ActionTargets,
@@ -26,7 +26,6 @@ from openvima.policies.nn.actions import (
 from openvima.policies.nn.mlp import last_bias, mlp, scale_last
 
 NUM_BINS = (50, 100, 50, 50, 50, 50) * 2  # x, y, quaternion of pose0, then of pose1
-SCORE = "component_accuracy"  # all twelve right is rare, and says little, until late in training
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +44,14 @@ class BinsConfig:
 class BinsHead(ActionHead):
     """Twelve classifiers on the action query, each component independent of the others."""
 
-    score = SCORE
-
     def __init__(self, hidden_width: int, width: int, actions: ActionEncoder) -> None:
         super().__init__(actions)
         self.classifiers = bin_classifiers(hidden_width, width)
 
-    def action_loss(
-        self, query_BTD: torch.Tensor, targets: ActionTargets
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the loss and its metrics; see `bins_loss`."""
-        return bins_loss(self.logits(query_BTD), targets)
+    def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
+        """Return the loss, its parts and the decoded actions; see `bins_loss`."""
+        loss, metrics, bins_BTC = bins_loss(self.logits(query_BTD), targets)
+        return loss, metrics, actions_from_bins(bins_BTC, query_BTD.dtype)
 
     def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
         """Decode the bin of each component."""
@@ -102,7 +98,7 @@ def fit_bins(classifiers: nn.ModuleList, actions_NC: torch.Tensor) -> None:
 
 def bins_loss(
     logits: Sequence[torch.Tensor], targets: ActionTargets
-) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+) -> tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
     """Cross-entropy of every component: mean over a part's components, then sum of the four parts.
 
     So each position and each rotation has the same weight, whatever the number of its components.
@@ -112,26 +108,18 @@ def bins_loss(
         targets: The demonstrated actions.
 
     Returns:
-        The loss, and metrics: `loss/<part>`; "accuracy", all twelve bins of a step right;
-        "component_accuracy", over single components; `<part>_accuracy`, all components of a part right.
+        The loss; its parts as `loss/<part>`; and the bins with the highest logits, (B, T, C).
 
     Source: the published policies were trained with this loss (VIMA, Jiang et al. 2023).
     """
     bins_BTC = encode_bins(to_unit_range(targets.actions_BTC))
     losses_BTC = torch.stack([nll(scores, bins_BTC[..., c]) for c, scores in enumerate(logits)], -1)
     losses_BT = {name: losses_BTC[..., part].mean(-1) for name, part in ACTION_PARTS.items()}
-    loss_BT = torch.stack(list(losses_BT.values())).sum(0)
-    is_right_BTC = torch.stack([scores.argmax(-1) for scores in logits], dim=-1) == bins_BTC
-    values_BT = {
-        **{f"loss/{name}": loss.detach() for name, loss in losses_BT.items()},
-        "accuracy": is_right_BTC.all(-1),
-        "component_accuracy": is_right_BTC.to(loss_BT.dtype).mean(-1),
-        **{f"{name}_accuracy": is_right_BTC[..., part].all(-1) for name, part in ACTION_PARTS.items()},
-    }
+    loss = masked_mean(torch.stack(list(losses_BT.values())).sum(0), targets.steps_BT)
     metrics = {
-        name: masked_mean(value.to(loss_BT.dtype), targets.steps_BT) for name, value in values_BT.items()
+        f"loss/{name}": masked_mean(loss_BT.detach(), targets.steps_BT) for name, loss_BT in losses_BT.items()
     }
-    return masked_mean(loss_BT, targets.steps_BT), metrics
+    return loss, metrics, torch.stack([scores.argmax(-1) for scores in logits], dim=-1)
 
 
 def encode_bins(unit_actions: torch.Tensor) -> torch.Tensor:

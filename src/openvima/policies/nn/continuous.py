@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from openvima.errors import ConfigError
 from openvima.policies.nn.action_encoder import ActionEncoder
-from openvima.policies.nn.action_head import ActionHead
+from openvima.policies.nn.action_head import ActionHead, ActionLoss
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ActionTargets,
@@ -25,12 +25,10 @@ from openvima.policies.nn.actions import (
     greedy,
     masked_mean,
     to_unit_range,
+    yaw_between,
 )
 from openvima.policies.nn.mlp import last_bias, mlp, scale_last
 
-SCORE = "accuracy"
-NEAR_M = 0.02  # position error, and
-NEAR_RAD = math.radians(5)  # rotation error of an action that counts as accurate
 _POSITIONS = 4  # x, y of pick and of place
 
 
@@ -89,8 +87,6 @@ class MixtureHead(ActionHead):
     Source: mixture density networks, Bishop 1994. The von Mises distribution is the Gaussian of a circle.
     """
 
-    score = SCORE
-
     def __init__(self, config: MixtureConfig, width: int, actions: ActionEncoder) -> None:
         super().__init__(actions)
         self.num_components, self.min_std = config.num_components, config.min_std
@@ -106,14 +102,12 @@ class MixtureHead(ActionHead):
             bias[:, _POSITIONS] = 1.0
             bias[:, _POSITIONS + 2 :] = math.log(0.25)
 
-    def action_loss(
-        self, query_BTD: torch.Tensor, targets: ActionTargets
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the negative log-likelihood of the demonstrated actions, and the metrics of `_metrics`."""
+    def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
+        """Return the negative log-likelihood of the demonstrated actions, and the decoded actions."""
         loss = masked_mean(-self.log_density(query_BTD, targets.actions_BTC), targets.steps_BT)
         with torch.no_grad():
             actions_BTC = self.action(query_BTD, greedy)
-        return loss, {"loss/action": loss.detach(), **_metrics(actions_BTC, targets)}
+        return loss, {"loss/action": loss.detach()}, actions_BTC
 
     @torch.no_grad()
     def fit_prior(self, actions_NC: torch.Tensor) -> None:
@@ -161,8 +155,6 @@ class MixtureHead(ActionHead):
 class RegressionHead(ActionHead):
     """Regresses positions, cosine and sine with the Huber loss."""
 
-    score = SCORE
-
     def __init__(self, config: RegressionConfig, width: int, actions: ActionEncoder) -> None:
         super().__init__(actions)
         self.huber_delta = config.huber_delta
@@ -178,10 +170,8 @@ class RegressionHead(ActionHead):
         """Start from the mean of these actions."""
         last_bias(self.out).copy_(torch.cat(_planar(actions_NC, torch.float32), dim=-1).mean(dim=0))
 
-    def action_loss(
-        self, query_BTD: torch.Tensor, targets: ActionTargets
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the Huber loss of positions and rotation, in units of its delta, and `_metrics`."""
+    def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
+        """Return the Huber loss of positions and rotation, in units of its delta, and the actions."""
         positions_BTP, yaw_BT2 = self.out(query_BTD).split((_POSITIONS, 2), dim=-1)
         target_BTP, target_BT2 = _planar(targets.actions_BTC, query_BTD.dtype)
         losses = {
@@ -191,7 +181,7 @@ class RegressionHead(ActionHead):
         parts = {f"loss/{name}": masked_mean(loss_BT, targets.steps_BT) for name, loss_BT in losses.items()}
         actions_BTC = _actions(positions_BTP.detach(), yaw_BT2.detach())
         detached = {name: value.detach() for name, value in parts.items()}
-        return torch.stack(list(parts.values())).sum(), {**detached, **_metrics(actions_BTC, targets)}
+        return torch.stack(list(parts.values())).sum(), detached, actions_BTC
 
     def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
         """Return the regressed actions; there is nothing to choose from."""
@@ -209,18 +199,11 @@ def _of(values_BTKX: torch.Tensor, chosen_BT: torch.Tensor) -> torch.Tensor:
     return values_BTKX.gather(2, index).squeeze(2)
 
 
-def _yaw(quaternions: torch.Tensor) -> torch.Tensor:
-    """Yaw of quaternions xyzw, shape (..., 4), radians."""
-    x, y, z, w = quaternions.unbind(-1)
-    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
 def _planar(actions_BTC: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions in unit range, (B, T, 4), and cosine and sine of the rotation, (B, T, 2)."""
     unit_BTC, poses = to_unit_range(actions_BTC), ("pose0", "pose1")
     positions = torch.cat([unit_BTC[..., ACTION_PARTS[f"{pose}_position"]] for pose in poses], dim=-1)
-    yaw0, yaw1 = (_yaw(actions_BTC[..., ACTION_PARTS[f"{pose}_rotation"]]) for pose in poses)
-    rotation = yaw1 - yaw0
+    rotation = yaw_between(actions_BTC)
     return positions.to(dtype), torch.stack([rotation.cos(), rotation.sin()], dim=-1).to(dtype)
 
 
@@ -234,27 +217,3 @@ def _actions(positions_BTP: torch.Tensor, yaw_BT2: torch.Tensor) -> torch.Tensor
     pick, place = positions_BTP.to(dtype).split(2, dim=-1)
     rotation0, rotation1 = ((quaternions + 1) / 2).split(4, dim=-1)  # to unit range
     return from_unit_range(torch.cat([pick, rotation0, place, rotation1], dim=-1))
-
-
-def _metrics(actions_BTC: torch.Tensor, targets: ActionTargets) -> dict[str, torch.Tensor]:
-    """Accuracy, and mean errors of positions in metres and of the rotation in radians.
-
-    An action is accurate if both positions are within 2 cm and the rotation within 5° of the demonstrated.
-    """
-    errors = {
-        name: (actions_BTC[..., ACTION_PARTS[name]] - targets.actions_BTC[..., ACTION_PARTS[name]]).norm(
-            dim=-1
-        )
-        for name in ("pose0_position", "pose1_position")
-    }
-    _, wanted_BT2 = _planar(targets.actions_BTC, actions_BTC.dtype)
-    _, given_BT2 = _planar(actions_BTC, actions_BTC.dtype)
-    errors["rotation"] = (wanted_BT2 * given_BT2).sum(-1).clamp(-1, 1).acos()
-    is_near = [error <= (NEAR_RAD if name == "rotation" else NEAR_M) for name, error in errors.items()]
-    values = {
-        "accuracy": torch.stack(is_near).all(0),
-        **{f"{name}_error": error for name, error in errors.items()},
-    }
-    return {
-        name: masked_mean(value.to(actions_BTC.dtype), targets.steps_BT) for name, value in values.items()
-    }

@@ -20,8 +20,7 @@ _MIN_WEIGHTS = 500_000  # smaller matrices stay in the cache of a core
 _PACKED_FOR_ROWS = 16
 
 _MIN_TRAINING_ROWS = 256  # of fewer rows there are too many numbers to compile for
-# oneDNN keeps compiled kernels; its default of 1,024 is fewer than one training step of all layers uses. It is
-# read at the first use.
+# Kernels that oneDNN keeps; its default of 1,024 are fewer than training uses again. Read at its first use.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
 
 # Private operations that torch.compile uses; there is no public API for them.
@@ -31,8 +30,8 @@ _CAN_PACK = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "
 class Linear(nn.Linear):
     """`nn.Linear` with oneDNN on a CPU: in training, and for the few rows of a step in inference.
 
-    For the latter, weights are packed at the first such call in inference mode, repacked when they change, and dropped for
-    training. Results are equal up to rounding.
+    For the latter, weights are packed at the first such call in inference mode, repacked when they change,
+    and dropped for training. Results are equal up to rounding.
     """
 
     _packed: torch.Tensor | None = None
@@ -91,9 +90,7 @@ class _OneDnnLinear(torch.autograd.Function):
     """x Wᵀ + b and its gradients; each is a product of the form that oneDNN's linear layer computes."""
 
     @staticmethod
-    def forward(
-        ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None
-    ) -> torch.Tensor:
+    def forward(ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
         ctx.save_for_backward(x, weight)
         ctx.has_bias = bias is not None
         return _product(x, weight, bias)

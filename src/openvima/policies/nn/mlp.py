@@ -44,5 +44,7 @@ def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:
 
 def last_bias(stack: nn.Module) -> torch.Tensor:
     """Return the bias of the last layer of an MLP."""
-    assert isinstance(stack, nn.Sequential) and isinstance(stack[-1], nn.Linear)
-    return stack[-1].bias
+    assert isinstance(stack, nn.Sequential)
+    last = stack[-1]
+    assert isinstance(last, nn.Linear)
+    return last.bias

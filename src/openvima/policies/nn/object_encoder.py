@@ -98,7 +98,8 @@ class ObjectEncoder(nn.Module):
         """
         mean, std = torch.tensor(_BOX_MEAN), torch.tensor(_BOX_STD)
         for encoder in self.box_encoders:
-            first, last = encoder[0], encoder[-1]
+            layers = [layer for layer in encoder.modules() if isinstance(layer, nn.Linear)]
+            first, last = layers[0], layers[-1]
             if first.weight.is_meta:  # weights are loaded later
                 return
             first.weight.div_(std)

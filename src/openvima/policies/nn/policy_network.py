@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
-from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
+from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, action_metrics, greedy
 from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
@@ -53,12 +53,8 @@ class PolicyNetwork(nn.Module):
     head: Any  # one of `nn/heads.py`; the pointer models have their own
     end_effectors: nn.Embedding
     observation_out: nn.Linear
+    score = "accuracy"  # the metric that selects the best checkpoint, a fraction of 1
     explains: bool = False  # whether `explain_step` is of use
-
-    @property
-    def score(self) -> str:
-        """The metric that selects the best checkpoint, a fraction of 1."""
-        return self.head.score
 
     @property
     def object_encoder(self) -> ObjectEncoder | None:
@@ -110,11 +106,13 @@ class PolicyNetwork(nn.Module):
 
         Returns:
             The loss, a mean over all steps, and metrics: every named part of the loss as `loss/<name>`, and
-            accuracies.
+            accuracies; see `action_metrics`.
         """
-        return self.head.loss(
+        loss, metrics, actions_BTC = self.head.loss(
             self.decoder, self.init_cache(prompt), self.observe(history, features_KF), targets
         )
+        in_view_BTN = history.masks_BTVN.any(dim=2) & (self.object_encoder is not None)
+        return loss, {**metrics, **action_metrics(actions_BTC, targets, history.grasps_BTN2, in_view_BTN)}
 
     def decode_step(
         self,

@@ -35,4 +35,6 @@ class Unpadder:
         if self._index_N is None:
             return x_ND
         zeros = x_ND.new_zeros(self._shape.numel(), x_ND.shape[-1])
-        return zeros.index_copy(0, self._index_N[: self._count], x_ND[: self._count]).unflatten(0, self._shape)
+        return zeros.index_copy(0, self._index_N[: self._count], x_ND[: self._count]).unflatten(
+            0, self._shape
+        )

@@ -63,8 +63,6 @@ class CandidatePointerHead(nn.Module):
     between prompt images, and that of the picked object to how the prompt shows it.
     """
 
-    score = "accuracy"
-
     def __init__(
         self,
         config: CandidateHeadConfig,

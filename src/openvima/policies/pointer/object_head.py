@@ -32,8 +32,6 @@ _SIMILARITY_SCALE = 0.1  # a difference of similarities that is hardly significa
 class ObjectPointerHead(nn.Module):
     """Two pointers over the objects in view, then offset and yaw for what they point at."""
 
-    score = "accuracy"
-
     def __init__(self, config: ObjectHeadConfig, width: int) -> None:
         super().__init__()
         self.config = config
