@@ -51,7 +51,7 @@ def test_weights_in_another_place_or_precision_count_at_once(layer) -> None:
     assert_right(layer.float())
 
 
-@pytest.mark.skipif(not linear._CAN_PACK, reason="this torch has no oneDNN")
+@pytest.mark.skipif(not linear._HAS_ONEDNN, reason="this torch has no oneDNN")
 def test_only_acting_makes_a_packed_copy_and_training_drops_it(layer) -> None:
     layer(torch.randn(5, 1024))
     assert layer._packed is None

@@ -142,11 +142,14 @@ class BehaviourCloning:
 
 
 def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
-    """Whether the crop encoder is frozen, since this run or that of the initial weights pretrained it."""
+    """Whether the crop encoder is frozen, since this run or that of the initial weights pretrained it.
+
+    Initial weights tell of it by their appearance embedding, which nothing else trains.
+    """
     encoder, pretraining = network.object_encoder, config.pretraining
-    has_appearance = encoder is not None and encoder.config.appearance_width > 0
-    is_pretrained = bool(pretraining.steps or config.init_from)
-    return has_appearance and is_pretrained and not pretraining.finetune_crop_encoder
+    if encoder is None or pretraining.finetune_crop_encoder:
+        return False
+    return bool(pretraining.steps or (config.init_from and encoder.config.appearance_width))
 
 
 def freeze_crops(

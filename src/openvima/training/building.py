@@ -82,11 +82,10 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
     has_appearance = appearance_width(sizes) > 0
-    if config.pretraining.steps and not has_appearance:
+    if config.pretraining.steps and sizes.inputs.tokens == "frames":
         raise ConfigError(
             f"pretraining.steps is {config.pretraining.steps}, but preset {config.preset!r} with image "
-            f"tokens {image_tokens(sizes)!r} has no appearance embedding to pretrain; leave it out, or set "
-            "it to 0."
+            f"tokens {image_tokens(sizes)!r} encodes no crops; leave it out, or set it to 0."
         )
     if config.pretraining.steps is None:
         steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0

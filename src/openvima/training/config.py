@@ -166,7 +166,8 @@ class PretrainingConfig:
     Args:
         steps: 0 leaves it out, and the image encoder is then trained by behaviour cloning. None is 400 for
             presets with an appearance embedding (nano, nano-bins, small), 0 for others and with `init_from`,
-            whose encoder stays frozen unless `finetune_crop_encoder` is set.
+            whose encoder stays frozen unless `finetune_crop_encoder` is set. Any preset with object tokens
+            can be pretrained.
         num_scenes: Scenes to render.
         batch_size: Object pairs a step.
         learning_rate: Peak learning rate.

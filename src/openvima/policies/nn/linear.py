@@ -24,14 +24,37 @@ _MIN_TRAINING_ROWS = 256  # of fewer rows there are too many numbers to compile 
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
 
 # Private operations that torch.compile uses; there is no public API for them.
-_CAN_PACK = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+_HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
-class Linear(nn.Linear):
-    """`nn.Linear` with oneDNN on a CPU: in training, and for the few rows of a step in inference.
+class TrainingLinear(nn.Linear):
+    """`nn.Linear` that computes outputs and gradients of many rows with oneDNN, on a CPU."""
 
-    For the latter, weights are packed at the first such call in inference mode, repacked when they change,
-    and dropped for training. Results are equal up to rounding.
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        """Map (..., in) to (..., out)."""
+        if (
+            torch.is_grad_enabled()
+            and input.numel() >= _MIN_TRAINING_ROWS * self.in_features
+            and self._can_use_onednn(input)
+            and not torch.is_autocast_enabled("cpu")
+        ):
+            return _OneDnnLinear.apply(input, self.weight, self.bias)  # type: ignore[no-any-return]
+        return F.linear(input, self.weight, self.bias)
+
+    def _can_use_onednn(self, x: torch.Tensor) -> bool:
+        return (
+            _HAS_ONEDNN
+            and not torch.compiler.is_compiling()  # it chooses by itself
+            and x.dtype == self.weight.dtype == torch.float32
+            and x.device.type == "cpu"
+        )
+
+
+class Linear(TrainingLinear):
+    """With prepacked weights for the few rows of a step in inference, as well.
+
+    They are packed at the first such call in inference mode, repacked when they change, and dropped for
+    training. Results are equal up to rounding.
     """
 
     _packed: torch.Tensor | None = None
@@ -44,9 +67,7 @@ class Linear(nn.Linear):
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Map (..., in) to (..., out)."""
         if not (self._is_large and self._has_few_rows(input)):
-            if self._has_training_rows(input):
-                return _OneDnnLinear.apply(input, self.weight, self.bias)  # type: ignore[no-any-return]
-            return F.linear(input, self.weight, self.bias)
+            return super().forward(input)
         version = (self.weight.data_ptr(), self.weight._version)
         if version != self._packed_version:
             self._packed = torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), _PACKED_FOR_ROWS)
@@ -63,25 +84,11 @@ class Linear(nn.Linear):
         """Exclude the packed copy from copies and pickles."""
         return {**self.__dict__, "_packed": None, "_packed_version": None}
 
-    def _has_training_rows(self, x: torch.Tensor) -> bool:
-        return (
-            _CAN_PACK
-            and torch.is_grad_enabled()
-            and x.numel() >= _MIN_TRAINING_ROWS * self.in_features
-            and x.dtype == self.weight.dtype == torch.float32
-            and x.device.type == "cpu"
-            and not torch.is_autocast_enabled("cpu")
-            and not torch.compiler.is_compiling()
-        )
-
     def _has_few_rows(self, x: torch.Tensor) -> bool:
         return (
-            _CAN_PACK
-            and not torch.compiler.is_compiling()  # torch.compile packs weights itself
-            and torch.is_inference_mode_enabled()
+            torch.is_inference_mode_enabled()
             and self.in_features < x.numel() <= _MAX_ROWS * self.in_features
-            and x.dtype == self.weight.dtype == torch.float32
-            and x.device.type == "cpu"
+            and self._can_use_onednn(x)
             and not self.weight.is_inference()  # such tensors have no version
         )
 

@@ -140,17 +140,19 @@ class ObjectEncoder(nn.Module):
         return self.fusion[0](torch.cat([*masked, *visible], dim=-1))
 
     def embed_appearance(self, features_VNF: torch.Tensor, masks_VN: torch.Tensor) -> torch.Tensor:
-        """Embed the appearance of objects, independent of position.
+        """Embed the appearance of objects, independent of position; without an embedding, the features do.
 
         Args:
             features_VNF: Crop features, shape (..., 2, N, F).
             masks_VN: Whether the object is visible in the view, shape (..., 2, N).
 
         Returns:
-            Unit vectors, shape (..., N, appearance width); dot products are cosine similarities.
+            Unit vectors, shape (..., N, appearance width or 2 · F); dot products are cosine similarities.
         """
         masked_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
-        return F.normalize(self.appearance(masked_VNF.transpose(-3, -2).flatten(-2)), dim=-1)
+        of_both_views = masked_VNF.transpose(-3, -2).flatten(-2)
+        has_embedding = self.config.appearance_width > 0
+        return F.normalize(self.appearance(of_both_views) if has_embedding else of_both_views, dim=-1)
 
     def rotation_between(
         self, features_a: torch.Tensor, features_b: torch.Tensor, masks_a: torch.Tensor, masks_b: torch.Tensor
