@@ -233,7 +233,7 @@ def test_settings_out_of_range_are_named(settings, change, message):
         ({"preset": "vima-2m"}, "'vima-2m' encodes prompts with T5.*model.text_encoder"),
         (
             {"preset": "gato-nano", "pretraining.steps": 5},
-            "'gato-nano' with image tokens 'patches' has no appearance embedding",
+            "'gato-nano' with image tokens 'patches' encodes no crops",
         ),
     ],
 )

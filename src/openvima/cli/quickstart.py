@@ -88,10 +88,11 @@ def _generate(folder: Path, demonstrations: int, seed: int, workers: int) -> Pat
 
 
 def _train(data: Path, run: Path, seed: int) -> Path:
-    from openvima.training import TrainingConfig, train
+    from openvima.cli.train import parse, train_in_processes
 
-    with progress_bar("2/3 training") as report:
-        return train(TrainingConfig(data=data, out=run, seed=seed), report)
+    words = ("--data", f"{data}", "--out", f"{run}", "--seed", f"{seed}")
+    words = (*words, "--runtime.processes", f"{min(2, num_cpus())}")
+    return train_in_processes(parse(words), words, label="2/3 training")
 
 
 def _evaluate(run: Path, out: Path, episodes: int, seed: int, workers: int) -> None:

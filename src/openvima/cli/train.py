@@ -25,10 +25,11 @@ The same command resumes an interrupted run from its last checkpoint.
 
 Example: openvima train --data demos --preset nano --out run
 
---recipe selects default settings: "paper" (as in the VIMA paper), "workstation" (one GPU, less data), "nano"
-(minutes on a few cores), "small" (the bundled openvima-small), "midas-pretrain", "midas-finetune" or
-"midas-in-context". The default is "small" for the preset of that name, "nano" for nano presets and your own
-learners, else "paper". --init-from disables the pretraining of recipe and file; set --pretraining.steps to
+--recipe selects default settings: "paper" (as in the VIMA paper), "papers" (its architectures in size nano, on
+two cores), "workstation" (one GPU, less data), "nano" (minutes on a few cores), "small" (the bundled
+openvima-small), "midas-pretrain", "midas-finetune" or "midas-in-context". The default is "small" for the
+preset of that name, "papers" for vima-nano and the like, "nano" for nano, nano-bins and your own learners,
+else "paper". --init-from disables the pretraining of recipe and file; set --pretraining.steps to
 pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
@@ -48,11 +49,23 @@ def run(words: Sequence[str]) -> int:
     Returns:
         Exit status.
     """
+    config = parse(words)
+    folder = train_in_processes(config, words)
+    if os.environ.get("RANK", "0") != "0":
+        return 0
+    trust = " --trust-code" if ":" in config.preset else ""
+    hint = f"`openvima evaluate --policy {shlex.quote(str(folder))}{trust} --out scores` scores it."
+    print(hint, file=sys.stderr)
+    print(folder)
+    return 0
+
+
+def parse(words: Sequence[str]) -> "TrainingConfig":
+    """Parse the settings; those that are not given are of the recipe and the file that are."""
     import tyro
 
     from openvima.multiprocess import num_cpus
-    from openvima.training import TrainingConfig, train
-    from openvima.training.processes import joined_by
+    from openvima.training import TrainingConfig
     from openvima.training.recipes import default_recipe, overridden, read_settings, recipe_settings
 
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -77,13 +90,29 @@ def run(words: Sequence[str]) -> int:
     default = TrainingConfig.of({"data": Path(), "out": Path(), **settings})
     for name in {"data", "out"} - settings.keys():
         object.__setattr__(default, name, tyro.MISSING)  # required, but a config checks that it is a path
-    config = tyro.cli(
+    return tyro.cli(
         TrainingConfig,
         prog="openvima train",
         description=DESCRIPTION,
         args=rest,
         default=default,
     )
+
+
+def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: str = "training") -> Path:
+    """Train in as many processes as the settings ask for, with progress on stderr.
+
+    Args:
+        config: All settings.
+        words: The arguments that `parse` reads them from, for the other processes.
+        label: Of the progress bar.
+
+    Returns:
+        The run folder.
+    """
+    from openvima.training import train
+    from openvima.training.processes import joined_by
+
     log = logging.getLogger("openvima.training")
     log.setLevel(logging.INFO)
     if not log.handlers:
@@ -92,19 +121,10 @@ def run(words: Sequence[str]) -> int:
     others = _num_processes(config) - 1 if "WORLD_SIZE" not in os.environ else 0
     with (
         joined_by(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
-        progress_bar("training") if is_first else nullcontext() as report,
+        progress_bar(label) if is_first else nullcontext() as report,
     ):
         rollout = _rollout(config) if config.rollout.every else None
-        folder = train(
-            config, report, rollout, rollout.animate if rollout and config.rollout.animate else None
-        )
-    if not is_first:
-        return 0
-    trust = " --trust-code" if ":" in config.preset else ""
-    hint = f"`openvima evaluate --policy {shlex.quote(str(folder))}{trust} --out scores` scores it."
-    print(hint, file=sys.stderr)
-    print(folder)
-    return 0
+        return train(config, report, rollout, rollout.animate if rollout and config.rollout.animate else None)
 
 
 class _Lines(logging.Handler):
