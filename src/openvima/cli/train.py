@@ -25,7 +25,7 @@ The same command resumes an interrupted run from its last checkpoint.
 
 Example: openvima train --data demos --preset nano --out run
 
---recipe selects default settings: "paper" (as in the VIMA paper), "papers" (its architectures in size nano, on
+--recipe selects default settings: "paper" (as in the VIMA paper), "papers" (its architectures in size nano,
 two cores), "workstation" (one GPU, less data), "nano" (minutes on a few cores), "small" (the bundled
 openvima-small), "midas-pretrain", "midas-finetune" or "midas-in-context". The default is "small" for the
 preset of that name, "papers" for vima-nano and the like, "nano" for nano, nano-bins and your own learners,
