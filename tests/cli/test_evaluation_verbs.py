@@ -112,6 +112,7 @@ def test_evaluate_then_report(tmp_path, capsys):
     ("words", "message"),
     [
         (["--policy", "oracel"], "Did you mean 'oracle'?"),
+        (["--policy", "oracle,vima-nano"], "untrained:vima-nano has random ones"),
         (["--policy", "oracle", "--tasks", "rotat"], "Did you mean 'rotate'?"),
         (
             ["--policy", "oracle", "--tasks", "sweep_without_exceeding", "--levels", "L3"],
@@ -126,6 +127,15 @@ def test_wrong_input_is_one_line_and_status_2(words, message, tmp_path, capsys):
     error = capsys.readouterr().err.strip()
     assert message in error.splitlines()[-1]
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("words", [["demo", "rotate", "--policy"], ["serve"]])
+def test_a_preset_is_no_policy(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("openvima.serving.serve", lambda policy, **_: pytest.fail("it is served"))
+    assert main([*words, "vima-nano"]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "openvima train --preset vima-nano --data" in error and "untrained:vima-nano" in error
 
 
 def test_a_report_of_nothing_is_status_2(tmp_path, capsys):

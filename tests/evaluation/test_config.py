@@ -126,9 +126,15 @@ def test_a_ablation_that_changes_nothing_for_any_policy_is_an_error():
 
 
 def test_run_folders_are_named_after_themselves_or_as_asked():
-    sources = policy_sources(("runs/first", "best=runs/second", "oracle", "nano"))
-    assert [source.name for source in sources] == ["first", "best", "oracle", "nano"]
+    sources = policy_sources(("runs/first", "best=runs/second", "oracle", "untrained:nano"))
+    assert [source.name for source in sources] == ["first", "best", "oracle", "untrained-nano"]
     assert [source.kind for source in sources] == ["run", "run", "oracle", "untrained"]
+
+
+def test_fresh_weights_are_recorded_with_their_preset():
+    sources = policy_sources(("untrained", "untrained:vima-nano"))
+    recorded = [{"kind": "untrained"}, {"kind": "untrained", "preset": "vima-nano"}]
+    assert [source.record() for source in sources] == recorded
 
 
 def test_two_policies_of_one_name_are_refused():
@@ -156,6 +162,8 @@ def test_an_unknown_policy_is_refused_with_the_names_there_are():
         ("mine=ws://host:1/\x1b[2J", ConfigError),
         ("mine=http://host:1", UnknownPolicyError),
         ("nowhere/runs/first", UnknownPolicyError),
+        ("vima-nano", UnknownPolicyError),
+        ("mine=untrained:vima-nona", UnknownPolicyError),
     ],
 )
 def test_names_of_policies_are_checked_before_any_weights_are_read(monkeypatch, tmp_path, policy, error):

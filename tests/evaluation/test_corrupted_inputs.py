@@ -157,7 +157,7 @@ def test_several_at_once_are_one_ablation_in_one_spelling():
 
 def test_moved_boxes_follow_from_the_episode_and_change_the_actions_of_networks_on_objects():
     pytest.importorskip("torch")
-    env, (nano, random) = begun("rearrange"), (load_policy("nano"), Noting())
+    env, (nano, random) = begun("rearrange"), (load_policy("untrained:nano"), Noting())
     observation, _ = env.reset(seed=3)
     acted = []
     for ablation in ("", "noisy_boxes:8", "noisy_boxes:8"):

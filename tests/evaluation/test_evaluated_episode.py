@@ -86,7 +86,7 @@ def test_no_code_that_results_name_runs_unless_it_is_trusted(
             named = replace(results, policies={"random": {"kind": "run", key: name}})
             assert find_source(tmp_path, named, "random") is None
     nano = replace(results, policies={"random": {"kind": "untrained", "preset": "nano"}})
-    assert find_source(tmp_path, nano, "random") == "nano"
+    assert find_source(tmp_path, nano, "random") == "untrained:nano"
     found = evaluated_episode(evaluation, "random", "rotate", "L1", 60)
     with pytest.raises(PolicyError, match=r"'evil\.py:boxes'.*--trust-code"):
         replace(found, batch=replace(found.batch, boxes="evil.py:boxes")).load_policy()

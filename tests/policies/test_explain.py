@@ -161,4 +161,4 @@ def test_what_cannot_be_explained_is_refused(demos) -> None:
     with pytest.raises(PolicyError, match="Sessions of a server"):
         session.explain()
     with pytest.raises(PolicyError, match=r"Gato has no explain.*openvima-small"):
-        load_policy("gato-nano").explain()
+        load_policy("untrained:gato-nano").explain()

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import CheckpointError, HubError, MissingExtraError, PolicyError, UnknownPolicyError  # noqa: E402
 from openvima.evaluation.sources import weights_hash  # noqa: E402
-from openvima.policies import RandomPolicy, load_policy  # noqa: E402
+from openvima.policies import RandomPolicy, load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, load_network  # noqa: E402
 from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
@@ -123,7 +123,7 @@ def test_without_a_tokenizer_the_error_says_how_to_give_one(published) -> None:
     assert stored is None
     for make in (
         lambda: load_policy(str(published)),
-        lambda: load_policy("vima-2m"),
+        lambda: load_policy("untrained:vima-2m"),
         lambda: NetworkPolicy(network),
     ):
         with pytest.raises(PolicyError, match=r"tokenizer=T5Tokenizer.*policies convert IN OUT --tokenizer"):
@@ -196,10 +196,40 @@ def test_the_hub_is_not_asked_for_a_folder_that_is_here(hub, policy, tmp_path, m
     assert not hub.asked
 
 
-def test_a_folder_named_like_a_preset_is_not_mistaken_for_it(tmp_path, monkeypatch) -> None:
+def test_a_folder_may_have_the_name_of_a_preset(policy, demonstrations, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "nano").mkdir()
-    with pytest.raises(PolicyError, match=r"'nano' is a preset.*write \./nano for the folder"):
-        load_policy("nano")
+    policy.save_pretrained("vima-nano")
+    assert_same_actions(load_policy("vima-nano"), policy, demonstrations)
+
+
+def test_a_folder_named_untrained_is_not_mistaken_for_fresh_weights(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "untrained").mkdir()
+    with pytest.raises(PolicyError, match=r"'untrained' is a network.*write \./untrained for the folder"):
+        load_policy("untrained")
     with pytest.raises(CheckpointError):
-        load_policy("./nano")
+        load_policy("./untrained")
+
+
+@pytest.mark.parametrize("name", ["nano", "vima-nano"])
+def test_a_preset_has_no_weights_and_the_error_says_how_to_get_some(name) -> None:
+    ways = rf"'{name}' is a preset.*`openvima train --preset {name} --data DEMOS --out RUN`.*openvima-small"
+    with pytest.raises(UnknownPolicyError, match=rf"{ways}.*untrained:{name} has random ones"):
+        load_policy(name)
+    with pytest.raises(CheckpointError, match=ways):
+        NetworkPolicy.from_pretrained(name)
+
+
+def test_the_error_for_a_published_preset_names_t5_and_the_published_weights() -> None:
+    with pytest.raises(UnknownPolicyError, match=r"--preset vima-2m --t5 t5-base .*published weights"):
+        load_policy("vima-2m")
+    with pytest.raises(UnknownPolicyError) as refusal:
+        load_policy("gato-2m")
+    assert "--t5 t5-base" in str(refusal.value) and "published" not in str(refusal.value)
+
+
+def test_fresh_weights_of_a_preset_have_a_name() -> None:
+    assert load_policy("untrained:vima-nano").network.config == preset("vima-nano")
+    assert load_policy("untrained").network.config == preset("nano")
+    with pytest.raises(UnknownPolicyError, match=r"no preset 'vima-nona'\. Did you mean 'vima-nano'"):
+        load_policy("untrained:vima-nona")

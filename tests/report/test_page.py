@@ -452,7 +452,7 @@ def test_the_command_names_what_policies_are_whatever_they_are_called(results):
     }
     config = {**results.config, "boxes": "my boxes.py:make"}
     command = default_command(replace(results, policies=kinds, config=config))
-    assert "--policy mine=ws://HOST:PORT,oracle,random=nano --tasks" in command
+    assert "--policy mine=ws://HOST:PORT,oracle,random=untrained:nano --tasks" in command
     assert "--boxes 'my boxes.py:make'" in command
 
 

@@ -1,6 +1,7 @@
 """Each architecture from demonstrations to actions, on the command line."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -90,6 +91,43 @@ def test_without_an_appearance_embedding_there_is_no_pretraining_and_the_image_e
     images = [name for name in fresh if name.startswith("images.")]
     assert all(not torch.equal(fresh[name], trained[name]) for name in images)
     assert_it_acts(tmp_path)
+
+
+def test_a_finished_run_that_is_to_be_longer_names_the_command_that_goes_on(data, tmp_path, capsys) -> None:
+    run = tmp_path / "my run"
+    assert run_train(data, run, "vima-nano", "--schedule.warmup-steps", 2) == 0
+    capsys.readouterr()
+    longer = ["--schedule.warmup-steps", 2, "--schedule.steps", STEPS + 2]
+    assert run_train(data, run, "vima-nano", *longer) != 0
+    error = " ".join(capsys.readouterr().err.split())
+    assert "finished run, whose learning-rate schedule has ended. Train 2 more steps" in error
+    _, command, _ = error.split("`")
+    program, *words = shlex.split(command)
+    assert program == "openvima" and main(words) == 0
+    other = tmp_path / "my run-longer"
+    settings = yaml.safe_load((other / "config.yaml").read_text())["training"]
+    assert (settings["schedule"]["steps"], settings["schedule"]["warmup_steps"]) == (2, 2)
+    assert settings["init_from"] == str(run)
+    assert (other / "checkpoints" / "2-cloning-000002").is_dir()
+
+
+def test_other_changes_of_a_run_name_no_command(data, tmp_path, capsys) -> None:
+    assert run_train(data, tmp_path, "vima-nano") == 0
+    for changes in (["--schedule.steps", 9, "--seed", 1], ["--schedule.steps", 2]):
+        assert run_train(data, tmp_path, "vima-nano", *changes) != 0
+        error = " ".join(capsys.readouterr().err.split())
+        assert "Give the same settings to continue it" in error and "--init-from" not in error
+    state = tmp_path / f"checkpoints/2-cloning-{STEPS:06d}/state.json"
+    state.write_text(state.read_text().replace(f'"step": {STEPS}', '"step": 1'))  # as if it was killed
+    assert run_train(data, tmp_path, "vima-nano", "--schedule.steps", 9) != 0
+    assert "Give the same settings to continue it" in " ".join(capsys.readouterr().err.split())
+
+
+def test_training_from_a_preset_says_that_it_has_no_weights(data, tmp_path, capsys) -> None:
+    assert run_train(data, tmp_path / "run", "vima-nano", "--init-from", "vima-nano") != 0
+    error = " ".join(capsys.readouterr().err.split())
+    assert "'vima-nano' is a preset: sizes of a network, without weights. Train it" in error
+    assert not (tmp_path / "run" / "config.yaml").exists()
 
 
 def test_an_unknown_preset_is_wrong_usage_and_leaves_no_run_folder(data, tmp_path, capsys) -> None:

@@ -34,7 +34,7 @@ def main(
         out: MP4 file to write.
         seed: Number of the episode.
         level: train, L1, L2, L3 or L4; by default the task's first.
-        policy: oracle, openvima-small (bundled), random, untrained, a preset, the
+        policy: oracle, openvima-small (bundled), random, untrained, untrained:PRESET (random weights), the
             folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
             a published file, OWNER/NAME[@REVISION] on the Hub, or a policy server (ws://HOST:PORT).
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,

@@ -61,11 +61,11 @@ def main(
 
     Args:
         policy: One or more of openvima-small (a bundled checkpoint), oracle, random, untrained,
-            presets, folders of training runs, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of
-            your own, published files, OWNER/NAME[@REVISION] on the Hub, policy servers (ws://HOST:PORT, see
-            `openvima serve`) and LeRobot policies (lerobot:PATH or lerobot:OWNER/NAME[@REVISION], see
-            --python), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give another
-            name.
+            untrained:PRESET (random weights), folders of training runs, FILE.py:FUNCTION or MODULE:FUNCTION
+            that makes a policy of your own, published files, OWNER/NAME[@REVISION] on the Hub, policy servers
+            (ws://HOST:PORT, see `openvima serve`) and LeRobot policies (lerobot:PATH or
+            lerobot:OWNER/NAME[@REVISION], see --python), with commas in between; NAME=FOLDER,
+            NAME=FILE.py:FUNCTION and so on give another name.
         tasks: Names of tasks with commas in between; all; or heldout, the four tasks of L4 that training
             does not see. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.

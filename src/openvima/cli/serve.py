@@ -35,8 +35,8 @@ def main(
 
     Args:
         policy: openvima-small (bundled), the folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION
-            that makes a policy of your own, a published file, OWNER/NAME[@REVISION] on the Hub, a preset,
-            random or untrained.
+            that makes a policy of your own, a published file, OWNER/NAME[@REVISION] on the Hub,
+            random, untrained or untrained:PRESET (random weights).
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
         host: Interface to listen on. Any but the loopback interface needs a token.
         token: Word that clients must know; by default that of the environment variable OPENVIMA_SERVE_TOKEN,

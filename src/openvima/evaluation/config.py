@@ -52,10 +52,11 @@ class EvaluationConfig:
     """Configuration of an evaluation.
 
     Args:
-        policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small", a
-            preset, a run folder, a published file, OWNER/NAME[@REVISION] on the Hub, "FILE.py:FUNCTION" or
-            "MODULE:FUNCTION"; or the address of a policy server such as "ws://127.0.0.1:8000". "name=source"
-            gives a name for the results; by default it is that of the folder, file or server.
+        policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small",
+            "untrained:PRESET", a run folder, a published file, OWNER/NAME[@REVISION] on the Hub,
+            "FILE.py:FUNCTION" or "MODULE:FUNCTION"; or the address of a policy server such as
+            "ws://127.0.0.1:8000". "name=source" gives a name for the results; by default it is that of the
+            folder, file or server.
         tasks: Names of tasks, or ("all",) for every task that the level holds, with text
             prompts every one that has a text form.
         levels: From "train", "L1", "L2", "L3", "L4".

@@ -13,11 +13,11 @@ from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
-from openvima.evaluation.sources import PolicySource, weights_hash
+from openvima.evaluation.sources import NAMED_POLICIES, PolicySource, weights_hash
 from openvima.evaluation.verification import recorded_env_config
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.file_names import CHECKPOINTS_FOLDER
-from openvima.policies.presets import PRESETS
+from openvima.policies.presets import PRESETS, UNTRAINED
 from openvima.scene import Episode
 from openvima.scene.command import PRIMITIVES
 from openvima.user_code import is_code
@@ -166,14 +166,14 @@ def find_source(folder: Path, results: Results, policy: str) -> str | None:
         As for `openvima evaluate --policy`; None if it is not found.
     """
     what = results.policies.get(policy, {})
-    for key, known in (("bundled", BUNDLED), ("preset", PRESETS)):
+    for key, known, start in (("bundled", BUNDLED, ""), ("preset", PRESETS, f"{UNTRAINED}:")):
         named = what.get(key)
         if isinstance(named, str) and named in known:  # any other name could be that of code, which would run
-            return named
+            return start + named
     if "preset" in what:  # of another version
         return None
     kind, sha256 = what.get("kind"), what.get("sha256")
-    if kind in ("oracle", "random", "untrained"):
+    if kind in NAMED_POLICIES:
         return str(kind)
     if kind != "run" or not sha256:
         return None

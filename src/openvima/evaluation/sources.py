@@ -20,7 +20,7 @@ from openvima.policies.own_code import (
     policy_of_code,
     tasks_left_out,
 )
-from openvima.policies.presets import PRESETS
+from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
 from openvima.policies.sources import (
     find_checkpoint,
     hub_commit,
@@ -35,7 +35,7 @@ from openvima.user_code import load_function, source_hash, without_folder
 
 ORACLE = "oracle"
 RANDOM = "random"
-NAMED_POLICIES = (ORACLE, RANDOM, "untrained")
+NAMED_POLICIES = (ORACLE, RANDOM, UNTRAINED)
 TRAINED_KINDS = ("run", "code", "remote")  # see `PolicySource.kind`
 _WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
@@ -46,7 +46,7 @@ class PolicySource:
 
     Args:
         name: Name in the results.
-        source: "oracle", "random", "untrained", the name of a preset or of a bundled checkpoint,
+        source: "oracle", "random", "untrained", "untrained:PRESET", the name of a bundled checkpoint,
             what else `load_policy` takes, or the address of a policy server.
         trust_code: Whether to run the code that a run folder names.
     """
@@ -57,7 +57,7 @@ class PolicySource:
 
     @property
     def kind(self) -> str:
-        """What it is: oracle, random, untrained (also for a preset), remote, lerobot, code or run.
+        """What it is: oracle, random, untrained (of any preset), remote, lerobot, code or run.
 
         "code" is a function that makes a policy; "run" is all else.
         """
@@ -65,8 +65,8 @@ class PolicySource:
             return "lerobot"
         if is_remote(self.source):
             return "remote"
-        if self.source in PRESETS:
-            return "untrained"
+        if is_untrained(self.source):
+            return UNTRAINED
         if self.source in NAMED_POLICIES:
             return self.source
         return "code" if is_own_code(self.source) else "run"
@@ -82,7 +82,8 @@ class PolicySource:
         Raises:
             ConfigError: It looks like the address of a server and cannot be one, there is no such function,
                 a run folder names code, which is not trusted, or it is a LeRobot policy that is not served.
-            UnknownPolicyError: There is no such path, and it is not like an id on the Hub.
+            UnknownPolicyError: There is no such path or preset, and it is not like an id on the Hub; or it is
+                a preset, without weights.
         """
         if self.kind == "lerobot":
             raise ConfigError(
@@ -93,6 +94,8 @@ class PolicySource:
             check_address(self.source)
         elif self.kind == "code":
             load_function(self.source, what="policy")
+        elif self.kind == UNTRAINED:
+            untrained_preset(self.source)
         elif code := self.learner:
             code.check(trusted=self.trust_code)
         elif self.kind == "run" and not is_policy_source(self.source):
@@ -131,7 +134,8 @@ class PolicySource:
             left_out = {"excluded_tasks": tasks} if (tasks := tasks_left_out(self.source)) else {}
             what = {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
             return what | ({"hub": resolved} if (resolved := hub_commit(self.source)) else {})
-        return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
+        is_preset = self.kind == UNTRAINED and self.source != UNTRAINED
+        return {"kind": self.kind} | ({"preset": untrained_preset(self.source)} if is_preset else {})
 
     def _seen(self) -> dict[str, list[str]]:
         found = held_out_data(self.source)

@@ -7,7 +7,7 @@ from typing import Any
 from openvima.errors import ConfigError, PolicyError, UnknownPolicyError
 from openvima.policies.base import Policy, RandomPolicy, require_torch
 from openvima.policies.own_code import learner_code, policy_of_code, policy_of_run
-from openvima.policies.presets import PRESETS
+from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
 from openvima.policies.sources import is_own_code, is_policy_source, unknown_policy
 
 
@@ -21,10 +21,11 @@ def load_policy(
     """Load a policy by name, from a folder or file, or from the Hugging Face Hub.
 
     Args:
-        name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; "openvima-small", the
-            bundled checkpoint; a run folder of `openvima train`, of which the best checkpoint is loaded; a
-            checkpoint folder; a published `.ckpt` file; a name on the Hub such as "owner/policy@v1"; or
-            "MODULE:FUNCTION" or "FILE.py:FUNCTION", a function without arguments that returns a policy.
+        name_or_run: "random"; "untrained" or "untrained:PRESET", for fresh weights of nano or of another
+            preset; "openvima-small", the bundled checkpoint; a run folder of `openvima train`, of which the
+            best checkpoint is loaded; a checkpoint folder; a published `.ckpt` file; a name on the Hub such
+            as "owner/policy@v1"; or "MODULE:FUNCTION" or "FILE.py:FUNCTION", a function without arguments
+            that returns a policy.
         seed: Seed of the random policy and of fresh weights.
         trust_code: Whether to run the code that the run folder of a learner of your own names.
         **options: Options of `NetworkPolicy`, such as `tokenizer`, `device` or `dtype`. The random policy
@@ -34,35 +35,36 @@ def load_policy(
         The policy, ready for `reset`.
 
     Raises:
-        UnknownPolicyError: It is neither a known name, nor a path, nor a possible Hub id.
+        UnknownPolicyError: It is neither a known name, nor a path, nor a possible Hub id; or that of a
+            preset, which has no weights.
         CheckpointError: The folder or file holds no readable checkpoint, or the download failed.
         ConfigError: There is no such function, or it raises; the run folder names code, which is not trusted;
             or an extractor is given to a policy of your own.
         PolicyError: A function returns something else than a policy; the policy needs the T5 tokenizer,
-            which is neither stored nor given; or a local folder has the name of a preset, or holds a
+            which is neither stored nor given; or a local folder is named "untrained", or holds a
             checkpoint and has the name of a bundled one.
         MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
     """
     if name_or_run == "random":
         return RandomPolicy(seed)
-    if name_or_run == "untrained" or name_or_run in PRESETS:
+    if is_untrained(name_or_run):
+        name = untrained_preset(name_or_run)
         if Path(name_or_run).is_dir():
             raise PolicyError(
-                f"{name_or_run!r} is a preset, with fresh weights, and a folder here; write ./{name_or_run} "
-                "for the folder, or work elsewhere for the preset."
+                f"{name_or_run!r} is a network with fresh weights, and a folder here; write ./{name_or_run} "
+                "for the folder, or work elsewhere for the network."
             )
         require_torch(f"policy {name_or_run!r}")
         from openvima.policies.build import build_network
         from openvima.policies.inference import NetworkPolicy
         from openvima.policies.presets import preset
 
-        config = preset("nano" if name_or_run == "untrained" else name_or_run)
-        return NetworkPolicy(build_network(config, seed=seed), **options)
+        return NetworkPolicy(build_network(preset(name), seed=seed), **options)
     if is_own_code(name_or_run):
         _check_extractor(name_or_run, options)
         return policy_of_code(name_or_run)
     if not is_policy_source(name_or_run):
-        raise UnknownPolicyError(unknown_policy(name_or_run, ("random", "untrained")))
+        raise UnknownPolicyError(unknown_policy(name_or_run, ("random", UNTRAINED)))
     if code := learner_code(name_or_run):
         code.check(trusted=trust_code)
         _check_extractor(name_or_run, options)

@@ -16,7 +16,7 @@ from openvima.policies.file_names import (
     WEIGHTS_FILE,
     checkpoint_order,
 )
-from openvima.policies.presets import PRESETS
+from openvima.policies.presets import PRESETS, PUBLISHED, UNTRAINED, is_untrained
 from openvima.user_code import is_code
 
 _HUB_FILES = (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*")
@@ -29,6 +29,8 @@ def is_policy_source(text: str) -> bool:
 
 def is_own_code(text: str) -> bool:
     """Whether a text names a function that makes a policy, and no existing path; or a file without one."""
+    if is_untrained(text):
+        return False
     return text.endswith(".py") or (is_code(text) and not Path(text).exists())
 
 
@@ -36,16 +38,32 @@ def unknown_policy(name: str, others: Sequence[str]) -> str:
     """Compose the message for an unknown policy.
 
     Args:
-        name: The name as given.
-        others: Allowed names besides bundled checkpoints and presets.
+        name: The name as given; that of a preset has no weights.
+        others: Allowed names besides bundled checkpoints; where they are none, presets are allowed, too.
     """
+    if name in PRESETS:
+        return f"{_without_weights(name)} {UNTRAINED}:{name} has random ones."
     named = (*others, *BUNDLED)
+    presets = f"{UNTRAINED}:PRESET for a preset" if others else "a preset"
     hint = (
-        f"Allowed: {', '.join(named)}, a preset that `openvima policies` lists, the folder of a training "
+        f"Allowed: {', '.join(named)}, {presets} that `openvima policies` lists, the folder of a training "
         "run, a published .ckpt file, owner/name or owner/name@revision on the Hugging Face Hub, "
         "FILE.py:FUNCTION, MODULE:FUNCTION, or in evaluations ws://HOST:PORT or lerobot:PATH."
     )
     return unknown_name("policy", name, (*named, *PRESETS), hint)
+
+
+def _without_weights(preset: str) -> str:
+    """Compose the message for a preset where weights are expected: how to get some."""
+    architecture, _, size = preset.rpartition("-")
+    needs_t5 = architecture in PUBLISHED and size != "nano"
+    t5 = " --t5 t5-base" if needs_t5 else ""
+    elsewhere = ", or see docs/policies.md for the published weights" if t5 and architecture == "vima" else ""
+    return (
+        f"{preset!r} is a preset: sizes of a network, without weights. Train it (`openvima train --preset "
+        f"{preset}{t5} --data DEMOS --out RUN`) and name the folder RUN, or name a bundled checkpoint "
+        f"({', '.join(BUNDLED)}){elsewhere}."
+    )
 
 
 def find_checkpoint(path_or_hub_id: str | Path) -> Path:
@@ -57,7 +75,8 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
             "owner/policy@v1", which is downloaded.
 
     Raises:
-        CheckpointError: There is no such path, or the installation lacks the weights.
+        CheckpointError: There is no such path, it is the name of a preset, or the installation lacks the
+            weights.
         HubError: The download failed.
         PolicyError: A local folder has the name of a bundled checkpoint and holds a checkpoint, too.
         MissingExtraError: The Hub's client is needed and not installed.
@@ -72,6 +91,8 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
         return path
     if repository := hub_name(name):
         return fetch(repository, _HUB_FILES)
+    if name in PRESETS:
+        raise CheckpointError(_without_weights(name))
     raise CheckpointError(
         f"there is no checkpoint at {name}; give a folder, a .ckpt file, owner/name[@revision] or "
         f"{', '.join(BUNDLED)}."

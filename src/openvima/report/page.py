@@ -11,6 +11,7 @@ from openvima.evaluation.config import DEFAULT_BATCH
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
+from openvima.policies.presets import UNTRAINED
 from openvima.report import episodes, figures, fragments, published, reasons, tables, text
 from openvima.report.ablations import ablated_policies
 from openvima.report.confirmation import Confirmation
@@ -154,6 +155,7 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain values
     """Name a policy for `--policy`, with a placeholder for the path of its weights."""
     kind = what.get("kind")
-    named = what.get("preset") or what.get("bundled") or what.get("source")
+    preset = what.get("preset")
+    named = f"{UNTRAINED}:{preset}" if preset else what.get("bundled") or what.get("source")
     source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
     return name if name == source else f"{name}={source}"

@@ -343,7 +343,7 @@ class TrainingConfig(RunConfig):
     Args:
         preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
             "module:function" for a `Learner` of your own.
-        init_from: Initial weights: another run, or whatever else `load_policy` takes.
+        init_from: Initial weights: another run, or other weights that `load_policy` takes.
         t5: Source of the T5 weights and tokenizer, for presets that use them: a folder, or an id on the
             Hugging Face Hub such as "t5-base".
         assets: Asset pack of pretraining: "procedural", the folder of the original one, or FILE.py:FUNCTION.

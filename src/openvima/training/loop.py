@@ -114,6 +114,7 @@ class Trainer:
         rollout_every: Steps between rollouts.
         animate: Called with the same checkpoints, for experiment trackers.
         demonstrations: Further values that identify the data.
+        going_on: As in `RunFolder`.
 
     Raises:
         CheckpointError: The last checkpoint is damaged.
@@ -132,6 +133,7 @@ class Trainer:
         rollout_every: int | None = None,
         animate: Animate | None = None,
         demonstrations: dict[str, Any] | None = None,  # Any: YAML
+        going_on: str = "",
     ) -> None:
         self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel
         self._on_report, self._rollout, self._rollout_every = report, rollout, rollout_every
@@ -143,6 +145,7 @@ class Trainer:
             force=config.force,
             keep_every=config.schedule.keep_every,
             is_first=parallel.is_first,
+            going_on=going_on,
         )
         parallel.wait()
         self._started, self._cpu_started = time.monotonic(), time.process_time()

@@ -24,6 +24,7 @@ from openvima.training.parallel import Parallel, compile_layers, joined
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
 from openvima.training.provenance import held_out_demonstrations
+from openvima.training.recipes import command_going_on
 from openvima.training.run_folder import run_lock
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import (
@@ -106,6 +107,7 @@ def train(
             rollout_every=config.rollout.every,
             animate=animate,
             demonstrations=_origin(config, dataset, boxes),
+            going_on=command_going_on(config),
         )
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
 
