@@ -97,10 +97,10 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
     **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image),
     `prompt_ambiguous` (descriptions in it fit objects that the replaced images differ from), `success`,
     `failure`, `reason` (why it ended, or empty), `progress` (`goals_met`, a fraction of those required, and
-    `distance_m` and `angle_rad` of the nearest goal that can be met next; NaN if goals state none), `grasped`
-    (id of the object that the last step lifted, or 0), `num_steps`, `joints` (as in observations), `task`,
-    `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of object and texture). The
-    images of the prompt are in `prompt`, an attribute.
+    `distance_m` and `angle_rad` of the nearest goal that can be met next, infinite if goals state none),
+    `grasped` (id of the object that the last step lifted, or 0), `num_steps`, `joints` (as in observations),
+    `task`, `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of object and texture).
+    The images of the prompt are in `prompt`, an attribute.
 
     **Start** — `reset(seed=k)` starts episode k of the environment's domain, task and level: always
     the same bytes. `reset()` draws the next number from the environment's generator.
