@@ -13,10 +13,12 @@ from openvima.cli.main import main
 from openvima.errors import ConfigError, PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.evaluation.config import Batch
+from openvima.evaluation.runner import Job
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy, load_policy
 from openvima.policies.own_code import parameters_hash
+from openvima.report.assets import record_clip
 
 CODE = """
 from openvima.policies import RandomPolicy
@@ -116,6 +118,15 @@ def test_exceptions_in_some_episodes_are_counted_kept_and_verified(file, capsys)
     assert (found["policy"], found["episodes"]) == ("bad", 3)
     assert found["raised"] > 0
     assert verify_results(Path("evaluation")).is_verified
+
+
+def test_an_episode_in_which_the_policy_raises_at_once_has_a_video_too(file):
+    file.write_text(edited("return 1 / 0"))
+    batch = Batch("bad", f"{file}:make", "rotate", "L1", first_seed=1, episodes=1)
+    clip = record_clip(Job(batch, ""), lambda _: None)
+    assert (clip.success, clip.steps) == (False, 0)
+    assert "bad raised ZeroDivisionError" in clip.reason
+    assert clip.video
 
 
 def test_exhausted_memory_is_no_error_of_the_policy(file, capsys):
