@@ -103,6 +103,10 @@ class PolicyError(OpenVimaError, ValueError):
     """Invalid inputs of a policy."""
 
 
+class PolicyRaisedError(PolicyError):
+    """The code of a policy raised in `reset` or `act`."""
+
+
 class DetectionError(OpenVimaError, ValueError):
     """An invalid detection: a box outside the image, or a score that is not a number."""
 

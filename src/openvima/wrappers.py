@@ -252,7 +252,7 @@ def _tool(tool: np.ndarray) -> np.ndarray:
 
 def _potential(progress: Mapping[str, float]) -> float:
     distance = progress["distance_m"] + LEVER_M * progress["angle_rad"]
-    return progress["goals_met"] - (0.0 if np.isnan(distance) else distance)
+    return progress["goals_met"] - (distance if np.isfinite(distance) else 0.0)
 
 
 def _patches(crops: np.ndarray) -> np.ndarray:

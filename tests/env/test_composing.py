@@ -216,10 +216,50 @@ def test_the_step_limit_is_given_or_a_default() -> None:
     assert "1 to 1000" in refusal(OBJECTS, PROMPT, max_steps=0)
 
 
-@pytest.mark.parametrize("prompt", ["", "x" * 1001, "two\nlines", None, "\x1b[2J"])
-def test_prompts_are_one_line_of_limited_length(prompt: object) -> None:
-    with pytest.raises(SceneError, match="1 to 1000 characters"):
+@pytest.mark.parametrize("prompt", ["", "   ", "\n\t\xa0", "x" * 1001, "\u3000" * 5000, None])
+def test_prompts_are_of_limited_length_and_not_blank(prompt: object) -> None:
+    with pytest.raises(SceneError, match="1 to 1000 characters, not blanks alone"):
         compose(OBJECTS, prompt)  # type: ignore[arg-type]  # wrong on purpose
+
+
+@pytest.mark.parametrize(
+    ("prompt", "text"),
+    [
+        ("Mets le {a} dans le {b}\xa0!", "Mets le {a} dans le {b} !"),
+        ("Mets le {a} dans le {b}\u202f!", "Mets le {a} dans le {b} !"),
+        ("{a}を\u3000{b}に入れてください。", "{a}を {b}に入れてください。"),
+        ("{a} را در {b} بگذارید؛ آن\u200cها را.", "{a} را در {b} بگذارید؛ آن\u200cها را."),
+        ("Put the {a}\ninto the {b}.\n", "Put the {a} into the {b}."),
+        ("Put\tthe  {a}.\r\n", "Put the {a}."),
+        ("Put  the {a}.", "Put  the {a}."),
+        (
+            "Look: \U0001f468\u200d\U0001f469\u200d\U0001f467 \U0001fae9",
+            "Look: \U0001f468\u200d\U0001f469\u200d\U0001f467 \U0001fae9",
+        ),
+    ],
+)
+def test_prompts_of_all_languages_are_taken_with_blanks_as_spaces(
+    prompt: str, text: str, tmp_path: Path
+) -> None:
+    episode = compose(OBJECTS, prompt)
+    assert episode.problem.prompt.text == text
+    for suffix in (".yaml", ".json"):
+        assert openvima.load_episode(openvima.save_episode(episode, tmp_path / f"e{suffix}")) == episode
+
+
+def test_a_prompt_of_a_yaml_block_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(
+        "objects:\n- [heart, red, [0.5, 0.0]]\nprompt: |\n  Lift the {a}\n  and wait.\n", encoding="utf-8"
+    )
+    assert openvima.load_episode(tmp_path / "scene.yaml").problem.prompt.text == "Lift the {a} and wait."
+
+
+@pytest.mark.parametrize(
+    ("odd", "name"), [("\x1b", r"U\+001B"), ("\x9b", r"U\+009B"), ("\ud800", r"U\+D800")]
+)
+def test_characters_that_are_not_for_text_are_named(odd: str, name: str) -> None:
+    with pytest.raises(SceneError, match=f"with the character {name}, which is not for text"):
+        compose(OBJECTS, f"Look {odd}[2J.")
 
 
 def test_random_scenes_are_played_or_refused_by_object_and_limit(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import copy
 import itertools
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -71,6 +72,23 @@ def test_images_follow_the_body_on_the_cup_while_it_moves() -> None:
             seen.append(observation["segm"]["front"] == info["grasped"])
     changes = sum((one != other).any() for one, other in itertools.pairwise(seen))
     assert changes > 5
+
+
+@pytest.mark.parametrize(("control", "fps"), [("end_effector", 10), ("primitives", 1)])
+def test_videos_of_steps_last_as_long_as_the_steps(control: str, fps: int) -> None:
+    options = {"control": control, "render_mode": "rgb_array", "modalities": ("joints",)}
+    built = [
+        openvima.make("rotate", **options),
+        gymnasium.make("openvima/rotate-v1", **options),
+        openvima.make_vec("rotate", 2, num_workers=0, **options),
+        openvima.make_vec("rotate", 2, num_workers=1, **options),
+        openvima.make_vec("rotate", 2, num_workers=0, seeds=range(2), **options),
+        gymnasium.make_vec("openvima/rotate-v1", num_envs=2, **options),
+    ]
+    assert [env.metadata["render_fps"] for env in built] == [fps] * len(built)  # RecordVideo reads it
+    assert openvima.TabletopEnv.metadata["render_fps"] == 1  # that of no other environment has changed
+    for env in built:
+        env.close()
 
 
 def test_time_is_limited() -> None:

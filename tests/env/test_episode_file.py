@@ -4,6 +4,7 @@ import random
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -11,7 +12,7 @@ import openvima
 from compose import answer_to, hostile_file, valid_files
 from openvima.errors import ConfigError, InputFileError, SceneError
 from openvima.evaluation import play
-from openvima.scene import Scene
+from openvima.scene import PhotoImage, Pose, Prompt, Scene
 from openvima.tasks import list_tasks, sample_episode, task_spec
 
 HAND_WRITTEN = """
@@ -75,6 +76,74 @@ def test_goals_of_ones_own_cannot_be_saved(tmp_path: Path) -> None:
         openvima.save_episode(episode, tmp_path / "scene.yaml")
     with pytest.raises(InputFileError, match=r"must end in \.yaml, \.yml, \.json"):
         openvima.save_episode(episode, tmp_path / "scene.txt")
+
+
+def prompted(text: str):
+    episode = sample_episode("rotate", seed=1)
+    prompt = replace(episode.problem.prompt, text=episode.problem.prompt.text + text)
+    return replace(episode, problem=replace(episode.problem, prompt=prompt))
+
+
+TEXTS = (
+    *(
+        "\xa0!",
+        "\u202f",
+        "\u3000",
+        "\U0001f468\u200d\U0001f469",
+        "\u200c\u200f\u2066",
+        "\ufeff",
+        "\xad",
+        "\u2028\u2029",
+    ),
+    *(
+        "\n",
+        "\t",
+        " \n  two\n\n",
+        "  ",
+        ": #x",
+        "'\"",
+        "\ue000",
+        "\ufffe",
+        "\U0001fae9",
+        "é\u0301",
+        "null",
+        "- a",
+    ),
+)
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".json"])
+def test_any_text_is_equal_after_saving_and_loading(suffix: str, tmp_path: Path) -> None:
+    for text in (*TEXTS, "".join(TEXTS), " ".join(TEXTS) * 5):
+        episode = prompted(text)
+        loaded = openvima.load_episode(openvima.save_episode(episode, tmp_path / f"e{suffix}"))
+        assert loaded == episode, repr(text)
+
+
+def test_what_could_not_be_loaded_is_not_saved(tmp_path: Path) -> None:
+    episode = sample_episode("rotate", seed=1)
+    scene = episode.problem.scene
+    (first, *_) = scene.placements
+    away = scene.with_poses({first.id: Pose((5.0, 0.0, 0.0))})
+    goal = replace(episode.problem.goals[0], target=Pose((np.inf, 0.0, 0.0)))
+    problem = episode.problem
+    for unfit, message in (
+        (prompted("\x1b[2J"), r"U\+001B, which is not for text"),
+        (prompted("\ud800"), r"U\+D800, which is not for text"),
+        (prompted("x" * 5000), "text of at most 4096 characters"),
+        (replace(episode, problem=replace(problem, scene=away)), "x must lie in"),
+        (replace(episode, problem=replace(problem, goals=(goal,))), "a number from -100 to 100"),
+        (replace(episode, max_steps=10**6), "max_steps is 1000000"),
+        (replace(episode, task="my task"), "give a plain name"),
+        (replace(episode, seed=-1), "seed"),
+    ):
+        with pytest.raises(InputFileError, match=f"cannot be saved, for it could not be loaded: .*{message}"):
+            openvima.save_episode(unfit, tmp_path / "e.yaml")
+    photos = tuple((f"p{n}", PhotoImage(48, 48, bytes(48 * 48 * 3))) for n in range(30))
+    large = replace(problem, prompt=Prompt(" ".join(f"{{{name}}}" for name, _ in photos), photos))
+    with pytest.raises(InputFileError, match=r"it takes \d+ bytes, and 262144 are allowed"):
+        openvima.save_episode(replace(episode, problem=large), tmp_path / "e.yaml")
+    assert not (tmp_path / "e.yaml").exists()
 
 
 def test_photos_outside_the_folder_are_refused(tmp_path: Path) -> None:

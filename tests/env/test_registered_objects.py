@@ -1,15 +1,19 @@
 """Objects of users in the simulator, in composed scenes and in text prompts."""
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from openvima import compose, make
 from openvima.catalog import register_object
-from openvima.scene import AtPose, Scene, Tolerance
+from openvima.scene import Action, AtPose, Scene, Tolerance
+from openvima.tasks import register_task, registry, task_spec
 from openvima.tasks.prompts import rewritten
+from openvima.wrappers import ProgressReward
 from user_shapes import boxes, restored_assets
 
 TRAY = boxes(
@@ -50,6 +54,35 @@ def placed_height_m(container: str) -> float:
     *_, info = env.step(env.oracle_decision().action)
     assert info["success"], info["reason"]
     return env.scene[5].pose.z
+
+
+class NoNumber(Inside):
+    """Its distance is no number."""
+
+    def distance(self, scene: Scene) -> tuple[float, float]:
+        return math.nan, 0.0
+
+
+@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
+@pytest.mark.parametrize("goal", [Inside, NoNumber, None])
+def test_environments_whose_goals_state_no_distance_pass_the_checks_of_gymnasium(
+    goal: type | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objects = [("block", "red", (0.5, -0.3)), ("test tray", "green", (0.5, 0.2))]
+    goals = [] if goal is None else [goal(5, 6)]
+    problem = compose(objects, "Put the {a} into the {b}.", goals=goals).problem
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    pools = task_spec("rotate").pools
+    register_task("own_goal", family="x", template="x.", oracle_max_steps=1, pools=pools)(
+        lambda table: problem
+    )
+    env = make("own_goal")
+    check_env(env, skip_render_check=True)
+    _, info = env.reset(seed=0)
+    assert info["progress"] == {"goals_met": 0.0, "distance_m": math.inf, "angle_rad": math.inf}
+    rewards = ProgressReward(env)
+    rewards.reset(seed=0)
+    assert rewards.step(Action((0.3, 0.0), (0.3, 0.0)).to_arrays())[1] == 0.0
 
 
 def test_objects_go_into_a_hollow_with_a_collision_mesh_and_rest_on_a_hull_without() -> None:

@@ -201,6 +201,25 @@ def test_after_a_reset_that_failed_no_step_moves_anything() -> None:
         envs.step(stack_actions([None, None]))
 
 
+def test_after_a_step_that_failed_no_step_moves_anything(monkeypatch: pytest.MonkeyPatch) -> None:
+    mode = AutoresetMode.NEXT_STEP
+    envs = SyncTabletopEnvs([Faulty, Faulty], ActionValidator(2, mode), mode)
+    envs.reset(seed=[1, 2])
+    actions = stack_actions([None, None])
+
+    def fail(action: object) -> None:
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr(envs.envs[1], "step", fail)
+        envs.step(actions)
+    with pytest.raises(EpisodeError, match=r"0, 1 have no running episode; call reset\(\)"):
+        envs.step(actions)
+    envs.reset(seed=[1, 2])
+    envs.step(actions)
+    envs.step(actions)
+
+
 def test_a_missing_action_becomes_an_idle_one() -> None:
     arrays = CORNER.to_arrays()
     stacked = stack_actions([arrays, None])

@@ -13,9 +13,12 @@ from openvima.cli.main import main
 from openvima.errors import ConfigError, PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.evaluation.config import Batch
+from openvima.evaluation.runner import Job
 from openvima.evaluation.sources import policy_sources
+from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy, load_policy
 from openvima.policies.own_code import parameters_hash
+from openvima.report.assets import record_clip
 
 CODE = """
 from openvima.policies import RandomPolicy
@@ -101,6 +104,29 @@ def test_what_a_policy_does_wrong_is_named_with_task_and_seeds(body, message, fi
     file.write_text(edited(body))
     with pytest.raises(PolicyError, match=message):
         evaluate(EvaluationConfig((f"mine={file}:make",), **CELLS))
+
+
+def test_exceptions_in_some_episodes_are_counted_kept_and_verified(file, capsys):
+    body = "self.n = getattr(self, 'n', 0) + 1; return actions if len(actions) == 1 and self.n < 4 else 1 / 0"
+    file.write_text(edited(body))
+    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "3", "--workers", "1", "--no-report"]
+    assert main(["evaluate", "--policy", f"bad={file}:make", *words]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "episodes of bad ended by an error of the policy; first in rotate, L1, seed" in said
+    assert "bad raised ZeroDivisionError" in said
+    (found,) = json.loads(Path("evaluation/results.json").read_text())["policy_errors"]
+    assert (found["policy"], found["episodes"]) == ("bad", 3)
+    assert found["raised"] > 0
+    assert verify_results(Path("evaluation")).is_verified
+
+
+def test_an_episode_in_which_the_policy_raises_at_once_has_a_video_too(file):
+    file.write_text(edited("return 1 / 0"))
+    batch = Batch("bad", f"{file}:make", "rotate", "L1", first_seed=1, episodes=1)
+    clip = record_clip(Job(batch, ""), lambda _: None)
+    assert (clip.success, clip.steps) == (False, 0)
+    assert "bad raised ZeroDivisionError" in clip.reason
+    assert clip.video
 
 
 def test_exhausted_memory_is_no_error_of_the_policy(file, capsys):

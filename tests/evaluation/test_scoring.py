@@ -2,9 +2,12 @@
 
 import pytest
 
-from openvima.errors import ConfigError, PolicyError, UnknownTaskError
+import openvima
+from openvima.errors import ConfigError, PolicyError, PromptError, UnknownTaskError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
+from openvima.evaluation.results import POLICY_ERROR
 from openvima.policies import RandomPolicy
+from openvima.policies.base import prompt_hash
 
 CELLS = {"tasks": ("rotate", "visual_manipulation"), "levels": ("L1", "L2"), "episodes": 3, "seed": 5}
 
@@ -82,3 +85,72 @@ def test_harder_episodes_leave_out_other_tasks_and_moved_boxes_need_a_network():
 def test_a_name_that_could_be_a_source_is_refused(name):
     with pytest.raises(ConfigError, match=f"polic.*{name.partition('=')[0]}"):
         score({name: RandomPolicy()}, tasks="rotate", levels="L1", episodes=1)
+
+
+class Raising(RandomPolicy):
+    """Raises in the episodes whose numbers among the prompts are given, after some actions."""
+
+    def __init__(self, bad_prompts, *, after=1, error=ZeroDivisionError):
+        super().__init__()
+        self.bad, self.after, self.error = bad_prompts, after, error
+
+    def reset(self, prompts):
+        super().reset(prompts)
+        self.num_acts, self.fails = 0, any(prompt_hash(prompt) in self.bad for prompt in prompts)
+
+    def act(self, observations):
+        if self.fails and self.num_acts == self.after:
+            raise self.error("no idea")
+        self.num_acts += 1
+        return super().act(observations)
+
+
+def prompt_of(task, seed):
+    env = openvima.make(task, level="L1", domain="eval")
+    env.reset(seed=seed)
+    return prompt_hash(env.prompt)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, PromptError, PolicyError])
+def test_a_policy_that_raises_in_one_episode_loses_that_episode_only(error, tmp_path):
+    cells = {"tasks": "visual_manipulation", "levels": "L1", "episodes": 4}
+    bad = {prompt_of("visual_manipulation", 2)}
+    usual = score({"mine": RandomPolicy()}, **cells).rows[0].outcomes
+    results = score({"mine": Raising(bad, error=error)}, **cells)
+    outcomes = results.rows[0].outcomes
+    assert [o for o in outcomes if o.seed != 2] == [o for o in usual if o.seed != 2]
+    assert (outcomes[2].success, outcomes[2].steps, outcomes[2].kind) == (False, 1, POLICY_ERROR)
+    assert "no idea" in outcomes[2].reason
+    assert results.rows[0].failures[POLICY_ERROR] == 1
+    (found,) = results.policy_errors()
+    assert str(found).startswith(
+        "1 of 4 episodes of mine ended by an error of the policy; first in visual_manipulation, L1, seed 2: "
+    )
+    assert Results.read(results.write(tmp_path / "results.json")) == results
+
+
+def test_a_policy_that_raises_in_all_of_a_later_batch_loses_that_batch_only():
+    bad = {prompt_of("visual_manipulation", seed) for seed in (0, 1)}
+    cells = {"tasks": ("rotate", "visual_manipulation"), "levels": "L1", "episodes": 2}
+    results = score({"mine": Raising(bad, after=0)}, **cells)
+    assert [row.failures.get(POLICY_ERROR, 0) for row in results.rows] == [0, 2]
+
+
+def test_a_policy_that_never_acts_is_an_error():
+    bad = {prompt_of("rotate", seed) for seed in (0, 1)}
+    message = (
+        r"mine raised ZeroDivisionError: no idea \(test_scoring.py, line \d+\), in rotate, L1, seeds 0, 1"
+    )
+    with pytest.raises(PolicyError, match=message):
+        score({"mine": Raising(bad, after=0)}, tasks="rotate", levels="L1", episodes=2)
+
+
+def test_a_policy_that_plays_each_episode_but_not_the_batch_is_an_error():
+    class One(RandomPolicy):
+        def reset(self, prompts):
+            if len(prompts) > 1:
+                raise PolicyError("fewer, please")
+            super().reset(prompts)
+
+    with pytest.raises(PolicyError, match="fewer, please"):
+        score({"mine": One()}, tasks="rotate", levels="L1", episodes=2)

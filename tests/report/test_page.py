@@ -10,7 +10,7 @@ import pytest
 
 from openvima.errors import DatasetError
 from openvima.evaluation.comparison import compare
-from openvima.evaluation.results import BAD_ACTION, EpisodeOutcome, Results, Row
+from openvima.evaluation.results import BAD_ACTION, POLICY_ERROR, EpisodeOutcome, Results, Row
 from openvima.report import write_report
 from openvima.report.confirmation import Confirmation
 from openvima.report.curves import read_charts, read_run_charts, run_labels
@@ -337,6 +337,16 @@ def test_invalid_actions_are_counted_for_each_policy_that_has_any(tmp_path):
     text = section(path.read_text(encoding="utf-8"), "failures")
     assert "2 of 2 episodes of mine ended by an invalid action; first in rotate, L1, seed 7: pose0" in text
     assert "is &lt;far&gt; away" in text and "episodes of oracle" not in text
+
+
+def test_errors_of_policies_are_counted_for_each_policy_that_has_any(tmp_path):
+    bad = EpisodeOutcome(7, False, 1, "mine raised <it>.", POLICY_ERROR)
+    path = write_report(Results((Row("mine", "rotate", "L1", 1, (bad, bad)),)), tmp_path / "a.html")
+    text = section(path.read_text(encoding="utf-8"), "failures")
+    assert (
+        "2 of 2 episodes of mine ended by an error of the policy; first in rotate, L1, seed 7: mine" in text
+    )
+    assert "&lt;it&gt;" in text
 
 
 def test_videos_are_kept_beside_the_results(clip, tmp_path):

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from openvima.scene import Action, Pose, Scene
-from openvima.scene.command import MAX_MOVE_M, MAX_TURN_RAD, ToolCommand
+from openvima.scene.command import HIGHEST_TIP_Z_M, MAX_MOVE_M, MAX_TURN_RAD, ToolCommand
 from openvima.sim import World
-from openvima.sim.end_effectors import HOVER_TIP_Z_M
+from openvima.sim.end_effectors import HOVER_TIP_Z_M, PROBE_BELOW_TIP_M, SWEEP_TIP_Z_M
+from openvima.sim.model import FLOOR_Z_M
 from openvima.sim.spatula import SWEEP_M_S
 from openvima.sim.tool_path import PathFollower, onward_path, tool_path
 from openvima.sim.tool_world import MAX_JOINT_SPEED, ToolWorld
-from openvima.sim.ur5 import JOINT_LIMITS, forward, tool_pose
+from openvima.sim.ur5 import JOINT_LIMITS, forward, highest_tip_z, tool_pose
 from sim_tables import ASSETS, random_table, table
 
 ON, OFF = ToolCommand(0, 0, 0, 0, True), ToolCommand(0, 0, 0, 0, False)
@@ -192,3 +193,40 @@ def test_a_path_is_taken_up_where_the_tool_is() -> None:
     assert next_waypoint(block) == pytest.approx((*place, above, 0.6, False), abs=1e-5)
     world.command(ToolCommand(0.0, 0.0, 0.05, 0.0, False))
     assert not world.holds
+
+
+@pytest.mark.parametrize("end_effector", ["suction", "spatula"])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_tool_stops_at_the_rim_of_its_reach_above_its_lowest_height(end_effector, side) -> None:
+    lowest = SWEEP_TIP_Z_M if end_effector == "spatula" else FLOOR_Z_M + PROBE_BELOW_TIP_M
+    for tool in (False, True):
+        for first in ((0, 0, -0.05), (0.05, 0, 0), (0, 0.05 * side, 0), (0.05, 0.05 * side, 0.05)):
+            world = ToolWorld(Scene((), end_effector), ASSETS)
+            for deltas in (
+                first,
+                (0.05, 0.05 * side, 0),
+                (0.05, 0.01 * side, -0.05),
+                (0.01, 0.05 * side, 0.02),
+            ):
+                for _ in range(20):
+                    world.command(ToolCommand(*deltas, 0.0, tool))
+                    pose = world.pose
+                    assert lowest <= pose.z <= HIGHEST_TIP_Z_M
+                    assert pose.z <= highest_tip_z(pose.x, pose.y)
+            assert tool or math.hypot(pose.x, pose.y) > 0.9
+            world.command(ToolCommand(-0.05, -0.05 * side, 0.0, 0.0, tool))
+            assert math.hypot(world.pose.x, world.pose.y) < math.hypot(pose.x, pose.y)  # and leaves it again
+
+
+def test_a_body_beyond_the_height_of_reach_stops_the_cup() -> None:
+    scene = table(("block", 0.74, 0.49, 0.0))
+    tall = scene.with_poses({5: Pose((0.74, 0.49, 0.08))})
+    world = ToolWorld(tall, ASSETS)
+    world._is_settled = True  # it stays in the air
+    go(world, 0.6, 0.49, 0.35, tool=False)
+    go(world, 0.77, 0.52, 0.35, tool=False)
+    go(world, 0.77, 0.40, 0.35, tool=False)
+    for deltas in ((0.01, 0.05, 0.05), (-0.05, 0.05, 0.0), (0.03, 0.0, 0.05), (0.0, -0.05, 0.05)):
+        for _ in range(10):
+            world.command(ToolCommand(*deltas, 0.0, False))
+            assert world.pose.z <= highest_tip_z(world.pose.x, world.pose.y)

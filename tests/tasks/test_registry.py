@@ -12,6 +12,7 @@ from openvima.catalog import Level, Pool, levels_of, pool
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
 from openvima.tasks import list_tasks, register_task, registry, sample_episode, task_spec
 from openvima.tasks.registry import MAX_EPISODE_STEPS
+from openvima.user_code import load_file
 
 TASKS = list_tasks()
 POOLS: dict[Level, Pool] = {"train": pool("rotate", "train")}
@@ -93,6 +94,44 @@ def test_a_level_without_the_task_is_refused() -> None:
 def test_a_name_can_be_registered_once_only() -> None:
     with pytest.raises(ValueError, match="registered twice"):
         register_task("rotate", family="x", template="x.", oracle_max_steps=1)(sample_episode)
+
+
+CELL = """
+from openvima.tasks import register_task, task_spec
+rotate = task_spec("rotate")
+@register_task("again", family="x", template="{steps}.", oracle_max_steps={steps}, pools=rotate.pools)
+def {function}(table):
+    return rotate.sample(table)
+"""
+
+
+@pytest.mark.parametrize("functions", [("sample", "sample"), ("sample", "renamed")])
+def test_code_that_runs_again_replaces_its_own_task(functions, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    for steps, function in enumerate(functions, 1):
+        code = CELL.replace("{steps}", str(steps)).replace("{function}", function)
+        exec(compile(code, f"<cell {steps}>", "exec"), {"__name__": "__main__"})
+        spec = task_spec("again")
+        assert (spec.oracle_max_steps, spec.sample.__name__) == (steps, function)
+        assert sample_episode("again", seed=0).oracle_max_steps == steps
+    other = compile(CELL.replace("{steps}", "3").replace("{function}", "sample"), "elsewhere.py", "exec")
+    with pytest.raises(
+        ConfigError, match=r"'again' is registered twice, by __main__ and elsewhere; task names"
+    ):
+        exec(other, {"__name__": "elsewhere"})
+    assert task_spec("again").oracle_max_steps == 2
+
+
+def test_a_file_under_two_names_and_an_edited_one_replace_their_own_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    file = tmp_path / "cell.py"
+    for steps in (1, 2):
+        file.write_text(CELL.replace("{steps}", str(steps)).replace("{function}", "sample"), encoding="utf-8")
+        load_file(file, what="test")
+        exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), {"__name__": "__main__"})
+        assert task_spec("again").oracle_max_steps == steps
 
 
 def test_a_new_task_may_bring_its_own_pools() -> None:

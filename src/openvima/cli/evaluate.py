@@ -174,8 +174,8 @@ def main(
         print(json.dumps(json.loads(path.read_text(encoding="utf-8"))["rows"]))
     else:
         print_results(results)
-    for invalid in results.invalid_actions():
-        print(f"Warning: {invalid}", file=sys.stderr)
+    for ended in (*results.invalid_actions(), *results.policy_errors()):
+        print(f"Warning: {ended}", file=sys.stderr)
     for name, what in results.policies.items():
         if seen := what.get("held_out_data"):
             print(

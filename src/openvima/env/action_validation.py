@@ -92,10 +92,13 @@ class ActionValidator:
             problems = [f"sub-environment {', '.join(map(str, at))}: {text}" for text, at in places.items()]
             raise ActionError(" ".join(problems) + " Nothing was moved.")
 
+    def begin_step(self) -> None:
+        """Record that the step checked last begins; should it fail, some episodes are a step ahead."""
+        self._needs_reset[:] = True
+
     def record_step(self, is_over: np.ndarray) -> None:
-        """Record which episodes ended in a step, shape (num_envs,), bool."""
-        if self._waits_for_reset:
-            self._needs_reset = np.array(is_over)
+        """Record that the step was executed, and which episodes ended in it, shape (num_envs,), bool."""
+        self._needs_reset = is_over & self._waits_for_reset
 
 
 def reset_option(options: object, name: str) -> Any:

@@ -1,5 +1,6 @@
 """Checks of the plain values that users and their files give for a scene."""
 
+import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import Any  # of whatever type a user gives
 
@@ -7,6 +8,7 @@ from openvima.errors import SceneError, echo, unknown_name
 from openvima.scene import Placement
 
 MAX_ENTRIES = 256
+_NO_TEXT = ("Cc", "Cs")  # categories of Unicode: control characters, halves of surrogate pairs
 
 
 def shown(value: object) -> str:
@@ -20,6 +22,15 @@ def shown(value: object) -> str:
     if isinstance(value, list | tuple) and len(value) <= 4:
         return echo("[" + ", ".join(shown(entry) for entry in value) + "]", 80)
     return f"a {type(value).__name__}"
+
+
+def odd_character(text: str, allowed: str = "") -> str:
+    """Name the first character that is not for text, such as "U+0007"; empty if there is none.
+
+    Joiners, marks of direction and characters that this version of Python does not know are for text.
+    """
+    odd = (c for c in text if unicodedata.category(c) in _NO_TEXT and c not in allowed)
+    return next((f"U+{ord(c):04X}" for c in odd), "")
 
 
 def entries(value: object, label: str) -> Sequence[Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any  # of whatever type a user gives; checked here
 
 from openvima.catalog import object_spec
-from openvima.env.checked_values import entries, handles_hint, known_object, shown
+from openvima.env.checked_values import entries, handles_hint, known_object, odd_character, shown
 from openvima.env.composed_objects import (
     FIELDS,
     SceneObject,
@@ -106,6 +106,22 @@ def _object_image(placement: Placement) -> ObjectImage:
     return ObjectImage(placement, MAGNIFICATION if placement.object == SMALL_BLOCK else 1.0)
 
 
+def _checked_text(text: object) -> str:
+    """Return a text in one line: other blanks than the space, such as ends of lines, become one."""
+    if isinstance(text, str) and len(text) <= 2 * MAX_PROMPT_CHARS and not text.isprintable():
+        text = " ".join(text.split())
+    if not isinstance(text, str) or not text.strip() or len(text) > MAX_PROMPT_CHARS:
+        raise SceneError(
+            f"prompt is {shown(text)}; give 1 to {MAX_PROMPT_CHARS} characters, not blanks alone, such as "
+            "'Put the {a} into the {b}.'"
+        )
+    if odd := odd_character(text):
+        raise SceneError(
+            f"prompt is {shown(text)}, with the character {odd}, which is not for text; leave it out."
+        )
+    return text
+
+
 def composed_prompt(text: object, images: object, fills: ImageMaker) -> Prompt:
     """Make a prompt of its text and the images that a user gives.
 
@@ -113,11 +129,7 @@ def composed_prompt(text: object, images: object, fills: ImageMaker) -> Prompt:
         SceneError: The text or an image is malformed, or a placeholder has no image.
         UnknownObjectError, UnknownTextureError, InputFileError: As for `compose`.
     """
-    if not isinstance(text, str) or not 1 <= len(text) <= MAX_PROMPT_CHARS or not text.isprintable():
-        raise SceneError(
-            f"prompt is {shown(text)}; give one line of 1 to {MAX_PROMPT_CHARS} characters, such as "
-            "'Put the {a} into the {b}.'"
-        )
+    text = _checked_text(text)
     if not isinstance(images, Mapping | None):
         raise SceneError(f"images is {shown(images)}; give a mapping of placeholders to images.")
     slots = image_names(text)

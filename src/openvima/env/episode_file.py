@@ -20,7 +20,7 @@ import yaml
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog import LEVELS, Assets, load_assets, object_spec, texture_spec
-from openvima.env.checked_values import MAX_ENTRIES, shown
+from openvima.env.checked_values import MAX_ENTRIES, odd_character, shown
 from openvima.env.composed_objects import WORKSPACE
 from openvima.env.composing import MAX_STEPS, composed
 from openvima.env.photos import read_photo
@@ -77,11 +77,22 @@ def save_episode(episode: Episode, path: str | Path) -> Path:
         The path.
 
     Raises:
-        InputFileError: The path ends in none of these, or the episode has a goal of a class of one's own.
+        InputFileError: The path ends in none of these, the episode has a goal of a class of one's own, or
+            `load_episode` would refuse it; no file is written.
     """
     path = Path(path)
     is_json, values = _checked_suffix(path) == ".json", episode_values(episode)
+    try:
+        same = episode_values(episode_from_values(values)) == values
+    except OpenVimaError as error:
+        raise InputFileError(f"the episode cannot be saved, for it could not be loaded: {error}") from None
+    if not same:
+        raise InputFileError("the episode cannot be saved, for it would not be loaded equal.")
     text = json.dumps(values, indent=1, ensure_ascii=False) + "\n" if is_json else yaml_text(values)
+    if (size := len(text.encode())) > MAX_EPISODE_BYTES:
+        raise InputFileError(
+            f"the episode cannot be saved: it takes {size} bytes, and {MAX_EPISODE_BYTES} are allowed."
+        )
     return atomic_write_file(path, text)
 
 
@@ -182,7 +193,7 @@ def _encode(value: Any, kind: Any) -> Any:  # Any: a part of an episode, annotat
         }
     if kind == _IMAGES:
         return {name: _encode(fill, PromptFill) for name, fill in value}
-    if isinstance(value, tuple):
+    if isinstance(value, tuple | list):
         kinds = _entry_kinds(kind, len(value))
         return [_encode(entry, entry_kind) for entry, entry_kind in zip(value, kinds, strict=True)]
     if isinstance(value, bytes):
@@ -268,7 +279,11 @@ def _scalar(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, ann
         return value
     if kind is float and type(value) in (int, float) and abs(value) <= _MAX_NUMBER:  # NaN is not
         return float(value)
-    if kind is str and isinstance(value, str) and len(value) <= _MAX_CHARS and value.isprintable():
+    if kind is str and isinstance(value, str) and len(value) <= _MAX_CHARS:
+        if odd := odd_character(value, allowed="\t\n"):
+            raise InputFileError(
+                f"{where} is {shown(value)}, with the character {odd}, which is not for text."
+            )
         return value
     if kind is bytes and isinstance(value, str):
         try:
@@ -279,7 +294,7 @@ def _scalar(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, ann
         float: f"a number from {-_MAX_NUMBER:g} to {_MAX_NUMBER:g}",
         int: "a whole number",
         bool: "true or false",
-        str: f"one line of at most {_MAX_CHARS} characters",
+        str: f"text of at most {_MAX_CHARS} characters",
         bytes: "base64 text",
     }[kind]
     raise InputFileError(f"{where} is {shown(value)}; it must be {allowed}.")

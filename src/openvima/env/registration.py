@@ -49,18 +49,22 @@ def make(task: str, **options: object) -> "TabletopEnv":
 
 
 def register_environments() -> None:
-    """Register all tasks with Gymnasium; idempotent."""
+    """Register all tasks with Gymnasium, those too that are registered later; idempotent."""
+    from openvima.tasks import list_tasks
+    from openvima.tasks.registry import watch_tasks
+
+    watch_tasks(_register_environment)
+    for task in list_tasks():
+        _register_environment(task)
+
+
+def _register_environment(task: str) -> None:
     from gymnasium.envs.registration import register, registry
 
-    from openvima.tasks import list_tasks
-
-    for task in list_tasks():
-        if environment_id(task) not in registry:
-            register(
-                id=environment_id(task),
-                entry_point="openvima.env.tabletop:TabletopEnv",
-                kwargs={"task": task},
-            )
+    if environment_id(task) not in registry:
+        register(
+            id=environment_id(task), entry_point="openvima.env.tabletop:TabletopEnv", kwargs={"task": task}
+        )
 
 
 def register_with_gymnasium() -> None:

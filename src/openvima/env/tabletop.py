@@ -18,7 +18,6 @@ from openvima.env.action_validation import reset_option
 from openvima.env.episode_file import episode_from_values, load_episode
 from openvima.env.object_names import ObjectNames
 from openvima.env.running_episode import (
-    FRAMES_PER_SECOND,
     RUNS,
     PrimitiveRun,
     ToolRun,
@@ -42,6 +41,7 @@ from openvima.scene import (
 from openvima.scene.command import (
     COMMAND_HIGH,
     COMMAND_LOW,
+    CONTROL_HZ,
     END_EFFECTOR,
     PRIMITIVES,
     ToolCommand,
@@ -97,10 +97,10 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
     **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image),
     `prompt_ambiguous` (descriptions in it fit objects that the replaced images differ from), `success`,
     `failure`, `reason` (why it ended, or empty), `progress` (`goals_met`, a fraction of those required, and
-    `distance_m` and `angle_rad` of the nearest goal that can be met next; NaN if goals state none), `grasped`
-    (id of the object that the last step lifted, or 0), `num_steps`, `joints` (as in observations), `task`,
-    `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of object and texture). The
-    images of the prompt are in `prompt`, an attribute.
+    `distance_m` and `angle_rad` of the nearest goal that can be met next, infinite if goals state none),
+    `grasped` (id of the object that the last step lifted, or 0), `num_steps`, `joints` (as in observations),
+    `task`, `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of object and texture).
+    The images of the prompt are in `prompt`, an attribute.
 
     **Start** — `reset(seed=k)` starts episode k of the environment's domain, task and level: always
     the same bytes. `reset()` draws the next number from the environment's generator.
@@ -128,7 +128,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             `reset` is given.
         hide_arm: Leave arm and tool out of the images, as in all published data; else they are ids 2 to 4.
         realtime: Record `frames`, 30 a second, while a step runs.
-        render_mode: None, or "rgb_array": `render` returns both views, front above top.
+        render_mode: None, or "rgb_array": `render` returns both views, front above top, for videos with
+            `metadata["render_fps"]` frames a second: 10 with control "end_effector", the true rate, else 1.
         modalities: What observations hold besides `ee`: of "rgb", "segm", "depth" and "joints".
         control: "primitives", or "end_effector": a step is 0.1 s, an action a float32 array of five numbers,
             dx, dy, dz in metres, dyaw in radians, and above 0.5 for suction, or the spatula's contact.
@@ -142,7 +143,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             task is invalid, or the task has no text form.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012  as in the base
+    # `render` shows the end of a step: at one a second a video of primitives can be followed.
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012  as in the base
 
     def __init__(
         self,
@@ -177,6 +179,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         self.task_options = task_options
         check_control(control)
         self.control = control
+        if control == END_EFFECTOR:
+            self.metadata = {**self.metadata, "render_fps": CONTROL_HZ}
         self.modalities = modalities
         self.action_space = _action_space(control)
         self._rasteriser = Rasteriser(self.assets)

@@ -135,6 +135,7 @@ class SyncTabletopEnvs(SyncVectorEnv):
             ActionError: An action is invalid. No sub-environment moved.
         """
         self._validator.check_step(actions)
+        self._validator.begin_step()
         rewards, terminated, truncated, infos = self._played.step(actions)
         self._validator.record_step(self._played.is_over)
         return copy.deepcopy(self._observations), rewards, terminated, truncated, batch_infos(infos)

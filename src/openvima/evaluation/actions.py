@@ -32,22 +32,29 @@ Steps = list[list[float]]  # the actions of one episode, 12 float32 numbers each
 
 
 class ActionRecorder:
-    """A rollout policy that records the valid actions of another."""
+    """A rollout policy that records the valid actions of another, of the last episode of each environment."""
 
     def __init__(self, policy: RolloutPolicy) -> None:
         self._policy, self._control = policy, PRIMITIVES
-        self.steps: list[Steps] = []  # of each episode
+        self._of_env: dict[TabletopEnv, Steps] = {}
+        self._running: list[Steps] = []
+
+    @property
+    def steps(self) -> list[Steps]:
+        """The actions of each episode, in the order in which the environments first began one."""
+        return list(self._of_env.values())
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start a batch of episodes."""
         self._control = envs[0].control
-        self.steps = [[] for _ in envs]
+        self._running = [[] for _ in envs]
+        self._of_env.update(zip(envs, self._running, strict=True))
         self._policy.begin(envs)
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Pass on the decisions, and record those that are actions."""
         decisions = self._policy.decide(observations)
-        for steps, observation, decision in zip(self.steps, observations, decisions, strict=False):
+        for steps, observation, decision in zip(self._running, observations, decisions, strict=False):
             if observation is not None and (numbers := _numbers(decision, self._control)):
                 steps.append(numbers)
         return decisions

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.env.tabletop import FRAMES_PER_SECOND, TabletopEnv
+from openvima.env.running_episode import FRAMES_PER_SECOND
+from openvima.env.tabletop import TabletopEnv
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies.loading import load_policy

@@ -31,6 +31,7 @@ def record_episode(
     with_prompt: bool = True,
     enlarge: int = ENLARGE,
     explain: bool = False,
+    may_fail: bool = False,
 ) -> EpisodeOutcome:
     """Roll out one episode and record it in real time.
 
@@ -43,6 +44,7 @@ def record_episode(
         with_prompt: Whether to draw the prompt above the scene.
         enlarge: Factor on the benchmark's images.
         explain: Whether to draw what the policy considered beside the scene, at the default size.
+        may_fail: As for `openvima.evaluation.rollout.play`.
 
     Returns:
         How the episode ended.
@@ -55,7 +57,7 @@ def record_episode(
     with EpisodeRecorder(
         env, path, title=title, with_prompt=with_prompt, enlarge=enlarge, explain=explainer
     ) as recorder:
-        (outcome,) = play([env], [start], policy, after_step=recorder.record_step)
+        (outcome,) = play([env], [start], policy, after_step=recorder.record_step, may_fail=may_fail)
         recorder.record_outcome(outcome.success if env.episode.problem.goals else None, outcome.steps)
     return outcome
 

@@ -5,7 +5,7 @@ import json
 import re
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ SCHEMA = 1
 FILE_NAME = "results.json"
 _MAX_BYTES = 1 << 28  # a million episodes
 BAD_ACTION = "invalid action"  # kind of failure
+POLICY_ERROR = "the policy raised an error"  # another
 _LISTS = ("tasks", "levels", "ablations")  # of names, in the configuration
 _TEXTS = ("kind", "sha256", "weights_sha256", "preset", "bundled", "source")  # on a policy
 # What replaying the actions cannot prove.
@@ -158,6 +159,27 @@ class InvalidActions:
 
 
 @dataclass(frozen=True, slots=True)
+class PolicyErrors:
+    """Episodes of one policy that ended by an exception of its code, under any ablation.
+
+    Args:
+        policy: Name of the policy.
+        raised: Number of such episodes.
+        episodes: Number of all its episodes.
+        first: Task, level and seed of the first one, and the exception.
+    """
+
+    policy: str
+    raised: int
+    episodes: int
+    first: str
+
+    def __str__(self) -> str:
+        count = f"{self.raised} of {self.episodes} episodes of {self.policy}"
+        return f"{count} ended by an error of the policy; {self.first}"
+
+
+@dataclass(frozen=True, slots=True)
 class Results:
     """A finished evaluation.
 
@@ -228,25 +250,31 @@ class Results:
 
     def invalid_actions(self) -> list[InvalidActions]:
         """Count invalid actions by policy, for the policies that have any."""
-        found = []
+        return [InvalidActions(*found) for found in self._ended_by(BAD_ACTION)]
+
+    def policy_errors(self) -> list[PolicyErrors]:
+        """Count exceptions of policies in `reset` and `act`, for the policies that have any."""
+        return [PolicyErrors(*found) for found in self._ended_by(POLICY_ERROR)]
+
+    def _ended_by(self, kind: str) -> Iterator[tuple[str, int, int, str]]:
+        """Policy, number of its episodes that ended by a kind of failure, number of all, and the first."""
         for policy in self.policy_names():
             rows = [row for row in self.rows if row.policy == policy]
-            invalid = [(r, o) for r in rows for o in r.outcomes if o.kind == BAD_ACTION]
-            if invalid:
-                row, outcome = invalid[0]
+            ended = [(row, outcome) for row in rows for outcome in row.outcomes if outcome.kind == kind]
+            if ended:
+                row, outcome = ended[0]
                 first = f"first in {row.task}, {row.level}, seed {outcome.seed}: {outcome.reason}"
-                episodes = sum(row.episodes for row in rows)
-                found.append(InvalidActions(policy, len(invalid), episodes, first))
-        return found
+                yield policy, len(ended), sum(row.episodes for row in rows), first
 
     def to_json(self) -> str:
         """Return the text of `results.json`; equal results give equal bytes."""
-        invalid = self.invalid_actions()
+        invalid, raised = self.invalid_actions(), self.policy_errors()
         content = {
             "schema": SCHEMA,
             "rows": [_row_record(row) for row in self.rows],
             "levels": [_level_record(mean) for mean in self.level_means()],
             **({"invalid_actions": [asdict(found) for found in invalid]} if invalid else {}),
+            **({"policy_errors": [asdict(found) for found in raised]} if raised else {}),
             "policies": self.policies,
             "config": self.config,
             "versions": self.versions,

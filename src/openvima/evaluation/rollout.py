@@ -4,9 +4,19 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from openvima.env.tabletop import TabletopEnv
-from openvima.errors import ActionError, OracleError
-from openvima.evaluation.results import BAD_ACTION, EpisodeOutcome, failure_kind
+from openvima.errors import (
+    ActionError,
+    DetectionError,
+    OpenVimaError,
+    OracleError,
+    PolicyError,
+    PolicyRaisedError,
+    PromptError,
+    ShapeError,
+)
+from openvima.evaluation.results import BAD_ACTION, POLICY_ERROR, EpisodeOutcome, failure_kind
 from openvima.evaluation.rollout_policies import Decision, RolloutPolicy
+from openvima.memory import lacks_memory
 from openvima.scene import Episode
 from openvima.scene.goal import object_of
 
@@ -15,6 +25,8 @@ WRONG_PICKED = "only wrong objects were picked up within the step limit"
 NO_GOALS = "the step limit is reached; the episode has no goals"
 OUT_OF_STEPS = "not done within the step limit"
 NO_ORACLE_ACTION = "the oracle has no action"
+# What one prompt or observation may cause, unlike a lost server or a missing package.
+_OF_EPISODES = (PolicyError, PromptError, DetectionError, ShapeError, ActionError)
 
 
 class EpisodeSlot:
@@ -54,6 +66,10 @@ class EpisodeSlot:
         else:
             self.observation = self.env.observe()
         return None
+
+    def fail(self, error: OpenVimaError) -> None:
+        """End the episode by an error of the policy."""
+        self._end(str(error), POLICY_ERROR)
 
     def _why_not_done(self, picks: bool) -> tuple[str, str]:
         """Say what was lacking at the end of the steps, with numbers and without."""
@@ -100,8 +116,12 @@ def play(
     policy: RolloutPolicy,
     *,
     after_step: Callable[[TabletopEnv], None] | None = None,
+    may_fail: bool = False,
 ) -> list[EpisodeOutcome]:
     """Play one episode in each environment.
+
+    Where the policy raises, the episodes that are not over are played again one by one, from their starts;
+    those in which it raises again have failed.
 
     Args:
         envs: Environments of one task and level.
@@ -109,20 +129,57 @@ def play(
         policy: Decides the actions; its `modalities` become those of the environments.
         after_step: Called with an environment after each of its steps, for recording; an action that is
             refused is no step.
+        may_fail: The policy may raise before the first action of every episode.
 
     Returns:
         How each episode ended, in the order of `starts`.
 
     Raises:
-        PolicyError: The policy left out an episode that is not over, or gave a wrong number of actions.
+        PolicyError: The policy raised before the first action of every episode, or cannot act in so many
+            episodes at once.
     """
     if (modalities := getattr(policy, "modalities", None)) is not None:
         for env in envs:
             env.modalities = modalities
     slots = [EpisodeSlot(env, start) for env, start in zip(envs, starts, strict=True)]
-    policy.begin(envs)
+    error = _play_together(slots, policy, after_step)
+    if error is None:
+        return _outcomes(slots)
+    running = [index for index, slot in enumerate(slots) if slot.outcome is None]
+    if len(running) == 1:
+        slots[running[0]].fail(error)
+    else:
+        for index in running:
+            slots[index] = EpisodeSlot(envs[index], starts[index])
+            if (own := _play_together([slots[index]], policy, after_step)) is not None:
+                slots[index].fail(own)
+    outcomes = _outcomes(slots)
+    is_of_batch = not isinstance(error, PolicyRaisedError) and all(o.kind != POLICY_ERROR for o in outcomes)
+    never_acts = all(outcome.kind == POLICY_ERROR and not outcome.steps for outcome in outcomes)
+    if is_of_batch or (never_acts and not may_fail):
+        raise error
+    return outcomes
+
+
+def _outcomes(slots: Sequence[EpisodeSlot]) -> list[EpisodeOutcome]:
+    return [slot.outcome for slot in slots if slot.outcome is not None]
+
+
+def _play_together(
+    slots: Sequence[EpisodeSlot], policy: RolloutPolicy, after_step: Callable[[TabletopEnv], None] | None
+) -> OpenVimaError | None:
+    """Step all environments until every episode is over; return the error of the policy before that."""
+    has_begun = False
     while any(slot.outcome is None for slot in slots):
-        decisions = policy.decide([slot.observation for slot in slots])
+        try:
+            if not has_begun:
+                policy.begin([slot.env for slot in slots])
+                has_begun = True
+            decisions = policy.decide([slot.observation for slot in slots])
+        except _OF_EPISODES as error:
+            if lacks_memory(error):
+                raise
+            return error
         near_ties = policy.near_ties() or [False] * len(slots)
         for slot, decision, is_near_tie in zip(slots, decisions, near_ties, strict=True):
             if slot.outcome is None:
@@ -131,4 +188,4 @@ def play(
                 slot.step(decision)
                 if after_step is not None and slot.steps > steps:
                     after_step(slot.env)
-    return [slot.outcome for slot in slots if slot.outcome is not None]
+    return None

@@ -11,7 +11,14 @@ import numpy as np
 
 from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import OpenVimaError, OracleError, PolicyError, UnknownWordWarning, echo
+from openvima.errors import (
+    OpenVimaError,
+    OracleError,
+    PolicyError,
+    PolicyRaisedError,
+    UnknownWordWarning,
+    echo,
+)
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource
@@ -165,7 +172,9 @@ class PromptedRolloutPolicy:
         except OpenVimaError:
             raise
         except Exception as error:
-            raise PolicyError(f"{self._name} raised {described(error)}, in {_episodes(envs)}.") from error
+            raise PolicyRaisedError(
+                f"{self._name} raised {described(error)}, in {_episodes(envs)}."
+            ) from error
 
     def explainer(self) -> Explainer:
         """Return the method with which the policy explains its last actions.

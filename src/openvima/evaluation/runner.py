@@ -62,10 +62,14 @@ class Rollouts:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A batch, and a fingerprint of what else its outcomes depend on."""
+    """A batch, a fingerprint of what its outcomes also need, and whether its policy may raise throughout.
+
+    A policy that raises in all of its first batch is an error, not a result.
+    """
 
     batch: Batch
     fingerprint: str
+    may_fail: bool = False
 
     @property
     def episode(self) -> tuple[str, str, str, int]:
@@ -234,8 +238,13 @@ def _jobs(prepared: PreparedEvaluation) -> list[Job]:
     source = source_hash(assets, what="assets") if is_code(assets) else ""
     code = [prepared.versions, source]
     prints = {name: json.dumps([what, *code], sort_keys=True) for name, what in prepared.policies.items()}
+    first = {batch.policy: batch for batch in reversed(prepared.batches)}
     return [
-        Job(batch, prints[batch.policy] + (prepared.boxes if batch.boxes else ""))
+        Job(
+            batch,
+            prints[batch.policy] + (prepared.boxes if batch.boxes else ""),
+            batch is not first[batch.policy],
+        )
         for batch in prepared.batches
     ]
 
@@ -247,7 +256,7 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Ro
         return
     from openvima.ray_backend import ray_imap_unordered
 
-    sent = {Job(job.batch.with_whole_paths(), job.fingerprint): job for job in jobs}
+    sent = {replace(job, batch=job.batch.with_whole_paths()): job for job in jobs}
     workers = config.workers or (1 if config.address is None else None)
     for job, played in ray_imap_unordered(play_batch, list(sent), workers, address=config.address):
         yield sent[job], played
@@ -261,7 +270,7 @@ def play_batch(job: Job, count: Callable[[int], None]) -> Rollouts:
     with one_thread(batch):
         recorder = ActionRecorder(load_rollout_policy(batch, job.fingerprint))
         envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
-        outcomes = tuple(play(envs, batch.seeds, recorder))
+        outcomes = tuple(play(envs, batch.seeds, recorder, may_fail=job.may_fail))
     count(len(outcomes))
     return Rollouts(outcomes, tuple(recorder.steps))
 

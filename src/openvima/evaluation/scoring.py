@@ -43,13 +43,15 @@ def score(
         control: "primitives" or "end_effector"; that of all the policies.
 
     Returns:
-        Success rates and the outcome of every episode.
+        Success rates and the outcome of every episode. One in which the policy raises has failed;
+        `Results.policy_errors` counts them.
 
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
         ConfigError: There is no episode, or the name of a policy, a task option or an ablation does not fit.
-        PolicyError: A policy lacks a method, raises, or gives something else than an action for each episode.
+        PolicyError: A policy lacks a method, or never acts in its first batch: it raises, or gives something
+            else than an action for each episode.
 
     Example:
         >>> from openvima.policies import RandomPolicy
@@ -80,6 +82,7 @@ def score(
         )
     batches = plan(config)
     outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}
+    begun: set[str] = set()
     for batch in batches:
         envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         given = policies.get(batch.policy)
@@ -88,7 +91,9 @@ def score(
             if given is None
             else PromptedRolloutPolicy(given, batch.ablation, name=batch.policy)
         )
-        outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy))
+        may_fail = batch.policy in begun  # a policy that fails from the start is an error, no result
+        outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy, may_fail=may_fail))
+        begun.add(batch.policy)
     kinds = {
         source.name: {"kind": "object", **object_record(policies[source.name])}
         if source.name in policies

@@ -15,7 +15,7 @@ from openvima.evaluation.ablations import ablated_environment
 from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import EvaluationConfig, cells
 from openvima.evaluation.results import DECLARED, FILE_NAME, EpisodeOutcome, Results, ResultsFile, Row
-from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, play
+from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR, play
 from openvima.evaluation.runner import Report
 from openvima.evaluation.versions import versions
 from openvima.input_files import read_json
@@ -23,7 +23,8 @@ from openvima.multiprocess import imap_unordered
 
 VERIFICATION_NAME = "verification.json"
 _SIMULATOR = ("environments", "mujoco")  # versions that decide what an action does
-_ENDED_EARLY = (BAD_ACTION, NO_ORACLE_ACTION)  # no action was executed; which one was given is not recorded
+# No action was executed; which one was given, or what was raised, is not recorded.
+_ENDED_EARLY = (BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR)
 _BATCH = 16  # episodes of one job
 
 

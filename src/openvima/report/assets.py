@@ -191,7 +191,7 @@ def record_clip(job: Job, count: Callable[[int], None]) -> Clip:
     with tempfile.TemporaryDirectory() as folder, one_thread(batch):
         path = Path(folder, "video.mp4")
         policy = load_rollout_policy(batch, job.fingerprint)
-        outcome = record_episode(env, policy, batch.first_seed, path, with_prompt=False)
+        outcome = record_episode(env, policy, batch.first_seed, path, with_prompt=False, may_fail=True)
         video = path.read_bytes()
     count(1)
     return Clip(

@@ -29,6 +29,7 @@ _PART_TICKS = round(1 / (CONTROL_HZ * _NUM_PARTS * TICK_S))
 _LOWEST_CUP_Z_M = FLOOR_Z_M + tools.PROBE_BELOW_TIP_M
 _TOUCH_M = 5e-4  # the cup grasps what is this near below it
 _BISECTIONS = 12
+_ROUNDING_M = 1e-9  # of the greatest height that the arm reaches
 _PART_S = _PART_TICKS * TICK_S
 
 
@@ -214,7 +215,10 @@ class ToolWorld:
         return found
 
     def _after(self, motion: tuple[float, float, float, float], fraction: float) -> ToolPose:
-        """The pose after a fraction of a motion; it slides along the bounds and the limit of the height."""
+        """The pose after a fraction of a motion; it slides along the bounds and the limits of the height.
+
+        Near the rim the lowest height may lie beyond the arm: such a pose cannot be reached.
+        """
         pose, (dx, dy, dz, turn) = self._pose, motion
         x, y = (
             min(max(at + fraction * delta, low - _MARGIN_M), high + _MARGIN_M)
@@ -222,11 +226,14 @@ class ToolWorld:
                 (pose.x, pose.y), (dx, dy), WORKSPACE_LOW, WORKSPACE_HIGH, strict=True
             )
         )
+        z = self._within_height(x, y, pose.z + fraction * dz)
+        return ToolPose(x, y, z, pose.yaw_rad + fraction * turn)
+
+    def _within_height(self, x: float, y: float, z: float) -> float:
+        """The nearest height at which the tool may be above a point."""
         highest = min(HIGHEST_TIP_Z_M, ur5.highest_tip_z(x, y) - tools.REACH_RESERVE_M)
         lowest = tools.SWEEP_TIP_Z_M if self._scene.end_effector == "spatula" else _LOWEST_CUP_Z_M
-        return ToolPose(
-            x, y, min(max(pose.z + fraction * dz, lowest), highest), pose.yaw_rad + fraction * turn
-        )
+        return max(min(z, highest), lowest)
 
     def _can_reach(self, pose: ToolPose) -> bool:
         try:
@@ -249,8 +256,8 @@ class ToolWorld:
         """Stop at the first contact from above, and beside what is in the way; lifting is always free."""
         pose, highest = self._pose, max(self._pose.z, target.z)
         lowest = self._lowest_z(target)
-        if lowest > highest + _TOUCH_M:
-            target = replace(pose, z=target.z)
+        if lowest > min(highest + _TOUCH_M, _greatest_z(target.x, target.y)):
+            target = replace(pose, z=self._within_height(pose.x, pose.y, target.z))
             lowest = min(self._lowest_z(pose), pose.z)
         return replace(target, z=max(target.z, lowest))
 
@@ -282,3 +289,8 @@ class ToolWorld:
             if self._settling.is_over:
                 self._settling = None
                 return
+
+
+def _greatest_z(x: float, y: float) -> float:
+    """Height up to which contacts may raise the tool, in metres."""
+    return min(HIGHEST_TIP_Z_M, ur5.highest_tip_z(x, y) - _ROUNDING_M)

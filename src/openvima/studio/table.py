@@ -7,7 +7,7 @@ import numpy as np
 import viser
 
 from openvima.catalog.geometry import Assets
-from openvima.env.tabletop import FRAMES_PER_SECOND, VideoFrame
+from openvima.env.running_episode import FRAMES_PER_SECOND, VideoFrame
 from openvima.render.gltf import Shape, coloured_glb, object_glb
 from openvima.render.rasteriser import SHEET_RGB, SHEET_SIZE
 from openvima.render.raycast import Hit, first_hit

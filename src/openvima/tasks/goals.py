@@ -87,7 +87,7 @@ def measure(problem: Problem, progress: Progress, scene: Scene) -> dict[str, flo
     Returns:
         `goals_met`: fraction of the required goals that are met, 0 … 1; 0 without goals. `distance_m` and
         `angle_rad`: how far the nearest of the goals that can be met next is from its target. Both are 0 once
-        `goals_met` is 1, and NaN if no goal states a distance.
+        `goals_met` is 1, and infinite if no goal states a distance (unlike NaN equal in equal episodes).
     """
     num_goals = len(problem.goals)
     num_required = num_goals if problem.num_required is None else problem.num_required
@@ -97,9 +97,9 @@ def measure(problem: Problem, progress: Progress, scene: Scene) -> dict[str, flo
         return {"goals_met": 1.0, "distance_m": 0.0, "angle_rad": 0.0}
     stage = problem.stage_of(progress.open_goals[0]) if progress.open_goals else range(0)
     distances = [distance_to(problem.goals[i], scene) for i in progress.open_goals if i in stage]
-    stated = [distance for distance in distances if distance is not None]
+    stated = [distance for distance in distances if distance is not None and not math.isnan(sum(distance))]
     distance_m, angle_rad = min(
-        stated, key=lambda distance: distance[0] + LEVER_M * distance[1], default=(math.nan, math.nan)
+        stated, key=lambda distance: distance[0] + LEVER_M * distance[1], default=(math.inf, math.inf)
     )
     return {"goals_met": goals_met, "distance_m": distance_m, "angle_rad": angle_rad}
 

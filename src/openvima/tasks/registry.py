@@ -100,6 +100,7 @@ class TaskSpec:
 
 
 _TASKS: dict[str, TaskSpec] = {}
+_WATCHERS: list[Callable[[str], None]] = []
 
 
 def register_task(
@@ -113,6 +114,8 @@ def register_task(
     distractors_allowed: bool = False,
 ) -> Callable[[SampleFunction], SampleFunction]:
     """Register a task; decorates its `sample` function.
+
+    Code that runs again, as a cell of a notebook or a reloaded module, replaces its own task.
 
     Args:
         name: Name of the task: up to 100 letters, digits, "_" and "-", of ASCII.
@@ -128,8 +131,8 @@ def register_task(
         The decorator, which returns the function unchanged.
 
     Raises:
-        ConfigError: The name is already registered or no plain name, there are no pools, one is of no level,
-            there is no such end effector, or episodes would have more than 20 steps.
+        ConfigError: Another module registered the name, or it is no plain name, there are no pools, one is of
+            no level, there is no such end effector, or episodes would have more than 20 steps.
     """
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ConfigError(
@@ -146,8 +149,12 @@ def register_task(
             raise ConfigError(f"pools of task {name!r}: {unknown_name('level', level, LEVELS)}")
 
     def register(sample: SampleFunction) -> SampleFunction:
-        if name in _TASKS:
-            raise ConfigError(f"task {name!r} is registered twice; task names are unique.")
+        known = _TASKS.get(name)
+        if known is not None and not _is_of_same_module(known.sample, sample):
+            raise ConfigError(
+                f"task {name!r} is registered twice, by {known.sample.__module__} and {sample.__module__}; "
+                "task names are unique."
+            )
         _TASKS[name] = TaskSpec(
             name=name,
             families=(family,) if isinstance(family, str) else tuple(family),
@@ -159,9 +166,24 @@ def register_task(
             sample=sample,
             distractors_allowed=distractors_allowed,
         )
+        for watch in _WATCHERS:
+            watch(name)
         return sample
 
     return register
+
+
+def watch_tasks(watch: Callable[[str], None]) -> None:
+    """Have a function called with the name of each task that is registered from now on."""
+    if watch not in _WATCHERS:
+        _WATCHERS.append(watch)
+
+
+def _is_of_same_module(one: SampleFunction, other: SampleFunction) -> bool:
+    """Whether two functions come from one module, or from one file that was imported under two names."""
+    codes = (getattr(sample, "__code__", None) for sample in (one, other))
+    files = [code and code.co_filename for code in codes]
+    return one.__module__ == other.__module__ or (files[0] == files[1] and Path(files[0] or "").is_file())
 
 
 def check_steps(task: str, oracle_max_steps: int) -> None:

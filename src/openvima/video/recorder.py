@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from openvima.env.tabletop import FRAMES_PER_SECOND, TabletopEnv, VideoFrame
+from openvima.env.running_episode import FRAMES_PER_SECOND
+from openvima.env.tabletop import TabletopEnv, VideoFrame
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene
 from openvima.scene.explanation import Explanation
