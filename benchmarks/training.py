@@ -1,6 +1,6 @@
 """How much faster a training step is than in another checkout: both do the same steps in turns.
 
-    python benchmarks/training.py --base CHECKOUT --data DIR [--presets vima-nano,midas-nano,small] [--json FILE]
+    python benchmarks/training.py --base CHECKOUT --data DIR [--presets NAME,…] [--rounds N] [--json FILE]
 
 Behaviour cloning of 64 demonstrations of all tasks in DIR on one core, forward, backward and AdamW, without
 pretraining. Times are CPU time of a step, the median of all rounds; the ratio is time before over time now.
