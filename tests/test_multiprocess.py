@@ -53,6 +53,25 @@ def test_a_killed_worker_is_reported() -> None:
         list(imap_unordered(worker_jobs.die, [0, 1, 2], 2, report=lambda count: None))
 
 
+@pytest.mark.parametrize("way", ["file", "standard input"])
+def test_a_script_without_a_guard_is_named_and_not_a_lack_of_memory(tmp_path: Path, way: str) -> None:
+    """Workers import the script, which would start workers again; standard input they cannot import."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import worker_jobs; from openvima.multiprocess import imap_unordered\n"
+        "list(imap_unordered(worker_jobs.fail, [0, 2], 2))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with script.open() as stdin:
+        words = [sys.executable, str(script) if way == "file" else "-"]
+        ended = subprocess.run(
+            words, env=environment, stdin=stdin, capture_output=True, text=True, check=False
+        )
+    (last,) = ended.stderr.splitlines()[-1:]
+    assert last.startswith("openvima.errors.WorkerError: the worker processes could not start.")
+    assert 'if __name__ == "__main__":' in last and "memory" not in last
+
+
 def test_one_worker_counts_over_all_items(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     counts = []

@@ -24,6 +24,14 @@ WORKER_VARIABLES = {
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
 }
+_KILLED = (
+    "a worker process was killed (often for lack of memory; --workers lowers the need). "
+    "Whole files were kept, and the same command continues."
+)
+_NOT_STARTED = (
+    "the worker processes could not start. They import your script, which must be a file where all that runs "
+    'stands below `if __name__ == "__main__":`; workers=1 needs no such process.'
+)
 # In a worker: the shared array of counts. Any: multiprocessing has no public type for it.
 _counters: Any = None
 
@@ -54,7 +62,7 @@ def imap_unordered(
 
     Raises:
         ConfigError: `num_workers` is out of range.
-        WorkerError: A worker was killed.
+        WorkerError: A worker was killed, or none could start.
         Exception: Any exception of a job; the other jobs are stopped.
     """
     watch = None if report is None else (lambda counts: report(sum(row[0] for row in counts)))
@@ -87,8 +95,8 @@ def imap_with_progress(
         yield from _run_serially(job, items, num_counts, watch)
         return
     context = multiprocessing.get_context("spawn")
-    # One row per job: no lock that a killed worker could hold.
-    counters = context.RawArray("q", len(items) * num_counts)
+    # One row per job, and whether a worker has started: no lock that a killed worker could hold.
+    counters = context.RawArray("q", len(items) * num_counts + 1)
     others = set(multiprocessing.active_children())
     with single_threaded_workers():
         pool = ProcessPoolExecutor(
@@ -104,10 +112,7 @@ def imap_with_progress(
                     yield pending.pop(future), future.result()
                 watch(_rows(counters, num_counts))
         except BrokenProcessPool:
-            raise WorkerError(
-                "a worker process was killed (often for lack of memory; --workers lowers the need). "
-                "Whole files were kept, and the same command continues."
-            ) from None
+            raise WorkerError(_KILLED if counters[-1] else _NOT_STARTED) from None
         except BaseException:  # a job's own error, or Ctrl-C
             for process in set(multiprocessing.active_children()) - others:
                 process.terminate()
@@ -207,6 +212,7 @@ def exit_with_parent(timeout_s: float | None = PARENT_END_S) -> None:
 def _start_worker(counters: Any) -> None:  # Any: see `_counters`
     global _counters
     _counters = counters
+    counters[-1] = 1
     init_worker()
 
 
@@ -220,5 +226,5 @@ def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:  # Any: se
 
 
 def _rows(counters: Any, num_counts: int) -> Counts:  # Any: see `_counters`
-    flat = counters[:]
+    flat = counters[:-1]
     return [flat[first : first + num_counts] for first in range(0, len(flat), num_counts)]
