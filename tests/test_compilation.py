@@ -1,4 +1,4 @@
-"""Where compiled functions and other derived files are kept, and what stands for the home."""
+"""Where compiled functions and other derived files are kept."""
 
 import importlib.util
 import os
@@ -12,7 +12,7 @@ import pytest
 from openvima import compilation
 from openvima.catalog.cache import cached_array
 from openvima.errors import ConfigError
-from openvima.paths import as_path, cache_dir, expand_home
+from openvima.paths import as_path, cache_dir
 
 KERNEL = "from openvima.compilation import njit\n\n@njit\ndef double(value):\n    return 2 * value\n"
 
@@ -105,27 +105,3 @@ def test_a_user_without_a_home_has_a_cache(homeless: Path) -> None:
 def test_a_home_that_is_not_known_is_named(homeless: Path) -> None:
     with pytest.raises(ConfigError, match="'~/run' needs a home folder"):
         as_path("~/run")
-
-
-@pytest.mark.parametrize(
-    ("given", "expanded"),
-    [
-        ("~/demos", "HOME/demos"),
-        ("--out=~/demos", "--out=HOME/demos"),
-        ("--loader.object-cache=~/a b", "--loader.object-cache=HOME/a b"),
-        ("mine=~/runs/lr=0.1", "mine=HOME/runs/lr=0.1"),
-        ("~", "HOME"),
-        ("runs/~/a", "runs/~/a"),
-        ("--out=a~", "--out=a~"),
-        ("Put the ~ here", "Put the ~ here"),
-    ],
-)
-def test_words_name_the_home(given: str, expanded: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/users/me")
-    assert expand_home(given) == expanded.replace("HOME", "/users/me")
-
-
-def test_the_cache_may_be_named_from_home(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/users/me")
-    monkeypatch.setenv("OPENVIMA_CACHE", "~/cache")
-    assert cache_dir() == Path("/users/me/cache")

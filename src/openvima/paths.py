@@ -3,14 +3,17 @@
 import os
 import re
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 from openvima.errors import ConfigError
 
-_OPTION = re.compile(r"(?:--)?[\w.-]+=(?=~)")  # of --out=~/demos and of mine=~/runs/mine
+Given = str | os.PathLike[str]
+
+_OPTION = re.compile(r"(?:--)?(?:[\w.-]+=)+(?=~)")  # of --out=~/demos and of mine=~/runs/mine
 
 
-def as_path(given: str | os.PathLike[str]) -> Path:
+def as_path(given: Given) -> Path:
     """Return a path, with `~` for the user's home.
 
     Raises:
@@ -25,10 +28,45 @@ def as_path(given: str | os.PathLike[str]) -> Path:
 
 
 def expand_home(word: str) -> str:
-    """Return a command-line word with `~` for the user's home, also where an option or a name precedes it."""
+    """Return a word with the user's home for `~`, also after the name of an option or policy and `=`."""
     option = _OPTION.match(word)
     start = option.end() if option else 0
     return word[:start] + str(as_path(word[start:])) if word.startswith("~", start) else word
+
+
+def as_text(given: Given) -> str:
+    """Return a name or path as text, with the user's home for `~`; what a `Path` gives is no name."""
+    if isinstance(given, str):
+        return str(as_path(given)) if given.startswith("~") else given
+    path = as_path(given)
+    return str(path) if len(path.parts) > 1 else os.path.join(os.curdir, path)
+
+
+def names_of(given: Given | Iterable[Given]) -> tuple[str, ...]:
+    """Return names as a tuple of text; a single one counts as a list of it."""
+    return tuple(as_text(name) for name in ((given,) if isinstance(given, str | os.PathLike) else given))
+
+
+def settle(
+    config: object, *, paths: Iterable[str] = (), texts: Iterable[str] = (), names: Iterable[str] = ()
+) -> None:
+    """Let fields of a frozen config take what users write for them.
+
+    Args:
+        config: The config; fields that are None, or of a type that its own checks refuse, stay.
+        paths: Fields with a path, which may be text and may begin with `~`.
+        texts: Fields with a name or a path as text.
+        names: Fields with a tuple of names or paths as text, or with a single one.
+    """
+    for name in paths:
+        if isinstance(given := getattr(config, name), str | os.PathLike):
+            object.__setattr__(config, name, as_path(given))
+    for name in texts:
+        if isinstance(given := getattr(config, name), str | os.PathLike):
+            object.__setattr__(config, name, as_text(given))
+    for name in names:
+        if isinstance(given := getattr(config, name), str | os.PathLike | list | tuple):
+            object.__setattr__(config, name, names_of(given))
 
 
 def cache_dir() -> Path:

@@ -15,6 +15,7 @@ from openvima.atomic_io import FREE_SPACE, NO_SPACE
 from openvima.cli.streams import accept_any_text
 from openvima.errors import OpenVimaError, UnknownWordWarning, echo, unknown_name
 from openvima.memory import address_space_remedy, lacks_memory, require_address_space
+from openvima.paths import expand_home
 
 # Verb → summary. Each verb is a module of this package.
 VERBS = {
@@ -97,6 +98,7 @@ def _run(verb: str, rest: list[str]) -> int:
     try:
         if verb in _LEAST_MB and not set(_HELP) & set(rest):
             require_address_space(_LEAST_MB[verb])
+        rest = [expand_home(word) for word in rest]
         module = importlib.import_module(f"openvima.cli.{verb.replace('-', '_')}")
         commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
         if commands is not None:
