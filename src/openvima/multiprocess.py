@@ -1,6 +1,7 @@
 """Parallel jobs in worker processes with one thread each."""
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
@@ -10,6 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
+from pathlib import Path
 from typing import Any, Protocol
 
 from openvima.errors import ConfigError, WorkerError
@@ -122,8 +124,43 @@ def imap_with_progress(
 
 
 def num_cpus() -> int:
-    """Return the CPUs available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Return how many CPUs this process may use; the quota of a container counts."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(
+        1, min([count, *map(math.ceil, _cpu_quotas(Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")))])
+    )
+
+
+def _cpu_quotas(mounted: Path, own: Path) -> Iterator[float]:
+    """Yield the CPUs that the control groups of this process may use, where they are limited.
+
+    Args:
+        mounted: Where the groups are mounted; in a container that of the process may be this one itself.
+        own: The file that names the groups of this process, as HIERARCHY:CONTROLLERS:PATH.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        for line in own.read_text(encoding="utf-8").splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers and "cpu" not in controllers.split(","):
+                continue
+            for root in (mounted / controllers, mounted / ("cpu" if controllers else "unified")):
+                group = root / path.strip("/")
+                for folder in (group, *group.parents):
+                    if folder.is_relative_to(root):
+                        yield from _quota_of(folder)
+
+
+def _quota_of(group: Path) -> Iterator[float]:
+    """Yield the CPUs of one control group, of version 2 or 1, if they are limited."""
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = (group / "cpu.max").read_text(encoding="utf-8").split()
+        yield int(quota) / int(period)  # "max" is no number
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = (
+            int((group / f"cpu.cfs_{name}_us").read_text("utf-8")) for name in ("quota", "period")
+        )
+        if quota > 0:
+            yield quota / period
 
 
 def check_workers(num_workers: int) -> None:
