@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 from torch.utils.data._utils.collate import default_collate_fn_map  # documented with `default_collate`
 
 from openvima.data.batching import BatchOrder
+from openvima.data.loader_memory import sent
 from openvima.data.reader import Dataset as Demonstrations
 from openvima.data.records import Demonstration
 from openvima.errors import ConfigError, ShapeError
@@ -134,7 +135,7 @@ def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:  # Any: te
             blank = items[0][name][:0]
             shown = [torch.stack([image[name] for image in found]) if found else blank for found in images]
             batch[f"prompt_{name}"] = _padded(shown, _padding(name))
-    return batch
+    return sent(batch)
 
 
 def _padding(name: str) -> int:
@@ -297,4 +298,4 @@ def batches_of(stream: BatchStream, **options: Any) -> DataLoader:  # Any: of se
 
 
 def _unchanged(batch: Any) -> Any:  # Any: see `Transform`; PyTorch's default would turn tuples into lists
-    return batch
+    return sent(batch)
