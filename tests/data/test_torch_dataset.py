@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.data import DataLoader  # noqa: E402
 
-from openvima.data import Dataset, GenerateConfig, generate, loader_memory  # noqa: E402
+from openvima.data import Dataset, GenerateConfig, generate, torch_batches  # noqa: E402
 from openvima.data.batching import BatchOrder  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset, collate, tensors_of  # noqa: E402
@@ -205,7 +205,7 @@ def test_without_room_in_shared_memory_workers_send_batches_through_the_pipe(
     items = DemonstrationDataset(demos)
     expected = next(iter(DataLoader(items, batch_size=8)))
     if lack == "known":
-        monkeypatch.setattr(loader_memory, "_room", lambda: 1000)
+        monkeypatch.setattr(torch_batches, "_room", lambda: 1000)
     else:
         monkeypatch.setattr(torch.Tensor, "share_memory_", refuse)
     options = {"num_workers": 2, "multiprocessing_context": "fork", "timeout": 60}

@@ -12,9 +12,9 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 from torch.utils.data._utils.collate import default_collate_fn_map  # documented with `default_collate`
 
 from openvima.data.batching import BatchOrder
-from openvima.data.loader_memory import sent
 from openvima.data.reader import Dataset as Demonstrations
 from openvima.data.records import Demonstration
+from openvima.data.torch_batches import sent
 from openvima.errors import ConfigError, ShapeError
 from openvima.scene import ACTION_SHAPES
 from openvima.scene.scene import BACKGROUND_ID
