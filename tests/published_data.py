@@ -80,9 +80,10 @@ class MadeEpisode:
             images[step, row - 3 : row + 4, column - 3 : column + 4] = second
         return {"top": images, "front": images[:, ::-1].copy()}
 
-    def files(self, generation: Generation = TODAY) -> dict[str, bytes]:
+    def files(self, generation: Generation = TODAY, protocol: int = 4) -> dict[str, bytes]:
         """Path within the episode's folder to content."""
-        contents = {f"{name}.pkl": pickled(value) for name, value in self.values(generation).items()}
+        values = self.values(generation)
+        contents = {f"{name}.pkl": pickled(value, protocol) for name, value in values.items()}
         for view, frames in self.frames().items():
             for number, frame in enumerate(frames):
                 contents[f"rgb_{view}/{number}.jpg"] = jpeg(frame)
@@ -190,13 +191,17 @@ def pickled(value: object, protocol: int = 4) -> bytes:
 
 
 class _Pickler(pickle.Pickler):
-    """Names the function that restores arrays as NumPy did before version 2."""
+    """Names the functions that restore arrays as NumPy did before version 2."""
+
+    def __init__(self, sink: io.BytesIO, protocol: int) -> None:
+        super().__init__(sink, protocol)
+        self._protocol = protocol
 
     def reducer_override(self, value: object) -> Any:
         if type(value) is not np.ndarray:
             return NotImplemented
-        _, args, state = value.__reduce__()
-        return _reconstruct, args, state
+        made = value.__reduce_ex__(self._protocol)
+        return _frombuffer if made[0].__name__ == "_frombuffer" else _reconstruct, *made[1:]
 
 
 def _reconstruct(*args: object) -> None:
@@ -204,6 +209,13 @@ def _reconstruct(*args: object) -> None:
 
 
 _reconstruct.__module__ = "numpy.core.multiarray"
+
+
+def _frombuffer(*args: object) -> None:
+    raise AssertionError(args)
+
+
+_frombuffer.__module__ = "numpy.core.numeric"
 
 
 def _object_info(package: str, name: str, texture: str) -> dict[str, Any]:
@@ -308,7 +320,7 @@ def _as_modules() -> Iterator[None]:
     """Let pickle find the classes where they say that they live."""
     fakes: dict[str, types.ModuleType] = {}
     for package in (PUBLISHED.package, TODAY.package):
-        for member in [*_classes(package).values(), _reconstruct]:
+        for member in [*_classes(package).values(), _reconstruct, _frombuffer]:
             home = member.__module__
             for end in [i for i, letter in enumerate(home) if letter == "."] + [len(home)]:
                 if home[:end] != "numpy":

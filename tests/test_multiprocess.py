@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import worker_jobs
+from openvima import multiprocess
 from openvima.errors import ConfigError, SceneError, WorkerError
 from openvima.multiprocess import imap_unordered
 
@@ -53,6 +54,25 @@ def test_a_killed_worker_is_reported() -> None:
         list(imap_unordered(worker_jobs.die, [0, 1, 2], 2, report=lambda count: None))
 
 
+@pytest.mark.parametrize("way", ["file", "standard input"])
+def test_a_script_without_a_guard_is_named_and_not_a_lack_of_memory(tmp_path: Path, way: str) -> None:
+    """Workers import the script, which would start workers again; standard input they cannot import."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import worker_jobs; from openvima.multiprocess import imap_unordered\n"
+        "list(imap_unordered(worker_jobs.fail, [0, 2], 2))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with script.open() as stdin:
+        words = [sys.executable, str(script) if way == "file" else "-"]
+        ended = subprocess.run(
+            words, env=environment, stdin=stdin, capture_output=True, text=True, check=False
+        )
+    (last,) = ended.stderr.splitlines()[-1:]
+    assert last.startswith("openvima.errors.WorkerError: the worker processes could not start.")
+    assert 'if __name__ == "__main__":' in last and "memory" not in last
+
+
 def test_one_worker_counts_over_all_items(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     counts = []
@@ -90,3 +110,37 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 def test_a_number_of_workers_that_cannot_be_is_refused(num_workers: int) -> None:
     with pytest.raises(ConfigError, match=rf"workers is {num_workers}; it must lie within 1 … 1024\."):
         list(imap_unordered(worker_jobs.write_number, [], num_workers))
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "quotas"),
+    [
+        ("0::/\n", {"cpu.max": "150000 100000\n"}, [1.5]),
+        ("0::/\n", {"cpu.max": "max 100000\n"}, []),
+        ("0::/slurm/job/step\n", {"slurm/job/cpu.max": "400000 100000\n", "cpu.max": "max 100000"}, [4.0]),
+        ("1:name=systemd:/\n0::/\n", {"unified/cpu.max": "200000 100000\n"}, [2.0]),
+        (
+            "4:cpu,cpuacct:/docker/1234\n0::/\n",  # the group is mounted as the root in a container
+            {"cpu,cpuacct/cpu.cfs_quota_us": "100000\n", "cpu,cpuacct/cpu.cfs_period_us": "50000\n"},
+            [2.0],
+        ),
+        ("1:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, []),
+        ("3:memory:/a\n", {"memory/a/cpu.max": "100000 100000"}, []),
+        ("damaged\n", {"cpu.max": "100000 100000"}, []),
+    ],
+)
+def test_quotas_of_containers_are_read(
+    tmp_path: Path, groups: str, files: dict[str, str], quotas: list[float]
+) -> None:
+    (tmp_path / "own").write_text(groups)
+    for name, content in files.items():
+        (tmp_path / "cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "cgroup" / name).write_text(content)
+    assert list(multiprocess._cpu_quotas(tmp_path / "cgroup", tmp_path / "own")) == quotas
+
+
+def test_a_quota_bounds_the_number_of_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(64))
+    for quotas, count in (([], 64), ([1.0], 1), ([0.2], 1), ([8.0, 1.5], 2), ([128.0], 64)):
+        monkeypatch.setattr(multiprocess, "_cpu_quotas", lambda mounted, own, found=quotas: iter(found))
+        assert multiprocess.num_cpus() == count

@@ -186,3 +186,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") 
     if not hint and len(known) <= 20:
         hint = f"Allowed: {', '.join(known)}."
     return f"there is no {kind} {echo(repr(name))}.{suggestion} {hint}".rstrip()
+
+
+class Terminated(KeyboardInterrupt):
+    """A training was ended by SIGTERM, and wrote a checkpoint before it stopped."""

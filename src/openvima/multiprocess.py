@@ -1,6 +1,7 @@
 """Parallel jobs in worker processes with one thread each."""
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
@@ -10,6 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
+from pathlib import Path
 from typing import Any, Protocol
 
 from openvima.errors import ConfigError, WorkerError
@@ -24,6 +26,14 @@ WORKER_VARIABLES = {
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**28),
 }
+_KILLED = (
+    "a worker process was killed (often for lack of memory; --workers lowers the need). "
+    "Whole files were kept, and the same command continues."
+)
+_NOT_STARTED = (
+    "the worker processes could not start. They import your script, which must be a file where all that runs "
+    'stands below `if __name__ == "__main__":`; workers=1 needs no such process.'
+)
 # In a worker: the shared array of counts. Any: multiprocessing has no public type for it.
 _counters: Any = None
 
@@ -54,7 +64,7 @@ def imap_unordered(
 
     Raises:
         ConfigError: `num_workers` is out of range.
-        WorkerError: A worker was killed.
+        WorkerError: A worker was killed, or none could start.
         Exception: Any exception of a job; the other jobs are stopped.
     """
     watch = None if report is None else (lambda counts: report(sum(row[0] for row in counts)))
@@ -87,8 +97,8 @@ def imap_with_progress(
         yield from _run_serially(job, items, num_counts, watch)
         return
     context = multiprocessing.get_context("spawn")
-    # One row per job: no lock that a killed worker could hold.
-    counters = context.RawArray("q", len(items) * num_counts)
+    # One row per job, and whether a worker has started: no lock that a killed worker could hold.
+    counters = context.RawArray("q", len(items) * num_counts + 1)
     others = set(multiprocessing.active_children())
     with single_threaded_workers():
         pool = ProcessPoolExecutor(
@@ -104,10 +114,7 @@ def imap_with_progress(
                     yield pending.pop(future), future.result()
                 watch(_rows(counters, num_counts))
         except BrokenProcessPool:
-            raise WorkerError(
-                "a worker process was killed (often for lack of memory; --workers lowers the need). "
-                "Whole files were kept, and the same command continues."
-            ) from None
+            raise WorkerError(_KILLED if counters[-1] else _NOT_STARTED) from None
         except BaseException:  # a job's own error, or Ctrl-C
             for process in set(multiprocessing.active_children()) - others:
                 process.terminate()
@@ -117,8 +124,43 @@ def imap_with_progress(
 
 
 def num_cpus() -> int:
-    """Return the CPUs available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Return how many CPUs this process may use; the quota of a container counts."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(
+        1, min([count, *map(math.ceil, _cpu_quotas(Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")))])
+    )
+
+
+def _cpu_quotas(mounted: Path, own: Path) -> Iterator[float]:
+    """Yield the CPUs that the control groups of this process may use, where they are limited.
+
+    Args:
+        mounted: Where the groups are mounted; in a container that of the process may be this one itself.
+        own: The file that names the groups of this process, as HIERARCHY:CONTROLLERS:PATH.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        for line in own.read_text(encoding="utf-8").splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers and "cpu" not in controllers.split(","):
+                continue
+            for root in (mounted / controllers, mounted / ("cpu" if controllers else "unified")):
+                group = root / path.strip("/")
+                for folder in (group, *group.parents):
+                    if folder.is_relative_to(root):
+                        yield from _quota_of(folder)
+
+
+def _quota_of(group: Path) -> Iterator[float]:
+    """Yield the CPUs of one control group, of version 2 or 1, if they are limited."""
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = (group / "cpu.max").read_text(encoding="utf-8").split()
+        yield int(quota) / int(period)  # "max" is no number
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = (
+            int((group / f"cpu.cfs_{name}_us").read_text("utf-8")) for name in ("quota", "period")
+        )
+        if quota > 0:
+            yield quota / period
 
 
 def check_workers(num_workers: int) -> None:
@@ -207,6 +249,7 @@ def exit_with_parent(timeout_s: float | None = PARENT_END_S) -> None:
 def _start_worker(counters: Any) -> None:  # Any: see `_counters`
     global _counters
     _counters = counters
+    counters[-1] = 1
     init_worker()
 
 
@@ -220,5 +263,5 @@ def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:  # Any: se
 
 
 def _rows(counters: Any, num_counts: int) -> Counts:  # Any: see `_counters`
-    flat = counters[:]
+    flat = counters[:-1]
     return [flat[first : first + num_counts] for first in range(0, len(flat), num_counts)]

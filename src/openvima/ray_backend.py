@@ -15,7 +15,7 @@ from typing import Any
 
 from openvima.errors import ConfigError, WorkerError
 from openvima.extras import import_extra
-from openvima.multiprocess import WORKER_VARIABLES, Counts, Job
+from openvima.multiprocess import WORKER_VARIABLES, Counts, Job, num_cpus
 
 POLL_S = 0.5
 COUNT_INTERVAL_S = 1.0  # one message per job and second
@@ -85,7 +85,7 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
     if address is None:
         options |= {
             "address": "local",
-            "num_cpus": num_workers or os.cpu_count() or 1,
+            "num_cpus": num_workers or num_cpus(),
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
         }

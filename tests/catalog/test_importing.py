@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from openvima.catalog import OBJECTS, TEXTURES, CollisionHull, load_assets, pack_files
-from openvima.catalog.cache import cache_dir
 from openvima.catalog.importing import import_pack, imported_pack
 from openvima.catalog.original import OriginalAssets
 from openvima.errors import AssetError
+from openvima.paths import cache_dir
 
 REFERENCE = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
 SIZE = OBJECTS["cross"].size_max

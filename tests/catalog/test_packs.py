@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.catalog.cache import cache_dir, cached_array
+from openvima.catalog.cache import cached_array
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
 from openvima.catalog.procedural import _DRAWING_MODULES, ProceduralAssets
 from openvima.errors import AssetError, UnknownTextureError
+from openvima.paths import cache_dir
 
 SIZE = (0.16, 0.16, 0.05)
 

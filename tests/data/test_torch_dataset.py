@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.data import DataLoader  # noqa: E402
 
-from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
+from openvima.data import Dataset, GenerateConfig, generate, torch_batches  # noqa: E402
 from openvima.data.batching import BatchOrder  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset, collate, tensors_of  # noqa: E402
@@ -186,3 +186,49 @@ def test_a_demonstration_without_steps_has_tensors_without_rows(demos: Dataset) 
     item = tensors_of(replace(demo, actions=(), pick_ids=(), place_ids=(), joint_paths=(), **start))
     assert item["pose0_position"].shape == (0, 2)
     assert item["pose1_rotation"].shape == (0, 4)
+
+
+def tensors(episodes: list[int], number: int) -> dict[str, object]:
+    return {"ones": torch.ones(100), "nested": [(torch.arange(number + 1), np.arange(3))], "text": "a"}
+
+
+def refuse(tensor: torch.Tensor) -> None:
+    raise RuntimeError("unable to allocate shared memory(shm) for file </torch_1>: No space left on device")
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.parametrize("lack", ["known", "found out"])
+def test_without_room_in_shared_memory_workers_send_batches_through_the_pipe(
+    demos: Dataset, monkeypatch: pytest.MonkeyPatch, lack: str
+) -> None:
+    """Docker gives containers 64 MB of it; such a loader stood still for ever."""
+    items = DemonstrationDataset(demos)
+    expected = next(iter(DataLoader(items, batch_size=8)))
+    if lack == "known":
+        monkeypatch.setattr(torch_batches, "_room", lambda: 1000)
+    else:
+        monkeypatch.setattr(torch.Tensor, "share_memory_", refuse)
+    options = {"num_workers": 2, "multiprocessing_context": "fork", "timeout": 60}
+    (batch,) = DataLoader(items, batch_size=8, **options)
+    assert type(batch) is dict and batch.keys() == expected.keys()
+    for name, value in expected.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(batch[name], value) and not batch[name].is_shared()
+        else:
+            assert batch[name] == value
+
+    order = BatchOrder(8, batch_size=2, seed=0)
+    for number, made in enumerate(BatchLoader(Numbers(8), order, transform=tensors, num_workers=2)):
+        assert made["ones"].sum() == 100 and made["text"] == "a"
+        assert made["nested"][0][0].tolist() == list(range(number + 1))
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_with_room_batches_are_in_shared_memory(demos: Dataset) -> None:
+    loader = DataLoader(
+        DemonstrationDataset(demos), batch_size=4, num_workers=1, multiprocessing_context="fork"
+    )
+    assert all(batch["rgb_top"].is_shared() for batch in loader)
+    order = BatchOrder(8, batch_size=2, seed=0)
+    loader = BatchLoader(Numbers(8), order, transform=tensors, num_workers=1, context="fork")
+    assert all(batch["nested"][0][0].is_shared() for batch in loader)

@@ -1,5 +1,8 @@
 """Scoring policies that exist as objects only."""
 
+from collections.abc import Callable
+
+import numpy as np
 import pytest
 
 import openvima
@@ -154,3 +157,59 @@ def test_a_policy_that_plays_each_episode_but_not_the_batch_is_an_error():
 
     with pytest.raises(PolicyError, match="fewer, please"):
         score({"mine": One()}, tasks="rotate", levels="L1", episodes=2)
+
+
+class Given:
+    """Gives the same value as each position."""
+
+    def __init__(self, make: Callable[[], object]):
+        self.make = make
+
+    def reset(self, prompts):
+        """Nothing is kept."""
+
+    def act(self, observations):
+        turn = np.array([0, 0, 0, 1], np.float32)
+        action = {"pose0_rotation": turn, "pose1_rotation": turn}
+        return [
+            {**action, "pose0_position": self.make(), "pose1_position": self.make()} for _ in observations
+        ]
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("control", ["primitives", "end_effector"])
+def test_tensors_with_gradients_are_an_error_that_names_policy_task_and_seed(nested, control):
+    torch = pytest.importorskip("torch")
+
+    def make() -> object:
+        values = torch.full((5 if control == "end_effector" else 2,), 0.5, requires_grad=True)
+        return list(values) if nested else values
+
+    policy = Given(make)
+    if control == "end_effector":
+        policy.control = control
+        policy.act = lambda observations: [make() for _ in observations]
+    cells = {"tasks": "rotate", "levels": "L1", "episodes": 1, "seed": 3, "control": control}
+    with pytest.raises(
+        PolicyError, match=r"mine raised RuntimeError.*detach.*in rotate, L1, seed 3"
+    ) as error:
+        score({"mine": policy}, **cells)
+    assert "\n" not in str(error.value)
+
+
+def test_actions_that_raise_when_read_are_an_error_of_the_policy():
+    class Odd:
+        def __array__(self, *args: object, **kwargs: object) -> None:
+            raise OSError("lost")
+
+    with pytest.raises(PolicyError, match=r"mine raised OSError: lost.*in rotate, L1, seed 0"):
+        score({"mine": Given(Odd)}, tasks="rotate", levels="L1", episodes=1)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64", "bfloat16"])
+def test_tensors_without_gradients_are_actions(dtype):
+    """NumPy knows no bfloat16: such an action is an invalid one, and ends the episode."""
+    torch = pytest.importorskip("torch")
+    policy = Given(lambda: torch.full((2,), 0.5, dtype=getattr(torch, dtype)))
+    (row,) = score({"mine": policy}, tasks="rotate", levels="L1", episodes=1).rows
+    assert ("NumPy cannot convert" in row.outcomes[0].reason) == (dtype == "bfloat16")

@@ -54,7 +54,8 @@ def test_the_code_of_a_page_runs(
     for name, scene in re.findall(r"^```yaml\n# (\S+)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
         Path(name).write_text(scene, encoding="utf-8")
     monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))  # pages register tasks
-    names: dict[str, object] = {"__name__": "page"}
+    # Below its guard stands all that this page does; the others have examples there, which run as such.
+    names: dict[str, object] = {"__name__": "__main__" if page.stem == "generating" else "page"}
     with restored_assets():
         for code in blocks(page):
             exec(compile(code, str(page), "exec"), names)
@@ -65,3 +66,10 @@ def test_blocks_that_do_not_run_are_few_and_begin_like_python() -> None:
     assert len(marked) <= 15
     for code in marked:
         compile(code, "page", "exec")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_code_that_starts_worker_processes_has_a_guard(page: Path) -> None:
+    for _, code in BLOCK.findall(page.read_text(encoding="utf-8")):
+        starts = re.search(r"(?<!num_)workers=(?!1\b)|make_vec\(.*num_workers=(?!0\b)", code)
+        assert not starts or 'if __name__ == "__main__":' in code, code

@@ -12,9 +12,10 @@ torch = pytest.importorskip("torch")
 
 from safetensors.torch import load_file  # noqa: E402
 
+from openvima.errors import Terminated  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.config import config_to_dict  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training import TrainingConfig, loop, train  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -96,3 +97,57 @@ def test_a_killed_process_leaves_whole_files_and_resumes(config, settings, whole
                 load_file(checkpoint / "optimizer.safetensors")
                 json.loads((checkpoint / "state.json").read_text())
     assert_same(train(config), whole)
+
+
+@pytest.mark.parametrize("stage", ["1-pretraining", "2-cloning"])
+def test_sigterm_writes_a_checkpoint_and_the_run_resumes(settings, tmp_path, stage: str, monkeypatch) -> None:
+    """The weights are those of a run that was never ended, whatever step the signal comes at."""
+    monkeypatch.setattr(loop, "LOG_EVERY", 1)
+    settings = {**settings, "schedule.checkpoint_every": 100}
+    whole = train(TrainingConfig.of({**settings, "out": tmp_path / "never ended"}))
+    config = TrainingConfig.of(settings)
+    seen = 0
+
+    def report(done: int, total: int, note: str) -> None:
+        nonlocal seen
+        seen += note.startswith(stage)
+        if seen == 2:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Terminated):
+        train(config, report)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert (config.out / "checkpoints" / f"{stage}-000003" / "state.json").exists()
+    train(config)
+    for file in whole.rglob("*.safetensors"):
+        ours, theirs = load_file(config.out / file.relative_to(whole)), load_file(file)
+        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_sigterm_ends_the_command_with_a_line(settings, tmp_path, processes: int) -> None:
+    words = ["train", "--data", settings["data"], "--out", tmp_path / "run", "--recipe", "nano"]
+    words += [
+        "--pretraining.steps",
+        "0",
+        "--schedule.steps",
+        "100000",
+        "--schedule.checkpoint-every",
+        "100000",
+    ]
+    words += ["--loader.batch-size", "2", "--runtime.processes", processes, "--runtime.workers", "1"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "openvima", *map(str, words)], stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    lines = []
+    for line in process.stderr:
+        if "2-cloning" in line and not any("2-cloning" in before for before in lines):
+            process.send_signal(signal.SIGTERM)
+        lines.append(line)
+    process.stderr.close()
+    assert process.wait() == 143
+    assert lines[-1].endswith("interrupted; complete files were kept, and the same command resumes.\n")
+    assert not any("Traceback" in line for line in lines)
+    (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
+    assert (checkpoint / "optimizer.safetensors").exists()

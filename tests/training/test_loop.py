@@ -1,6 +1,7 @@
 """Whole runs: resuming, differing settings, content of the run folder."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,24 @@ def test_without_demonstrations_the_error_says_how_to_make_some(settings, tmp_pa
     with pytest.raises(DatasetError, match="openvima generate"):
         train(TrainingConfig.of({**settings, "data": tmp_path / "nothing"}))
     assert not settings["out"].exists()
+
+
+@pytest.mark.parametrize("where", ["data", "object_cache"])
+def test_a_cache_that_cannot_be_written_is_refused_before_pretraining(settings, tmp_path, where):
+    if where == "data":
+        settings["data"] = shutil.copytree(settings["data"], tmp_path / "copy")
+        shutil.rmtree(settings["data"] / "object_cache", ignore_errors=True)
+        (settings["data"] / "object_cache").touch()  # where even root cannot write
+    else:
+        (tmp_path / "file").touch()
+        settings["object_cache"] = tmp_path / "file"
+    notes = []
+    with pytest.raises(DatasetError, match=r"cannot write the object cache to .*: .*--object-cache"):
+        train(TrainingConfig.of(settings), lambda done, total, note: notes.append(note))
+    assert notes == [] and not (settings["out"] / "config.yaml").exists()
+    settings["object_cache"] = str(tmp_path / "elsewhere")
+    train(TrainingConfig.of(settings))
+    assert list((tmp_path / "elsewhere").iterdir())
 
 
 def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):

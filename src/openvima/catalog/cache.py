@@ -2,7 +2,6 @@
 
 import io
 import logging
-import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -10,21 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from openvima.atomic_io import atomic_write
+from openvima.paths import cache_dir
 
 _logger = logging.getLogger(__name__)
 
 _CHECKSUM_BYTES = 4  # CRC-32 of all before it; at the end of a file, where readers of .npy ignore it
-
-
-def cache_dir() -> Path:
-    """Return the folder for derived files: $OPENVIMA_CACHE, else openvima in the user's cache folder.
-
-    The folder may not exist yet. Everything in it can be deleted at any time.
-    """
-    if own := os.environ.get("OPENVIMA_CACHE"):
-        return Path(own)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "openvima"
 
 
 def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.ndarray:

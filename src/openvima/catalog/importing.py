@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.atomic_io import atomic_write
-from openvima.catalog.cache import cache_dir
 from openvima.catalog.original import decode_file
 from openvima.catalog.pack_files import ARCHIVE_NAME, CheckoutFiles, ImportedFiles, known_hashes
 from openvima.errors import AssetError
+from openvima.paths import cache_dir
 
 Report = Callable[[int, int, str], None]
 

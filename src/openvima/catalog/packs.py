@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from openvima.catalog.geometry import Assets, is_pack
 from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, unknown_name
+from openvima.paths import as_path
 from openvima.user_code import is_code
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
         from openvima.catalog.user_assets import load_user_assets
 
         return load_user_assets(str(assets))
-    folder = Path(assets).expanduser()
+    folder = as_path(assets)
     if not folder.is_dir():
         hint = (
             "Allowed: 'procedural', 'original', MODULE:FUNCTION, FILE.py:FUNCTION, or the folder of a "

@@ -23,6 +23,7 @@ from openvima.errors import (
     echo,
     unknown_name,
 )
+from openvima.paths import as_path
 
 MAX_NAME = 40  # characters
 MAX_ALIASES = 10
@@ -152,9 +153,7 @@ def register_texture(name: str, image: np.ndarray | str | Path) -> TextureSpec:
     """
     what = f"texture {echo(repr(name))}"
     _check_name(name, what, "texture")
-    pixels = (
-        _read_png(Path(image).expanduser(), what) if isinstance(image, str | Path) else _as_array(image, what)
-    )
+    pixels = _read_png(as_path(image), what) if isinstance(image, str | Path) else _as_array(image, what)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
         raise ShapeError(f"{what} is {pixels.dtype} of shape {pixels.shape}; it must be uint8 of (H, W, 3).")
     if not all(1 <= side <= MAX_TEXTURE_SIDE for side in pixels.shape[:2]):

@@ -10,6 +10,7 @@ from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vec
 from openvima.catalog.meshes import TEXTURE_PER_M, scaled
 from openvima.catalog.obj_file import ObjMesh, face_normals, parse_obj
 from openvima.errors import AssetError, InputFileError, ShapeError
+from openvima.paths import as_path
 
 MAX_TRIANGLES = 20_000
 MAX_VERTICES = 60_000
@@ -113,10 +114,7 @@ def check_lengths(lengths: Vector3, what: str) -> Vector3:
 
 def _read(mesh: Mesh, what: str) -> ObjMesh:
     """Read triangles; `parts` numbers the separate pieces."""
-    if isinstance(mesh, str | Path):
-        found = _read_file(Path(mesh).expanduser(), what)
-    else:
-        found = _from_arrays(mesh, what)
+    found = _read_file(as_path(mesh), what) if isinstance(mesh, str | Path) else _from_arrays(mesh, what)
     if not 4 <= len(found.vertices) <= MAX_TRIANGLES:
         raise AssetError(
             f"mesh of {what} has {len(found.vertices)} triangles; 4 … {MAX_TRIANGLES} are allowed."

@@ -74,10 +74,10 @@ def info() -> int:
         Exit status.
     """
     from openvima.catalog import OBJECTS, TEXTURES
-    from openvima.catalog.cache import cache_dir
     from openvima.catalog.importing import imported_pack
     from openvima.catalog.objects import REGISTERED_OBJECTS
     from openvima.catalog.textures import REGISTERED_TEXTURES
+    from openvima.paths import cache_dir
     from openvima.tasks import list_tasks
 
     pack = imported_pack()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from openvima.cli.lists import parse_list, parse_shard_range
+from openvima.cli.lists import parse_list, parse_shard_range, parse_sources
 from openvima.cli.progress import progress_bar
 from openvima.cli.tables import print_table
 
@@ -131,7 +131,7 @@ def main(
     if in_context:
         ablations = f"{ablations},{IN_CONTEXT}"
     config = EvaluationConfig(
-        policies=parse_list(policy),
+        policies=parse_sources(policy),
         tasks=parse_list(tasks),
         levels=parse_list(levels),
         episodes=episodes,

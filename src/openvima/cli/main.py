@@ -13,8 +13,9 @@ from typing import Any
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE, NO_SPACE
 from openvima.cli.streams import accept_any_text
-from openvima.errors import OpenVimaError, UnknownWordWarning, echo, unknown_name
+from openvima.errors import OpenVimaError, Terminated, UnknownWordWarning, echo, unknown_name
 from openvima.memory import address_space_remedy, lacks_memory, require_address_space
+from openvima.paths import expand_home
 
 # Verb → summary. Each verb is a module of this package.
 VERBS = {
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command-line arguments; by default those of the process.
 
     Returns:
-        Exit status: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted.
+        Exit status: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted, 143 ended by SIGTERM.
     """
     accept_any_text()
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -97,6 +98,7 @@ def _run(verb: str, rest: list[str]) -> int:
     try:
         if verb in _LEAST_MB and not set(_HELP) & set(rest):
             require_address_space(_LEAST_MB[verb])
+        rest = [expand_home(word) for word in rest]
         module = importlib.import_module(f"openvima.cli.{verb.replace('-', '_')}")
         commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
         if commands is not None:
@@ -112,8 +114,9 @@ def _run(verb: str, rest: list[str]) -> int:
             status = tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
         sys.stdout.flush()  # while a full disk can still be reported
         return status
-    except KeyboardInterrupt:
-        return _fail(_INTERRUPTED.get(verb, "interrupted."), 130)
+    except KeyboardInterrupt as error:
+        status = 143 if isinstance(error, Terminated) else 130  # 128 and the signal, as shells say it
+        return _fail(_INTERRUPTED.get(verb, "interrupted."), status)
     except BrokenPipeError:  # the reader of our output, such as `head`, exited
         sys.stderr.close()
         return 1

@@ -11,6 +11,8 @@ from typing import Annotated
 
 import tyro
 
+from openvima.cli.lists import parse_sources
+
 
 def main(
     path: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PATH")] = None,
@@ -67,7 +69,7 @@ def main(
 
     config = StudioConfig(
         path,
-        tuple(name.strip() for name in policies.split(",") if name.strip()),
+        parse_sources(policies),
         record_demonstrations,
         EnvConfig(assets, compat, prompts, task_options),
         device,

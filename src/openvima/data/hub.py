@@ -6,6 +6,7 @@ from pathlib import Path
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, parse_manifest, read_inside
 from openvima.errors import DatasetError
 from openvima.hub import cache_folder, dataset_name, fetch
+from openvima.paths import as_path
 
 _MAX_MANIFEST_BYTES = 2**28  # of 500,000 shards
 
@@ -28,7 +29,7 @@ def data_folder(path: str | Path, *, shards: bool = True) -> Path:
     """
     name = dataset_name(path)
     if name is None:
-        return Path(path)
+        return as_path(path)
     # The client's cache has a folder per commit, of links. A data set must be of plain files.
     commit = fetch(name, (MANIFEST_NAME,), kind="dataset").name
     fixed, folder = replace(name, revision=commit), cache_folder(name, commit)

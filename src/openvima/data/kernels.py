@@ -1,9 +1,9 @@
 """Compiled loops: colours of pixels joined and parted again, pieces of memory gathered."""
 
-from numba import njit
+from openvima.compilation import njit
 
 
-@njit(cache=True)
+@njit
 def join_colours(planes, pixels):
     """Copy red, green and blue planes, (N, 3, P), to pixels of three colours, (N, 3 · P); contiguous uint8.
 
@@ -17,7 +17,7 @@ def join_colours(planes, pixels):
             joined[3 * pixel + 2] = blue[pixel]
 
 
-@njit(cache=True)
+@njit
 def part_colours(pixels, planes):
     """Copy pixels of three colours, (N, 3 · P), to red, green and blue planes, (N, 3, P); both uint8.
 
@@ -30,7 +30,7 @@ def part_colours(pixels, planes):
                 plane[pixel] = given[3 * pixel + colour]
 
 
-@njit(cache=True)
+@njit
 def gather(words, starts, sizes, gathered):
     """Copy spans of `words` (W,), all int32, one after the other to `gathered`.
 

@@ -22,6 +22,7 @@ from openvima.data.schema import CODECS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.multiprocess import MAX_WORKERS
+from openvima.paths import settle
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.registry import named_tasks
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
@@ -91,6 +92,7 @@ class GenerateConfig:
     __repr__ = brief_repr
 
     def __post_init__(self) -> None:
+        settle(self, paths=("out",), names=("tasks",))
         problems = [
             f"{name} is {value}; it must lie within {least} … {most}."
             for name, value, least, most in (

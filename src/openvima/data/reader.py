@@ -24,6 +24,7 @@ from openvima.data.schema import VIEWS
 from openvima.data.shard import Shard, remedy
 from openvima.errors import DatasetError, unknown_name
 from openvima.html import notebook_html
+from openvima.paths import names_of
 
 
 class Dataset:
@@ -50,10 +51,10 @@ class Dataset:
     """
 
     def __init__(
-        self, path: str | Path, *, tasks: Sequence[str] | None = None, index_only: bool = False
+        self, path: str | Path, *, tasks: str | Sequence[str] | None = None, index_only: bool = False
     ) -> None:
         self.path = data_folder(path, shards=not index_only)
-        self.tasks = None if tasks is None else tuple(tasks)
+        self.tasks = None if tasks is None else names_of(tasks)
         self.manifest = read_manifest(self.path)
         index = _read_index(self.path, self.manifest)
         self.index = index.filter(of_tasks(index, self.tasks, self.path)) if self.tasks is not None else index

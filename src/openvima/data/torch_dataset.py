@@ -14,6 +14,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map  # documented
 from openvima.data.batching import BatchOrder
 from openvima.data.reader import Dataset as Demonstrations
 from openvima.data.records import Demonstration
+from openvima.data.torch_batches import sent
 from openvima.errors import ConfigError, ShapeError
 from openvima.scene import ACTION_SHAPES
 from openvima.scene.scene import BACKGROUND_ID
@@ -134,7 +135,7 @@ def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:  # Any: te
             blank = items[0][name][:0]
             shown = [torch.stack([image[name] for image in found]) if found else blank for found in images]
             batch[f"prompt_{name}"] = _padded(shown, _padding(name))
-    return batch
+    return sent(batch)
 
 
 def _padding(name: str) -> int:
@@ -297,4 +298,4 @@ def batches_of(stream: BatchStream, **options: Any) -> DataLoader:  # Any: of se
 
 
 def _unchanged(batch: Any) -> Any:  # Any: see `Transform`; PyTorch's default would turn tuples into lists
-    return batch
+    return sent(batch)

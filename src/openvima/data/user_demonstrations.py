@@ -20,6 +20,7 @@ from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import DatasetError, EpisodeError
 from openvima.folder_lock import folder_lock
+from openvima.paths import as_path
 from openvima.render.raycast import object_below
 from openvima.scene import COMPOSED, HOST_TASK, Action, Episode, Scene
 from openvima.scene.goal import object_of
@@ -139,7 +140,7 @@ def record_demonstration(
     check_recordable(episode, env_config=env_config)
     if episode.task == COMPOSED:
         env_config = EnvConfig(env_config.assets, env_config.compat)  # the others are of tasks
-    demo, folder = demonstrate(episode, actions, env_config=env_config), Path(folder)
+    demo, folder = demonstrate(episode, actions, env_config=env_config), as_path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with folder_lock(folder, timeout_s=_LOCK_S):

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from openvima.detector.config import DETECTORS, BackboneConfig, DetectorConfig, detector_config
 from openvima.errors import CheckpointError
+from openvima.paths import as_path
 
 if TYPE_CHECKING:
     from openvima.detector.detector import FrameDetector
@@ -20,7 +21,7 @@ def detector_folder(folder: str | Path | None = None) -> Path:
     Raises:
         CheckpointError: There is no such folder.
     """
-    path = BUNDLED if folder is None else Path(folder)
+    path = BUNDLED if folder is None else as_path(folder)
     if path.is_dir():
         return path
     raise CheckpointError(

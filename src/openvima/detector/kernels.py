@@ -1,10 +1,11 @@
 """Numba kernels of the detector: normalisation, pooling, box decoding, suppression, RoIAlign, pasting."""
 
 import numpy as np
-from numba import njit
+
+from openvima.compilation import njit
 
 
-@njit(cache=True)
+@njit
 def look_up(images, table, out):
     """Write `table` (3, 256) at images (B, 3, H, W), uint8, to the beginning of `out` (B, ≥ H, ≥ W, 3)."""
     for image in range(images.shape[0]):
@@ -14,7 +15,7 @@ def look_up(images, table, out):
                     out[image, row, column, channel] = table[channel, images[image, channel, row, column]]
 
 
-@njit(cache=True)
+@njit
 def relu_and_pool(x, out):
     """Write maxima of 0 and 3 × 3 pixels of `x` (B, H, W, C), with stride 2, to `out`, half as large."""
     _, height, width, channels = x.shape
@@ -33,7 +34,7 @@ def relu_and_pool(x, out):
                     cell[k] = max(max(highest[left + k], highest[centre + k]), highest[right + k])
 
 
-@njit(cache=True)
+@njit
 def decode(deltas, references, weights, max_log_scale, limits, boxes):
     """Fill `boxes` (N, 4) as `decode_boxes` does; `weights` are four floats, `limits` width and height."""
     for n in range(len(boxes)):
@@ -45,7 +46,7 @@ def decode(deltas, references, weights, max_log_scale, limits, boxes):
             boxes[n, axis + 2] = min(max(centre + half, 0.0), limits[axis])
 
 
-@njit(cache=True)
+@njit
 def suppress(boxes, order, groups, iou_threshold):
     """Return which boxes (N, 4) are kept, shape (N,), bool, in the order of their indices `order` (N,).
 
@@ -69,7 +70,7 @@ def suppress(boxes, order, groups, iou_threshold):
     return kept
 
 
-@njit(cache=True)
+@njit
 def align(features, boxes, images, levels, level, stride, sampling_ratio, out):
     """Average samples of features (B, H, W, C) in cells of the boxes (R, 4) of a level, as `roi_align` does.
 
@@ -109,7 +110,7 @@ def align(features, boxes, images, levels, level, stride, sampling_ratio, out):
                     out[r, k, row, column] = cell[k]
 
 
-@njit(cache=True)
+@njit
 def _sample_points(low, high, length, stride, size, sampling_ratio, dtype):
     """Return the features beside each sampling point of an axis and their weights, (size · samples, 2)."""
     start, extent = low / stride - 0.5, (high - low) / stride
@@ -125,7 +126,7 @@ def _sample_points(low, high, length, stride, size, sampling_ratio, dtype):
     return indices, weights
 
 
-@njit(cache=True)
+@njit
 def paste(probabilities, boxes, out):
     """Write where masks (N, S, S) inside boxes (N, 4) reach 0.5 to `out` (N, H, W), bool, which is False."""
     size = probabilities.shape[1]
@@ -141,7 +142,7 @@ def paste(probabilities, boxes, out):
                 out[n, row, column] = _read(probabilities[n], y, x) >= 0.5
 
 
-@njit(cache=True)
+@njit
 def _read(plane, y, x):
     """Interpolate a plane (S, S) at a point; it is zero outside."""
     row, column = int(np.floor(y)), int(np.floor(x))

@@ -31,6 +31,7 @@ from openvima.evaluation.ablations import (
 from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
+from openvima.paths import as_path, settle
 from openvima.policies.bundled import BUNDLED
 from openvima.scene.command import steps_per_primitive
 from openvima.serving.lerobot import is_lerobot, lerobot_server
@@ -112,6 +113,7 @@ class EvaluationConfig:
     __repr__ = brief_repr
 
     def __post_init__(self) -> None:
+        settle(self, paths=("out",), texts=("python",), names=("policies", "tasks", "levels", "ablations"))
         problems = [
             f"{name} is {value}; it must be at least {least}."
             for name, value, least in (
@@ -302,9 +304,9 @@ class Batch:
         if is_code(assets):
             assets = with_absolute_path(assets)
         elif assets not in ASSET_PACKS:
-            assets = str(Path(assets).expanduser().absolute())
+            assets = str(as_path(assets).absolute())
         name, is_trained, folder = boxes.partition("=")
-        boxes = f"{name}={Path(folder).absolute()}" if is_trained else with_absolute_path(boxes)
+        boxes = f"{name}={as_path(folder).absolute()}" if is_trained else with_absolute_path(boxes)
         return replace(self, source=source, env_config=replace(self.env_config, assets=assets), boxes=boxes)
 
 

@@ -12,6 +12,7 @@ from openvima.errors import PolicyError
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import begin_episode, play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, RolloutPolicy
+from openvima.paths import as_path
 from openvima.scene import Episode
 from openvima.scene.explanation import Explanation
 from openvima.video.clips import png
@@ -76,7 +77,7 @@ def _explainer(policy: RolloutPolicy) -> Callable[[], Explanation]:
 
 
 def save_episode_image(
-    env: TabletopEnv, path: Path, *, seed: int, policy: RolloutPolicy | None = None, enlarge: int = 2
+    env: TabletopEnv, path: str | Path, *, seed: int, policy: RolloutPolicy | None = None, enlarge: int = 2
 ) -> EpisodeOutcome:
     """Roll out one episode and save an image of it: the prompt above, start and end side by side.
 
@@ -100,7 +101,7 @@ def save_episode_image(
     scenes = np.concatenate([gap, _titled(start, "before"), gap, _titled(end, ended), gap], axis=1)
     strip = draw_prompt_strip(env.prompt, width=scenes.shape[1])
     image = np.concatenate([strip, scenes, np.full((_GAP, scenes.shape[1], 3), 255, np.uint8)])
-    atomic_write_file(path, png(Image.fromarray(image)))
+    atomic_write_file(as_path(path), png(Image.fromarray(image)))
     return outcome
 
 

@@ -16,6 +16,7 @@ from openvima.errors import DatasetError, InputFileError, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
 from openvima.html import notebook_html
 from openvima.input_files import read_text
+from openvima.paths import as_path
 
 SCHEMA = 1
 FILE_NAME = "results.json"
@@ -284,9 +285,9 @@ class Results:
         content["sha256"] = hashlib.sha256(_json_text(content).encode()).hexdigest()
         return _json_text(content)
 
-    def write(self, path: Path) -> Path:
+    def write(self, path: str | Path) -> Path:
         """Write `results.json`; an interrupted write leaves the old file or none."""
-        return atomic_write_file(path, self.to_json())
+        return atomic_write_file(as_path(path), self.to_json())
 
     @staticmethod
     def read(path: str | Path) -> "Results":
@@ -295,7 +296,7 @@ class Results:
         Raises:
             DatasetError: The file is missing, damaged or of another schema.
         """
-        return ResultsFile.read(Path(path)).results
+        return ResultsFile.read(as_path(path)).results
 
 
 @dataclass(frozen=True, slots=True)

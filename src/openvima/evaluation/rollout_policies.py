@@ -3,7 +3,7 @@
 import importlib.util
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -89,6 +89,16 @@ class OracleRolloutPolicy:
         raise PolicyError(f"the oracle has no explain(). {POLICIES_THAT_EXPLAIN}")
 
 
+def _read(action: object) -> None:
+    """Let values raise that do so when they are read, such as tensors with gradients.
+
+    What NumPy cannot convert raises `TypeError` or `ValueError`, and is an invalid action later on.
+    """
+    for value in action.values() if isinstance(action, Mapping) else (action,):
+        with suppress(TypeError, ValueError):
+            np.asarray(value)
+
+
 class PromptedRolloutPolicy:
     """A policy, which reads prompts and observations only.
 
@@ -162,6 +172,8 @@ class PromptedRolloutPolicy:
                 raise PolicyError(
                     f"{self._name} gave no action for {_episodes([env])}, whose episode is not over."
                 )
+            with self._named_errors([env]):
+                _read(action)
         return actions
 
     @contextmanager

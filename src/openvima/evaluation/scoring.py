@@ -11,6 +11,7 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy
 from openvima.evaluation.sources import object_record
 from openvima.evaluation.versions import versions
+from openvima.paths import names_of
 from openvima.policies.base import Policy
 from openvima.scene.command import PRIMITIVES
 
@@ -22,7 +23,7 @@ def score(
     levels: str | Sequence[str] = ("L1", "L2", "L3", "L4"),
     episodes: int = DEFAULT_EPISODES,
     seed: int = 0,
-    ablations: tuple[str, ...] = (),
+    ablations: str | Sequence[str] = (),
     prompts: str = "multimodal",
     task_options: str = "",
     control: str = PRIMITIVES,
@@ -64,12 +65,12 @@ def score(
         )
     config = EvaluationConfig(
         tuple(policies),
-        tasks=(tasks,) if isinstance(tasks, str) else tuple(tasks),
-        levels=(levels,) if isinstance(levels, str) else tuple(levels),
+        tasks=names_of(tasks),
+        levels=names_of(levels),
         episodes=episodes,
         seed=seed,
         env_config=EnvConfig(prompts=prompts, task_options=task_options, control=control),
-        ablations=ablations,
+        ablations=names_of(ablations),
     )
     if wrong := set(policies) - {source.name for source in config.sources}:
         raise ConfigError(

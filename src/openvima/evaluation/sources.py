@@ -1,6 +1,7 @@
 """Policies of an evaluation: names, sources and hashes of weights."""
 
 import hashlib
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from urllib.parse import urlsplit
 
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
 from openvima.input_files import open_regular
+from openvima.paths import expand_home
 from openvima.policies.base import Policy
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.own_code import (
@@ -146,7 +148,7 @@ def policy_sources(policies: Sequence[str], *, trust_code: bool = False) -> tupl
     """Read policies as given on the command line.
 
     Args:
-        policies: Sources, or NAME=SOURCE.
+        policies: Sources, or NAME=SOURCE; an existing path is a source, whatever it contains.
         trust_code: As in `PolicySource`.
 
     Raises:
@@ -155,7 +157,9 @@ def policy_sources(policies: Sequence[str], *, trust_code: bool = False) -> tupl
     """
     sources = []
     for given in policies:
-        name, equals, source = ("", "", given) if is_remote(given) else given.partition("=")
+        given = expand_home(given)
+        whole = is_remote(given) or os.path.exists(given)  # such as runs/lr=0.001
+        name, equals, source = ("", "", given) if whole else given.partition("=")
         if not equals:
             name, source = _default_name(given), given
         sources.append(PolicySource(name, source, trust_code))

@@ -4,13 +4,14 @@ Only loops over arrays that the caller prepared; `objects.py` checks shapes and 
 """
 
 import numpy as np
-from numba import njit
+
+from openvima.compilation import njit
 
 CROP_SIZE = 32
 _FAR = np.int32(1 << 20)
 
 
-@njit(cache=True)
+@njit
 def object_extents(segm, extents, num_pixels):
     """Fill `extents` (256, 4) int64 with xmin, xmax, ymin, ymax of every id and `num_pixels` (256,)."""
     for k in range(num_pixels.shape[0]):
@@ -35,7 +36,7 @@ def object_extents(segm, extents, num_pixels):
             start = end
 
 
-@njit(cache=True)
+@njit
 def square_crop(rgb, xmin, xmax, ymin, ymax, square):
     """Copy the inclusive box into `square` (3, S, S), which is zero, with the shorter side centred."""
     width = xmax - xmin + 1
@@ -49,7 +50,7 @@ def square_crop(rgb, xmin, xmax, ymin, ymax, square):
                 square[channel, top + row, left + column] = rgb[channel, ymin + row, xmin + column]
 
 
-@njit(cache=True)
+@njit
 def halve_frame(frame, half):
     """Average 2 × 2 pixels of `frame` (3, 2 H, 2 W) into `half` (3, H, W), halves rounded up."""
     for channel in range(half.shape[0]):
@@ -62,7 +63,7 @@ def halve_frame(frame, half):
                 half[channel, row, column] = total >> 2
 
 
-@njit(cache=True)
+@njit
 def resize_square(square, size, scratch, crop):
     """Resize `square[:, :size, :size]` to `crop` (3, 32, 32) uint8 as OpenCV's area interpolation does.
 
@@ -81,7 +82,7 @@ def resize_square(square, size, scratch, crop):
         _enlarge(square, size, crop)
 
 
-@njit(cache=True)
+@njit
 def _shrink(square, size, scratch, crop):
     """Weigh every source pixel by the area that it shares with the target pixel."""
     scale = size / CROP_SIZE
@@ -107,7 +108,7 @@ def _shrink(square, size, scratch, crop):
                 crop[channel, row, column] = np.uint8(np.rint(total / (scale * scale)))
 
 
-@njit(cache=True)
+@njit
 def _source(index, size):
     """Source pixel, its neighbour's index and their weights of 2048 for one target index."""
     inverse = np.float64(CROP_SIZE) / size
@@ -122,7 +123,7 @@ def _source(index, size):
     return j, min(j + 1, size - 1), w0, w1
 
 
-@njit(cache=True)
+@njit
 def _enlarge(square, size, crop):
     """Fixed-point linear interpolation, which OpenCV uses for "area" when it has to enlarge."""
     for channel in range(3):
@@ -136,7 +137,7 @@ def _enlarge(square, size, crop):
                 crop[channel, row, column] = value >> 2
 
 
-@njit(cache=True)
+@njit
 def most_interior_pixel(segm, object_id, extents, distance, pixel):
     """Write column and row of the object's pixel that is farthest from its outline into `pixel` (2,).
 

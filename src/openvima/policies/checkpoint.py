@@ -18,6 +18,7 @@ from openvima import __version__
 from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
 from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.input_files import read_yaml
+from openvima.paths import as_path
 from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig, config_from_dict, config_to_dict
 from openvima.policies.differences import described, listed
@@ -78,7 +79,7 @@ def save_checkpoint(
         CheckpointError: The folder holds other files, the precision is not supported, or a weight overflows
             it.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     _check_replaceable(folder)
     with atomic_folder(folder) as partial:
         write_checkpoint(network, partial, tokenizer, dtype=dtype)
@@ -131,7 +132,7 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     Raises:
         CheckpointError: A file is missing or unreadable, or weights and config do not match.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     restore_folder(folder)
     info = read_info(folder)
     network = _outline(folder, info.config)

@@ -4,12 +4,13 @@ Only loops over arrays that the caller prepared; `processor.py` owns the documen
 """
 
 import numpy as np
-from numba import njit
+
+from openvima.compilation import njit
 
 _WIDTH, _HEIGHT = 1, 2  # halves, in the last row of a camera's matrix
 
 
-@njit(cache=True)
+@njit
 def table_point(camera, column, row, point):
     """Fill `point` (2,) with the point on the table under a pixel; every rounding is that of `unproject`."""
     right, up, away, focal_px = camera[0], camera[1], camera[2], camera[3, 0]
@@ -24,7 +25,7 @@ def table_point(camera, column, row, point):
     point[1] = (a0 * c1 - a1 * c0) / determinant
 
 
-@njit(cache=True)
+@njit
 def pad_false_positives(
     cameras, have_points, place, offsets, crop_index, boxes, new_index, new_boxes, points
 ):
@@ -44,7 +45,7 @@ def pad_false_positives(
                 table_point(cameras[view], boxes[step, view, 0], boxes[step, view, 1], points[p, view])
 
 
-@njit(cache=True)
+@njit
 def pad_history(
     cameras,
     place,
@@ -87,7 +88,7 @@ def pad_history(
             table_point(cameras[0], 0, 0, picks[p, slot])
 
 
-@njit(cache=True)
+@njit
 def pad_prompts(lengths, first, num_objects, tokens, is_valid, words, objects, mask):
     """Pad the tokens of prompts, and number their objects across the batch.
 
@@ -105,7 +106,7 @@ def pad_prompts(lengths, first, num_objects, tokens, is_valid, words, objects, m
             row += 1
 
 
-@njit(cache=True)
+@njit
 def stack_prompt_objects(cameras, offsets, rows, crop_index, boxes, new_index, new_boxes, masks, points):
     """Put the views of the objects of prompts first.
 
@@ -124,7 +125,7 @@ def stack_prompt_objects(cameras, offsets, rows, crop_index, boxes, new_index, n
         table_point(cameras[view], boxes[row, view, 0], boxes[row, view, 1], points[k])
 
 
-@njit(cache=True)
+@njit
 def find_slots(counts, ids, wanted, slots):
     """Fill `slots` (S,) with the slot of the id that is `wanted` in each step, -1 where no object has it."""
     row = 0

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.errors import ConfigError, PolicyError, UnknownPolicyError
+from openvima.paths import as_text
 from openvima.policies.base import Policy, RandomPolicy, require_torch
 from openvima.policies.own_code import learner_code, policy_of_code, policy_of_run
 from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
@@ -12,7 +13,7 @@ from openvima.policies.sources import is_own_code, is_policy_source, unknown_pol
 
 
 def load_policy(
-    name_or_run: str,
+    name_or_run: str | Path,
     *,
     seed: int = 0,
     trust_code: bool = False,
@@ -25,7 +26,7 @@ def load_policy(
             preset; "openvima-small", the bundled checkpoint; a run folder of `openvima train`, of which the
             best checkpoint is loaded; a checkpoint folder; a published `.ckpt` file; a name on the Hub such
             as "owner/policy@v1"; or "MODULE:FUNCTION" or "FILE.py:FUNCTION", a function without arguments
-            that returns a policy.
+            that returns a policy. A `Path` is always a local one.
         seed: Seed of the random policy and of fresh weights.
         trust_code: Whether to run the code that the run folder of a learner of your own names.
         **options: Options of `NetworkPolicy`, such as `tokenizer`, `device` or `dtype`. The random policy
@@ -45,6 +46,7 @@ def load_policy(
             checkpoint and has the name of a bundled one.
         MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
     """
+    name_or_run = as_text(name_or_run)
     if name_or_run == "random":
         return RandomPolicy(seed)
     if is_untrained(name_or_run):

@@ -7,6 +7,7 @@ from openvima.atomic_io import restore_folder
 from openvima.errors import CheckpointError, unknown_name
 from openvima.hub import HubName, fetch, hub_name
 from openvima.input_files import read_text
+from openvima.paths import as_path
 from openvima.policies.bundled import BUNDLED, bundled_folder
 from openvima.policies.file_names import (
     BEST_FILE,
@@ -83,7 +84,7 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
     """
     if isinstance(path_or_hub_id, str) and path_or_hub_id in BUNDLED:
         return bundled_folder(path_or_hub_id)
-    path, name = Path(path_or_hub_id), str(path_or_hub_id)
+    path, name = as_path(path_or_hub_id), str(path_or_hub_id)
     restore_folder(path)
     if path.is_dir():
         return checkpoint_folder(path)

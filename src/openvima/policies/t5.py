@@ -23,6 +23,7 @@ from openvima.errors import (
 from openvima.extras import import_extra
 from openvima.hub import HubName, fetch, hub_name
 from openvima.input_files import open_regular
+from openvima.paths import as_path
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
@@ -161,7 +162,7 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     """
     text = network.config.prompt.text
     named = str(path_or_hub_id).partition("@")[0].rpartition("/")[2]
-    if named in T5_SIZES and T5_SIZES[named] != text and not Path(path_or_hub_id).exists():
+    if named in T5_SIZES and T5_SIZES[named] != text and not as_path(path_or_hub_id).exists():
         raise CheckpointError(
             f"t5 is {path_or_hub_id}, but the network has {t5_name(text)}; give a T5 1.0 of that size."
         )
@@ -269,7 +270,7 @@ def _weights_file(path_or_hub_id: str | Path) -> Path:
 
 def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
     """The folder itself; for a Hub id, the folder of the downloaded files."""
-    folder, name = Path(path_or_hub_id), str(path_or_hub_id)
+    folder, name = as_path(path_or_hub_id), str(path_or_hub_id)
     if folder.is_dir():
         return folder
     repository = hub_name(name)

@@ -13,6 +13,7 @@ from openvima.evaluation.sources import weights_hash
 from openvima.evaluation.verification import is_marked_verified
 from openvima.hub import HubName, commit
 from openvima.input_files import read_text, read_yaml
+from openvima.paths import as_path
 from openvima.policies.base import require_torch
 from openvima.policies.file_names import CHECKPOINTS_FOLDER, CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE
 from openvima.policies.sources import find_checkpoint
@@ -146,7 +147,8 @@ def _checkpoint(source: str | Path) -> Path:
 
 
 def _results_file(path: str | Path) -> Path:
-    return Path(path) / FILE_NAME if Path(path).is_dir() else Path(path)
+    path = as_path(path)
+    return path / FILE_NAME if path.is_dir() else path
 
 
 def _of_weights(path: Path, sha256: str) -> Results:

@@ -6,7 +6,8 @@ The calling modules check the arguments. Each kernel has a slow reference implem
 import math
 
 import numpy as np
-from numba import njit
+
+from openvima.compilation import njit
 
 # Direction towards the light, the same in every image: (−50, 30, 100) as a unit vector.
 _LIGHT_X = -50.0 / math.sqrt(13400.0)
@@ -16,7 +17,7 @@ AMBIENT, DIFFUSE, SPECULAR = 0.6, 0.35, 0.05
 MICROMETRES = 1e6  # in a metre
 
 
-@njit(cache=True)
+@njit
 def light_intensity(nx: float, ny: float, nz: float) -> float:
     """Brightness factor of a surface with the unit normal (nx, ny, nz) in the world.
 
@@ -27,7 +28,7 @@ def light_intensity(nx: float, ny: float, nz: float) -> float:
     return AMBIENT + DIFFUSE * max(0.0, facing) + SPECULAR * reflected_z * reflected_z
 
 
-@njit(cache=True)
+@njit
 def texel_index(u: float, v: float, height: int, width: int) -> tuple[int, int]:
     """Row and column of the texel nearest to (u, v); v = 0 is the bottom row, both coordinates wrap at 1."""
     column = int((u - np.floor(u)) * width)
@@ -35,7 +36,7 @@ def texel_index(u: float, v: float, height: int, width: int) -> tuple[int, int]:
     return max(row, 0), min(column, width - 1)  # u − floor(u) of a tiny negative u rounds to 1
 
 
-@njit(cache=True)
+@njit
 def project_vertices(
     vertices: np.ndarray,  # (V, 3) float64, body frame
     pose: np.ndarray,  # (3, 4) float64, world from body
@@ -62,7 +63,7 @@ def project_vertices(
         screen[i, 3] = z
 
 
-@njit(cache=True)
+@njit
 def select_triangles(
     corners: np.ndarray,  # (F, 3) int32, indices into points
     points: np.ndarray,  # (V, ≥ 2) float64: across and upwards; the front of triangles turns left
@@ -88,7 +89,7 @@ def select_triangles(
     return count
 
 
-@njit(cache=True)
+@njit
 def _range_of(a: float, b: float, c: float) -> tuple[float, float]:
     """Smallest and largest of three numbers."""
     low = a if a < b else b
@@ -96,14 +97,14 @@ def _range_of(a: float, b: float, c: float) -> tuple[float, float]:
     return (c if c < low else low), (c if c > high else high)
 
 
-@njit(cache=True)
+@njit
 def _whole_numbers_between(a: float, b: float, c: float, last: int) -> tuple[int, int]:
     """First and last whole number from 0 to `last` in the range of a, b, c; none if the first is larger."""
     low, high = _range_of(a, b, c)
     return int(min(max(np.ceil(low), 0.0), last + 1.0)), int(max(min(np.floor(high), float(last)), -1.0))
 
 
-@njit(cache=True)
+@njit
 def draw_triangles(
     vertices: np.ndarray,  # (V, 3) float64, body frame
     corners: np.ndarray,  # (F, 3) int32, indices into vertices
@@ -194,7 +195,7 @@ def draw_triangles(
                     )
 
 
-@njit(cache=True)
+@njit
 def stamp_triangles(
     vertices: np.ndarray,  # (V, 3) float64, body frame
     corners: np.ndarray,  # (F, 3) int32, indices into vertices

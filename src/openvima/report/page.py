@@ -11,6 +11,7 @@ from openvima.evaluation.config import DEFAULT_BATCH
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
+from openvima.paths import as_path, names_of
 from openvima.policies.presets import UNTRAINED
 from openvima.report import episodes, figures, fragments, published, reasons, tables, text
 from openvima.report.ablations import ablated_policies
@@ -45,11 +46,11 @@ _PLACES = {"run": "RUN", "remote": "ws://HOST:PORT"}
 
 def write_report(
     results: Results,
-    out: Path,
+    out: str | Path,
     *,
     command: str = "",
-    metrics: Path | None = None,
-    runs: Sequence[Path] = (),
+    metrics: str | Path | None = None,
+    runs: str | Path | Sequence[str | Path] = (),
     clips: Sequence[Clip] = (),
     comparisons: Sequence[Comparison] | None = None,
     notes: Sequence[str] = (),
@@ -80,7 +81,8 @@ def write_report(
     if comparisons is None:
         comparisons = compare_pairs(results, default_pairs(results))
     with_published = with_published and published.is_comparable(results)
-    records = [*([metrics] if metrics else []), *runs]
+    out = as_path(out)
+    records = [*map(as_path, [*([metrics] if metrics else []), *names_of(runs)])]
     clips = list({clip.file_name: clip for clip in clips}.values())
     videos = episodes.video_ids(clips)
     listed, num_episodes = episodes.listed_episodes(results, videos)

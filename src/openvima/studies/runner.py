@@ -17,6 +17,7 @@ from openvima.evaluation.runner import evaluate_prepared, prepare
 from openvima.folder_lock import folder_lock, is_lock_file
 from openvima.input_files import read_json
 from openvima.multiprocess import check_workers, imap_unordered
+from openvima.paths import as_path
 from openvima.policies.base import require_torch
 from openvima.report.assets import require_extra
 from openvima.studies.page import study_page
@@ -78,7 +79,7 @@ DEFAULT_EXECUTION = Execution()
 def run_study(
     study: Study,
     inputs: StudyInputs,
-    out: Path,
+    out: str | Path,
     *,
     seeds: int = 1,
     device: str | None = None,
@@ -107,7 +108,7 @@ def run_study(
         FolderLockedError: Another process writes to the folder.
         OpenVimaError: As for `generate`, `train` and `evaluate`.
     """
-    out = out.absolute()
+    out = as_path(out).absolute()
     plan = plan_study(study, inputs, out, seeds=seeds, device=device)
     check_plan(plan, inputs)
     with folder_lock(out):

@@ -15,6 +15,7 @@ from openvima.errors import DatasetError, PolicyError
 from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode, success_rates
 from openvima.evaluation.results import FILE_NAME, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy
+from openvima.paths import as_path
 from openvima.render import channels_last
 from openvima.sim.ur5 import HOME
 from openvima.studio.browser_session import BrowserSession
@@ -87,7 +88,7 @@ class BrowsePanel:
         Raises:
             DatasetError: It is neither a results folder nor a data folder.
         """
-        folder = Path(self._path.value).expanduser()
+        folder = as_path(self._path.value)
         if (folder / FILE_NAME).is_file() or folder.suffix == ".json":
             self._results, self._dataset = (folder, Results.read(folder)), None
         elif (folder / MANIFEST_NAME).is_file():

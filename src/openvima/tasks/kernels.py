@@ -1,10 +1,11 @@
 """Numba kernels over the label raster; the calling modules check the arguments."""
 
 import numpy as np
-from numba import njit
+
+from openvima.compilation import njit
 
 
-@njit(cache=True)
+@njit
 def mark_free_centres(
     labels: np.ndarray,  # (R, C) int16, 0 where free
     side: int,
@@ -43,7 +44,7 @@ def mark_free_centres(
     return total
 
 
-@njit(cache=True)
+@njit
 def nth_centre(centres: np.ndarray, counts: np.ndarray, index: int) -> tuple[int, int]:
     """Row and column of the marked cell number `index` in row-major order."""
     row = 0
@@ -58,7 +59,7 @@ def nth_centre(centres: np.ndarray, counts: np.ndarray, index: int) -> tuple[int
     return -1, -1
 
 
-@njit(cache=True)
+@njit
 def squared_depths(
     labels: np.ndarray,  # (R, C) int16
     object_id: int,

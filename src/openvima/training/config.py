@@ -6,8 +6,17 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from openvima.errors import ConfigError, unknown_name
+from openvima.paths import settle
 from openvima.policies.presets import PRESETS
-from openvima.training.validation import Count, Probability, Range, Steps, from_settings, problems_of
+from openvima.training.validation import (
+    Count,
+    Probability,
+    Range,
+    Steps,
+    from_settings,
+    path_settings,
+    problems_of,
+)
 
 PRETRAINING_STEPS = 400  # of presets with an appearance embedding
 DETECTED_PROB = 0.5  # where a detector is named
@@ -314,6 +323,7 @@ class RunConfig:
     runtime: RuntimeConfig = RuntimeConfig()
 
     def __post_init__(self) -> None:
+        settle(self, paths=path_settings(type(self)), texts=self._texts())
         if problems := [*self._unknown(), *problems_of(self)]:
             raise ConfigError(" ".join(problems))
 
@@ -330,6 +340,10 @@ class RunConfig:
             for name in names:
                 values.get(section, {}).pop(name, None)
         return {name: str(v) if isinstance(v, Path) else v for name, v in values[""].items()}
+
+    def _texts(self) -> tuple[str, ...]:
+        """Return the settings that are a name or a path."""
+        return ()
 
     def _unknown(self) -> Iterator[str]:
         """Yield further problems."""
@@ -365,6 +379,9 @@ class TrainingConfig(RunConfig):
     rollout: RolloutConfig = RolloutConfig()
     pretraining: PretrainingConfig = PretrainingConfig()
     augmentation: AugmentationConfig = AugmentationConfig()
+
+    def _texts(self) -> tuple[str, ...]:
+        return ("preset", "init_from", "t5", "assets")
 
     def _unknown(self) -> Iterator[str]:
         if isinstance(self.preset, str) and self.preset not in PRESETS and ":" not in self.preset:

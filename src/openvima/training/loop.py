@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from openvima.data.reader import Dataset
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, Terminated
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
 from openvima.training.optimizer_state import load_named_state, named_state
@@ -30,6 +30,7 @@ from openvima.training.run_folder import (
     TrainedState,
 )
 from openvima.training.schedule import learning_rate_at, step_seed
+from openvima.training.termination import noted_sigterm
 from openvima.training.trackers import Tracker, open_trackers
 from openvima.video.animation import Animation
 
@@ -188,17 +189,33 @@ class Trainer:
         optimizer = _optimizer(self.learner, stage, self.config.optimizer.weight_decay)
         if self.progress.step:
             self._load_optimizer(optimizer)
-        window: list[Metrics] = []
         self._last = (self.progress.step, time.monotonic())
+        with noted_sigterm() as is_terminated:
+            self._take_steps(stage, optimizer, num_steps, is_terminated)
+
+    def _take_steps(
+        self,
+        stage: Stage,
+        optimizer: torch.optim.Optimizer,
+        num_steps: int,
+        is_terminated: Callable[[], bool],
+    ) -> None:
+        window: list[Metrics] = []
         for step in range(self.progress.step, num_steps):
             window.append(self._step(stage, optimizer, step, num_steps))
             self.progress = replace(self.progress, step=step + 1)
             saves = self._saves_at(step + 1) or step + 1 == num_steps
-            if saves or (step + 1) % LOG_EVERY == 0:
+            logs = saves or (step + 1) % LOG_EVERY == 0
+            # Several processes stop after the same step, and so ask each other, when they log anyway.
+            may_end = logs or self.parallel.num_ranks == 1
+            ends = may_end and self.parallel.mean({"ends": float(is_terminated())})["ends"] > 0
+            if logs or ends:
                 self._log(stage, self.parallel.mean(_mean(window)))
                 window = []
-            if saves:
-                self._save(stage, optimizer)
+            if saves or ends:
+                self._save(stage, optimizer, validates=saves)
+            if ends:
+                raise Terminated
 
     def _saves_at(self, step: int) -> bool:
         """Whether a checkpoint is due."""
@@ -255,21 +272,21 @@ class Trainer:
         times = {"seconds_since_start": seconds, "cpu_seconds_since_start": cpu_seconds}
         self.run.append(TIMINGS_FILE, {**self._here(), **times})
 
-    def _save(self, stage: Stage, optimizer: torch.optim.Optimizer) -> None:
-        """Validate, update the best checkpoint, and write one.
+    def _save(self, stage: Stage, optimizer: torch.optim.Optimizer, *, validates: bool = True) -> None:
+        """Validate, update the best checkpoint, and write one; without validation, the best stays.
 
         A later checkpoint, trained at a lower rate, is the best unless its noisy score is worse by more than
         the standard error.
         """
         self.learner.eval()
-        metrics = stage.validate()
+        metrics = stage.validate() if validates else {}
         self._write(stage, {f"validation_{name}": value for name, value in metrics.items()})
         self._say_validation(stage, metrics)
         name = f"{stage.name}-{self.progress.step:06d}"
         is_last_stage = self.progress.stage == len(self._stages) - 1
         score, error = metrics.get("score", 0.0), metrics.get("score_error", 0.0)
         best = self.progress.best_score
-        if is_last_stage and (best is None or score >= best - error):
+        if validates and is_last_stage and (best is None or score >= best - error):
             best = score if best is None else max(score, best)
             self.progress = replace(self.progress, best_score=best, best_checkpoint=name)
         state = self._state(optimizer)

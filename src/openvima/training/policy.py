@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.catalog.packs import load_assets
-from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
+from openvima.data.object_cache.cache import Boxes, ObjectCache, check_object_cache, open_object_cache
 from openvima.data.object_cache.random_appearance import check_scenes
 from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
@@ -97,6 +97,8 @@ def train(
                 f"loader.boxes is {config.loader.boxes!r}, but preset {config.preset!r} takes whole frames; "
                 "leave it out, or take a preset that takes objects."
             )
+        if parallel.is_first:  # before pretraining, which comes first and may take hours
+            _check_caches(config, dataset, boxes, learner)
         trainer = Trainer(
             config,
             dataset,
@@ -110,6 +112,17 @@ def train(
             going_on=command_going_on(config),
         )
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
+
+
+def _check_caches(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None, learner: Learner) -> None:
+    """Check that the object caches are there or can be written."""
+    check = partial(check_object_cache, dataset, learner.input_kind, folder=config.object_cache)
+    if (config.loader.detected_prob or 0.0) < 1:
+        check()
+    if boxes:
+        check(boxes=boxes)
+    for variant in range(config.loader.rerendered_variants if config.loader.rerendered_prob else 0):
+        check(appearance=variant)
 
 
 def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:  # Any: YAML

@@ -8,6 +8,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from openvima.errors import ConfigError, unknown_name
+from openvima.paths import as_path
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,11 @@ def setting_types(kind: type, prefix: str = "") -> dict[str, Any]:  # Any: types
     return types
 
 
+def path_settings(kind: type) -> list[str]:
+    """Return the settings of a dataclass itself that are paths."""
+    return [name for name, hint in get_type_hints(kind).items() if Path in _options(hint)]
+
+
 def from_settings(kind: type[Settings], settings: Mapping[str, Any]) -> Settings:
     """Make a dataclass of dataclasses from settings by dotted name; those left out keep their defaults.
 
@@ -104,7 +110,7 @@ def converted(value: Any, hint: Any) -> Any:  # Any: what YAML holds, and types
     if not isinstance(value, str) or not {Path, float} & kinds:
         return value
     try:
-        return Path(value) if Path in kinds else float(value)
+        return as_path(value) if Path in kinds else float(value)
     except ValueError:  # reported by `problems_of`
         return value
 

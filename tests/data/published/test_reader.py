@@ -98,6 +98,14 @@ def test_both_generations_and_both_forms_hold_the_same(path: Path, tmp_path: Pat
             assert dataclasses.replace(a, outcome=reason).content_hash() == b.content_hash()
 
 
+def test_pickles_of_protocol_5_hold_the_same(tmp_path: Path) -> None:
+    read = []
+    for protocol in (4, 5):
+        files = {"rearrange/000000": SCENE.files(PUBLISHED, protocol)}
+        read.append(PublishedData(write_folder(tmp_path / str(protocol), files))[0].content_hash())
+    assert read[0] == read[1]
+
+
 def test_the_folder_of_one_task_is_enough(tmp_path: Path) -> None:
     write_folder(tmp_path, episodes())
     data = PublishedData(tmp_path / "simple_manipulation")

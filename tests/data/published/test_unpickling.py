@@ -49,14 +49,78 @@ def test_what_occurs_twice_comes_back_twice() -> None:
     assert first is second
 
 
+@pytest.mark.parametrize("protocol", [4, 5])
 @pytest.mark.parametrize("dtype", ["|u1", "<i8", ">i2", "<f4", ">f8", "?", "<u4"])
-def test_arrays_come_back(dtype: str) -> None:
+def test_arrays_come_back(dtype: str, protocol: int) -> None:
     array = np.arange(24).astype(dtype).reshape(2, 3, 4)
-    for value in (array, np.asfortranarray(array), array[:0]):
-        for content in (pickle.dumps(value, 4), published_data.pickled(value)):
+    single = array[1, 1, 1:2].reshape(())
+    for value in (
+        array,
+        np.asfortranarray(array),
+        array[:0],
+        array.transpose(1, 0, 2),
+        array[:, ::2],
+        single,
+    ):
+        for content in (pickle.dumps(value, protocol), published_data.pickled(value, protocol)):
             read = as_array(read_pickle(content))
             assert read.dtype == array.dtype
             assert np.array_equal(read, value)
+            assert not read.flags.writeable
+
+
+def test_arrays_that_cannot_be_written_come_back() -> None:
+    array = np.frombuffer(b"abcd", np.uint8)
+    assert np.array_equal(as_array(read_pickle(pickle.dumps(array, 5))), array)
+
+
+@pytest.mark.parametrize("package", ["numpy.core", "numpy._core"])
+@pytest.mark.parametrize(
+    ("args", "fault"),
+    [
+        ((b"abc", (10**12,), "C"), "do not fit"),
+        ((b"abc", (-1, 5), "C"), "do not fit"),
+        ((b"abc", (3,), "X"), "do not fit"),
+        ((b"abc", (3,), None), None),
+        ((b"abc", (3,), "K", (1,)), "do not fit"),
+        ((b"abc", (3,), "K", (0, 0)), "do not fit"),
+        ((b"abc", (3,), "K", (0,), 1), "do not fit"),
+        ((b"abc", (3,), "K"), None),
+        ((b"abc",), "do not fit"),
+        ((b"abc", 3), "do not fit"),
+        (("text", (4,), "C"), "do not fit"),
+        (([1, 2], (2,), "C"), "do not fit"),
+    ],
+)
+def test_arrays_of_protocol_5_fit_their_bytes(package: str, args: tuple, fault: str | None) -> None:
+    content, *rest = args
+    made = read_pickle(pickle.dumps((content, Calls(np.dtype, "u1", False, True), *rest), 5))
+    array = STAND_INS[f"{package}.numeric._frombuffer"](*made)
+    if fault is None:
+        assert as_array(array).tolist() == [*b"abc"]
+        return
+    with pytest.raises(MemberError, match=fault):
+        as_array(array)
+
+
+@pytest.mark.parametrize("opcode", [b"\x97", b"\x98"])
+def test_buffers_outside_of_the_pickle_are_refused(opcode: bytes) -> None:
+    with pytest.raises(MemberError, match=r"_BUFFER.*nothing was run"):
+        read_pickle(b"\x80\x05N" + opcode + b".")
+
+
+def test_bytes_that_can_be_written_are_data_and_no_tool() -> None:
+    content = b"\x96" + struct.pack("<Q", 3) + b"abc"
+    assert read_pickle(b"\x80\x05" + content + b".") == bytearray(b"abc")
+    for use, fault in (
+        (b")R", "not callable"),
+        (b"}Nsb", "no pickle of data"),
+        (b")\x81", "no pickle of data"),
+    ):
+        with pytest.raises(MemberError, match=fault):
+            read_pickle(b"\x80\x05" + content + use + b".")
+    with pytest.raises(MemberError, match="truncated"):
+        read_pickle(b"\x80\x05\x96" + b"\xff" * 8 + b"abc.")
 
 
 @pytest.mark.parametrize("number", [np.int64(-3), np.float32(0.5), np.bool_(True), np.uint8(9)])
@@ -81,6 +145,13 @@ def test_objects_stay_records() -> None:
     assert [node.state["_val"] for node in old["modalities"].state["_content"]] == ["rgb", "segm"]
     with pytest.raises(TypeError):
         old["modalities"]()
+
+
+def test_both_protocols_hold_the_same_objects() -> None:
+    trajectory = published_data.MadeEpisode().trajectory(published_data.TODAY)
+    read = [read_pickle(published_data.pickled(trajectory, protocol)) for protocol in (4, 5)]
+    assert read[0].keys() == read[1].keys()
+    assert read[0]["obj_id_to_info"].keys() == read[1]["obj_id_to_info"].keys()
 
 
 class Calls:
@@ -118,6 +189,8 @@ def attack(touch: str) -> dict[str, bytes]:
         + named("builtins", "getattr") + named("os", "path") + text("os") + b"\x86R0"
         + named("os", "system") + text(touch) + b"\x85R.",
         "a dotted name": PROTO + named("shutil", "os.system") + text(touch) + b"\x85R.",
+        "a call, protocol 5": pickle.dumps(Calls(os.system, touch), 5),
+        "a call in an array, protocol 5": pickle.dumps(np.array([Calls(os.system, touch)], dtype=object), 5),
         "functools.partial": pickle.dumps(Calls(functools.partial(os.system, touch)), 4),
         "a call in an array": pickle.dumps(np.array([Calls(os.system, touch)], dtype=object), 4),
         "a call as a key": PROTO + b"}" + named("os", "system") + text(touch) + b"\x85RK\x01s.",
@@ -258,9 +331,8 @@ def test_no_beginning_of_a_pickle_reads_as_whole() -> None:
 
 @given(st.data())
 def test_damage_gives_a_value_or_an_error_that_says_so(data: st.DataObject) -> None:
-    whole = published_data.pickled(
-        {"a": [1, 2.5, None], "b": np.arange(4), "c": (True, b"bytes", "text" * 20)}
-    )
+    values = {"a": [1, 2.5, None], "b": np.arange(4), "c": (True, b"bytes", "text" * 20)}
+    whole = published_data.pickled(values, data.draw(st.sampled_from([4, 5])))
     content = bytearray(whole)
     for _ in range(data.draw(st.integers(1, 6))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))

@@ -18,6 +18,7 @@ from openvima.data.lerobot.writer import LerobotWriter, write_json
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
 from openvima.folder_lock import folder_lock, is_lock_file
+from openvima.paths import settle
 from openvima.scene.command import CONTROL_HZ
 from openvima.video.encoder import import_av
 
@@ -57,6 +58,7 @@ class LerobotConfig:
     force: bool = False
 
     def __post_init__(self) -> None:
+        settle(self, paths=("data", "out"), names=("tasks",))
         problems = []
         if self.fps is not None and self.fps not in RATES:
             problems.append(f"fps is {self.fps}; allowed are {', '.join(map(str, RATES))}.")

@@ -1,6 +1,7 @@
 """The object cache of a data set: a derived folder, written when first needed and safe to delete."""
 
 import shlex
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -29,6 +30,7 @@ from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
+from openvima.paths import as_path
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import KINDS, InputKind
 from openvima.scene import COMPOSED
@@ -99,7 +101,11 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     """
 
     def __init__(
-        self, dataset: Dataset, kind: InputKind = "objects", folder: Path | None = None, variant: str = ""
+        self,
+        dataset: Dataset,
+        kind: InputKind = "objects",
+        folder: str | Path | None = None,
+        variant: str = "",
     ) -> None:
         self.dataset, self.kind, self.variant, self._root = dataset, kind, variant, folder
         self.folder = _cache_folder(dataset, kind, folder, variant)
@@ -205,7 +211,7 @@ def open_object_cache(
     dataset: Dataset,
     kind: InputKind = "objects",
     *,
-    folder: Path | None = None,
+    folder: str | Path | None = None,
     boxes: Boxes | None = None,
     appearance: int | None = None,
     workers: int = 1,
@@ -234,18 +240,47 @@ def open_object_cache(
         raise DatasetError(f"boxes are those of {boxes.name}, but whole frames have none; leave them out.")
     variant = Variant(boxes, appearance)
     target = _cache_folder(dataset, kind, folder, variant.name)
-    if _missing(dataset, kind, target, variant):
-        try:
-            target.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            if error.errno in NO_SPACE:
-                raise
-            raise DatasetError(
-                f"cannot write the object cache to {target}: {error.strerror}. Name another folder."
-            ) from None
+    if check_object_cache(dataset, kind, folder=folder, boxes=boxes, appearance=appearance):
         with folder_lock(target, timeout_s=timeout_s):
             _write_missing(_missing(dataset, kind, target, variant), workers, report)
     return ObjectCache(dataset, kind, folder, variant.name)
+
+
+def check_object_cache(
+    dataset: Dataset,
+    kind: InputKind = "objects",
+    *,
+    folder: str | Path | None = None,
+    boxes: Boxes | None = None,
+    appearance: int | None = None,
+) -> bool:
+    """Return whether `open_object_cache` has anything to write, and make the folder for it.
+
+    Args:
+        dataset: As in `open_object_cache`, like the others.
+        kind: See there.
+        folder: See there.
+        boxes: See there.
+        appearance: See there.
+
+    Raises:
+        DatasetError: The folder would have to be written to, and cannot be.
+    """
+    variant = Variant(boxes, appearance)
+    target = _cache_folder(dataset, kind, folder, variant.name)
+    if not _missing(dataset, kind, target, variant):
+        return False
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=target).close()
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            raise
+        raise DatasetError(
+            f"cannot write the object cache to {target}: {error.strerror}. Name another folder: "
+            "--object-cache of `openvima train`, --out of `openvima data preprocess`."
+        ) from None
+    return True
 
 
 def _missing(dataset: Dataset, kind: InputKind, target: Path, variant: Variant) -> list[_Work]:
@@ -293,11 +328,11 @@ def sources(dataset: Dataset) -> list[Source]:
     return found
 
 
-def _cache_folder(dataset: Dataset, kind: InputKind, folder: Path | None, variant: str) -> Path:
+def _cache_folder(dataset: Dataset, kind: InputKind, folder: str | Path | None, variant: str) -> Path:
     if kind not in KINDS:
         raise DatasetError(unknown_name("kind of object cache", kind, KINDS))
     parts = (kind, f"v{CACHE_VERSION}", *((variant,) if variant else ()))
-    return (folder or dataset.path / CACHE_FOLDER) / "-".join(parts)
+    return (as_path(folder) if folder else dataset.path / CACHE_FOLDER) / "-".join(parts)
 
 
 def _made(folder: Path, source: Source, kind: InputKind, variant: str) -> CacheFile | None:

@@ -25,6 +25,7 @@ from openvima.data.writer import ShardWriter
 from openvima.errors import ConfigError, DatasetError
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import MAX_WORKERS, Counts, imap_with_progress
+from openvima.paths import settle
 
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set
@@ -61,6 +62,7 @@ class ImportConfig:
     force: bool = False
 
     def __post_init__(self) -> None:
+        settle(self, paths=("source", "out"), names=("tasks",))
         problems = [
             f"{name} is {value}; it must lie within 1 … {most:,}."
             for name, value, most in (

@@ -11,6 +11,7 @@ from openvima.data.published.names import split_of, todays_task
 from openvima.data.published.zip_archive import ZipArchive
 from openvima.data.records import Demonstration
 from openvima.errors import ConfigError, DatasetError, MemberError, unknown_name
+from openvima.paths import as_path, names_of
 from openvima.tasks import task_spec
 
 SPLITS = ("all", "train", "validation")
@@ -99,11 +100,13 @@ class PublishedData(Sequence[Demonstration]):
         'Stack objects in this order {frame_0} {frame_1} {frame_2}.'
     """
 
-    def __init__(self, path: str | Path, *, tasks: Sequence[str] | None = None, split: str = "all") -> None:
+    def __init__(
+        self, path: str | Path, *, tasks: str | Sequence[str] | None = None, split: str = "all"
+    ) -> None:
         if split not in SPLITS:
             raise ConfigError(unknown_name("split", split, SPLITS))
-        self.path = Path(path)
-        self.tasks = None if tasks is None else tuple(tasks)
+        self.path = as_path(path)
+        self.tasks = None if tasks is None else names_of(tasks)
         self.split = split
         self._source = open_source(self.path)
         places, self.broken_folders = _sorted_places(self._source)

@@ -14,8 +14,9 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from openvima.errors import InputFileError, MemberError
-from openvima.pickle_opcodes import check_opcodes
+from openvima.pickle_opcodes import OPCODES, check_opcodes
 
+_OPCODES = OPCODES | {"BYTEARRAY8"}  # in which protocol 5 writes the content of arrays
 MAX_OPERATIONS = 100_000  # opcodes; the largest known file has about 3,000
 _MAX_TEXT = 200  # characters of a name or reason that a message quotes
 # What `pickle` raises when it is given damaged bytes.
@@ -25,14 +26,16 @@ _ODD_ERRORS = (
 )
 _DTYPE = re.compile(r"[<>|=]?[buif][1248]")
 
-_NUMPY = ("numpy.core.multiarray", "numpy._core.multiarray")
+_NUMPY = ("numpy.core", "numpy._core")
 _ENCYCLOPEDIA = tuple(f"{package}.tasks.components.encyclopedia" for package in ("vimasim", "vima_bench"))
-ARRAYS = frozenset(f"{module}._reconstruct" for module in _NUMPY)
-SCALARS = frozenset(f"{module}.scalar" for module in _NUMPY)
+ARRAYS = frozenset(f"{package}.multiarray._reconstruct" for package in _NUMPY)
+BUFFERS = frozenset(f"{package}.numeric._frombuffer" for package in _NUMPY)  # arrays in protocol 5
+SCALARS = frozenset(f"{package}.multiarray.scalar" for package in _NUMPY)
 # Classes whose instances published files contain.
 _CLASSES = frozenset(
     [
         *ARRAYS,
+        *BUFFERS,
         *SCALARS,
         "numpy.dtype",
         "functools.partial",
@@ -115,7 +118,7 @@ def read_pickle(content: bytes) -> Any:  # Any: whatever the file holds
         MemberError: It is damaged, too large, or more than data.
     """
     try:
-        check_opcodes(content, max_operations=MAX_OPERATIONS)
+        check_opcodes(content, max_operations=MAX_OPERATIONS, opcodes=_OPCODES)
         return _Unpickler(io.BytesIO(content)).load()
     except MemberError:
         raise
@@ -145,15 +148,19 @@ def as_array(value: object) -> np.ndarray:
     Raises:
         MemberError: It is none, holds anything but numbers, or its size does not fit its shape.
     """
-    if not isinstance(value, Record) or value.name not in ARRAYS or not isinstance(value.state, tuple):
-        raise MemberError(f"it has {kind_of(value)} where an array should be.")
     try:
-        _, shape, dtype, by_columns, content = value.state
-        return _frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C")
+        if isinstance(value, Record) and value.name in BUFFERS:
+            content, dtype, shape, order, *axes = value.args
+            array = _frombuffer(content, dtype).reshape(shape, order="C" if order == "K" else order)
+            return array.transpose(*axes) if order == "K" else array
+        if isinstance(value, Record) and value.name in ARRAYS and isinstance(value.state, tuple):
+            _, shape, dtype, by_columns, content = value.state
+            return _frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C")
     except MemberError:
         raise
     except (TypeError, ValueError, OverflowError):
         raise MemberError("it has an array whose size, shape and type do not fit each other.") from None
+    raise MemberError(f"it has {kind_of(value)} where an array should be.")
 
 
 def as_plain(value: object) -> object:
@@ -184,11 +191,14 @@ def kind_of(value: object) -> str:
 
 def _frombuffer(content: object, dtype: object) -> np.ndarray:
     """View bytes as numbers; the result has the size of the bytes, whatever a file claims."""
-    if not isinstance(dtype, Record) or dtype.name != "numpy.dtype" or not isinstance(content, bytes):
+    if not isinstance(dtype, Record) or dtype.name != "numpy.dtype":
+        raise TypeError
+    if not isinstance(content, bytes | bytearray):
         raise TypeError
     spec = dtype.args[0] if dtype.args else None
     if not isinstance(spec, str) or not _DTYPE.fullmatch(spec):
         raise MemberError(f"it has an array of type {kind_of(spec)}; only numbers are read.")
     order = dtype.state[1] if isinstance(dtype.state, tuple) and len(dtype.state) > 1 else "|"
     numbers = np.dtype(spec)
-    return np.frombuffer(content, numbers.newbyteorder(">") if order == ">" else numbers)
+    numbers = numbers.newbyteorder(">") if order == ">" else numbers
+    return np.frombuffer(memoryview(content).toreadonly(), numbers)

@@ -18,6 +18,7 @@ from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, writ
 from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, unknown_name
 from openvima.folder_lock import folder_lock
+from openvima.paths import as_path, names_of, settle
 from openvima.tasks.prompts import MULTIMODAL
 
 Duplicates = Literal["refuse", "skip"]
@@ -49,6 +50,10 @@ class MergeConfig:
     compression: str | None = None
     workers: int = 1
     force: bool = False
+
+    def __post_init__(self) -> None:
+        settle(self, paths=("out",), names=("tasks",))
+        object.__setattr__(self, "sources", tuple(map(as_path, names_of(self.sources))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

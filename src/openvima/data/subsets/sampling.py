@@ -15,6 +15,7 @@ from openvima.data.subsets.folders import check_out, provenance
 from openvima.data.subsets.shards import NewShard, plan_shards, write_shards
 from openvima.errors import DatasetError
 from openvima.folder_lock import folder_lock
+from openvima.paths import settle
 
 Report = Callable[[int, int, str], None]
 
@@ -40,6 +41,9 @@ class SubsetConfig:
     compression: str | None = None
     workers: int = 1
     force: bool = False
+
+    def __post_init__(self) -> None:
+        settle(self, paths=("source", "out"), names=("tasks",))
 
     def settings(self, dataset: Dataset) -> dict[str, Any]:  # Any: JSON
         """Return what decides the content, without paths."""

@@ -19,6 +19,7 @@ from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
 from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
 from openvima.multiprocess import imap_unordered
+from openvima.paths import as_path
 from openvima.user_code import is_code
 
 DEFAULT = VerifyConfig()
@@ -40,7 +41,7 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
         ConfigError: The assets are a function that is missing or fails.
         WorkerError: A worker died.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     if config.assets is not None and is_code(config.assets):
         load_assets(config.assets)
     check_failed(folder)

@@ -29,6 +29,7 @@ from openvima.env.config import ENV_SETTINGS
 from openvima.errors import DatasetError, OpenVimaError
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import Counts, imap_with_progress
+from openvima.paths import as_path
 
 _STAGING = ".repair.tmp"
 
@@ -77,7 +78,7 @@ def repair(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
         FolderLockedError: Another process writes to the folder.
         WorkerError: A worker died; repeat the command.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     if take_inventory(folder).holds_failed:
         raise DatasetError(f"{folder} belongs to {folder.parent}; repair that, and both are repaired.")
     with folder_lock(folder):

@@ -1,0 +1,207 @@
+"""Paths are text or `Path`, `~` is the user's home, single names are lists, and what exists is a path."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from openvima.cli.lists import parse_sources
+from openvima.cli.main import main
+from openvima.data import Dataset, GenerateConfig, verify
+from openvima.data.lerobot import LerobotConfig
+from openvima.data.published import ImportConfig
+from openvima.data.subsets import MergeConfig, SubsetConfig
+from openvima.errors import CheckpointError, UnknownPolicyError
+from openvima.evaluation import EvaluationConfig, Results, score
+from openvima.evaluation.config import plan
+from openvima.evaluation.sources import policy_sources
+from openvima.paths import cache_dir, expand_home
+from openvima.policies import RandomPolicy, load_policy
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's home, which is the current folder as well."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def training(**settings: Any) -> Any:
+    pytest.importorskip("torch")
+    from openvima.training import TrainingConfig
+
+    return TrainingConfig(**{"data": "demos", "out": "run", **settings})
+
+
+def detector(**settings: Any) -> Any:
+    pytest.importorskip("torch")
+    from openvima.training.detector import DetectorTrainingConfig
+
+    return DetectorTrainingConfig(**{"data": "demos", "out": "run", **settings})
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda **given: EvaluationConfig(("oracle",), **given), "out"),
+        (GenerateConfig, "out"),
+        (lambda **given: ImportConfig(source=Path("a"), **given), "out"),
+        (lambda **given: ImportConfig(out=Path("a"), **given), "source"),
+        (lambda **given: LerobotConfig(data=Path("a"), **given), "out"),
+        (lambda **given: LerobotConfig(out=Path("a"), **given), "data"),
+        (lambda **given: SubsetConfig(source=Path("a"), **given), "out"),
+        (lambda **given: MergeConfig(sources=(Path("a"),), **given), "out"),
+        (training, "out"),
+        (training, "data"),
+        (training, "object_cache"),
+        (detector, "init_from"),
+    ],
+)
+def test_settings_with_a_path_take_text_and_home(
+    home: Path, make: Callable[..., object], name: str, kind: Callable
+) -> None:
+    assert getattr(make(**{name: kind("~/here")}), name) == home / "here"
+    assert getattr(make(**{name: kind("here")}), name) == Path("here")
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda **given: EvaluationConfig(**{"policies": ("oracle",), **given}), "policies"),
+        (lambda **given: EvaluationConfig(("oracle",), **given), "tasks"),
+        (lambda **given: EvaluationConfig(("oracle",), **given), "levels"),
+        (lambda **given: GenerateConfig(Path("a"), **given), "tasks"),
+        (lambda **given: ImportConfig(Path("a"), Path("b"), **given), "tasks"),
+        (lambda **given: LerobotConfig(Path("a"), Path("b"), **given), "tasks"),
+        (lambda **given: SubsetConfig(Path("a"), Path("b"), **given), "tasks"),
+        (lambda **given: MergeConfig((Path("a"),), Path("b"), **given), "tasks"),
+    ],
+)
+def test_settings_with_a_list_take_a_single_name_and_any_list(make: Callable[..., object], name: str) -> None:
+    assert getattr(make(**{name: "rotate"}), name) == ("rotate",)
+    assert getattr(make(**{name: ["rotate", "twist"]}), name) == ("rotate", "twist")
+
+
+def test_a_single_data_set_is_merged_alone(home: Path) -> None:
+    assert MergeConfig("~/a", Path("b")).sources == (home / "a",)  # type: ignore[arg-type]
+
+
+def test_policies_may_be_paths(home: Path) -> None:
+    config = EvaluationConfig((Path("run"), "mine=~/other", "oracle"))  # type: ignore[arg-type]
+    assert [source.source for source in config.sources] == ["./run", f"{home}/other", "oracle"]
+    assert [source.name for source in config.sources] == ["run", "mine", "oracle"]
+
+
+def test_initial_weights_may_be_a_path(home: Path) -> None:
+    assert training(init_from=Path("run")).init_from == "./run"
+    assert training(t5="~/t5-base").t5 == f"{home}/t5-base"
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_policy_is_loaded_from_text_path_and_home(home: Path, kind: Callable) -> None:
+    pytest.importorskip("torch")
+    from openvima.policies.inference import NetworkPolicy
+
+    policy = load_policy("nano")
+    assert isinstance(policy, NetworkPolicy)
+    policy.save_pretrained(kind("~/runs/mine"))
+    for given in ("runs/mine", "~/runs/mine"):
+        assert isinstance(load_policy(kind(given)), NetworkPolicy)
+
+
+def test_a_path_is_never_the_name_of_a_policy(home: Path) -> None:
+    assert isinstance(load_policy("random"), RandomPolicy)
+    with pytest.raises(UnknownPolicyError, match=r"\./random"):
+        load_policy(Path("random"))
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_data_and_results_are_named_by_text_path_and_home(home: Path, kind: Callable) -> None:
+    assert main(["generate", "--tasks=rotate", "--episodes=2", "--out=~/demos"]) == 0
+    dataset = Dataset(kind("~/demos"), tasks="rotate")
+    assert len(dataset) == 2 and dataset.tasks == ("rotate",)
+    assert verify(kind("~/demos")).folder == home / "demos"
+    results = score({"random": RandomPolicy()}, tasks="rotate", levels="L1", episodes=1)
+    results.write(kind("~/results.json"))
+    assert Results.read(kind("~/results.json")).rows == results.rows
+    assert not Path("~").exists()
+
+
+def test_a_file_of_settings_names_the_home(home: Path) -> None:
+    pytest.importorskip("torch")
+    from openvima.training.recipes import read_settings
+
+    Path("run.yaml").write_text("out: ~/run\ndata: ~/demos\ninit_from: ~/first\n", encoding="utf-8")
+    settings = read_settings(Path("run.yaml"))
+    assert training(**settings).out == home / "run"
+    assert training(**settings).data == home / "demos"
+    assert training(**settings).init_from == str(home / "first")
+
+
+def test_an_existing_path_is_a_policy_whatever_it_is_named(home: Path) -> None:
+    for name in ("lr=0.001", "a,b", "a=1,b=2", "mine"):
+        (home / "runs" / name).mkdir(parents=True)
+    (home / "my,policies.py").write_text("", encoding="utf-8")
+    given = (
+        "runs/lr=0.001,mine=runs/a,b,oracle, runs/a=1,b=2 ,mine2=runs/mine,x=my,policies.py:make,~/runs/mine"
+    )
+    words = parse_sources(given)
+    assert words[:3] == ("runs/lr=0.001", "mine=runs/a,b", "oracle")
+    assert words[3:] == ("runs/a=1,b=2", "mine2=runs/mine", "x=my,policies.py:make", "~/runs/mine")
+    sources = policy_sources(words[:-1])
+    assert [source.name for source in sources] == ["lr-0.001", "mine", "oracle", "a-1-b-2", "mine2", "x"]
+    paths = ["runs/lr=0.001", "runs/a,b", "oracle", "runs/a=1,b=2", "runs/mine", "my,policies.py:make"]
+    assert [source.source for source in sources] == paths
+    (home / "oracle,random").mkdir()
+    assert parse_sources("oracle,random,nano") == ("oracle,random", "nano")
+
+
+def test_names_that_are_no_paths_are_split(home: Path) -> None:
+    assert parse_sources("oracle, random,,mine=run") == ("oracle", "random", "mine=run")
+    assert parse_sources("a.py:make,b.py:make") == ("a.py:make", "b.py:make")
+    (home / "my policies.py").write_text("", encoding="utf-8")
+    words = ("my policies.py:make", "other=./my policies.py:Mine")
+    assert parse_sources(",".join(words)) == words
+    assert parse_sources("") == ()
+
+
+def test_batches_of_other_processes_have_whole_paths(home: Path) -> None:
+    (home / "lr=0.001").mkdir()
+    (batch,) = plan(EvaluationConfig("lr=0.001", tasks="rotate", levels="L1", episodes=1))  # type: ignore
+    assert batch.with_whole_paths().source == str(home / "lr=0.001")
+
+
+def test_a_detector_lies_at_home(home: Path) -> None:
+    from openvima.detector import detector_folder
+
+    (home / "boxes").mkdir()
+    assert detector_folder("~/boxes") == home / "boxes"
+    with pytest.raises(CheckpointError, match="no folder"):
+        detector_folder("~/others")
+
+
+@pytest.mark.parametrize(
+    ("given", "expanded"),
+    [
+        ("~/demos", "HOME/demos"),
+        ("--out=~/demos", "--out=HOME/demos"),
+        ("--loader.object-cache=~/a b", "--loader.object-cache=HOME/a b"),
+        ("mine=~/runs/lr=0.1", "mine=HOME/runs/lr=0.1"),
+        ("~", "HOME"),
+        ("runs/~/a", "runs/~/a"),
+        ("--out=a~", "--out=a~"),
+        ("Put the ~ here", "Put the ~ here"),
+    ],
+)
+def test_words_name_the_home(given: str, expanded: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/users/me")
+    assert expand_home(given) == expanded.replace("HOME", "/users/me")
+
+
+def test_the_cache_may_be_named_from_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/users/me")
+    monkeypatch.setenv("OPENVIMA_CACHE", "~/cache")
+    assert cache_dir() == Path("/users/me/cache")
