@@ -43,7 +43,7 @@ Animate = Callable[[Path], Sequence[Animation]]
 
 LOG_EVERY = 20  # steps
 COLLAPSED_SPREAD = 0.02  # see `openvima.policies.nn.action_head.spread`
-OVERFIT_RATIO = 1.25  # of the loss on held-out demonstrations to that in training
+OVERFIT_GAP = 0.15  # of the score in training to that on held-out demonstrations
 
 logger = logging.getLogger(__name__)
 # What the terminal shows of the metrics.
@@ -151,7 +151,7 @@ class Trainer:
         parallel.wait()
         self._started, self._cpu_started = time.monotonic(), time.process_time()
         self._last = (0, self._started)  # step and time of the last line of metrics
-        self._training_loss = math.nan
+        self._training_score = math.nan
         self.progress = self.run.resume(learner)
         learner.to(parallel.device)
         self._stages: Sequence[PlannedStage] = ()
@@ -257,7 +257,7 @@ class Trainer:
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
         self.report(f"{stage.name}: {_shown(metrics)}  {rate:.1f} steps/s")
-        self._training_loss = metrics.get("loss", math.nan)
+        self._training_score = metrics.get(self.learner.score, math.nan)
         if metrics.get("query_spread", 1.0) < COLLAPSED_SPREAD and self.parallel.is_first:
             logger.warning(
                 "step %d: the network gives almost one action for all inputs (spread of the action query "
@@ -305,15 +305,17 @@ class Trainer:
     def _say_validation(self, stage: Stage, metrics: Metrics) -> None:
         if not (metrics and self.parallel.is_first):
             return
-        step, loss = self.progress.step, metrics.get("loss", math.nan)
+        step, name = self.progress.step, self.learner.score
+        score = metrics.get(name, math.nan)
         logger.info("%s, step %d, held out: %s", stage.name, step, _shown(metrics))
-        if loss - self._training_loss > (OVERFIT_RATIO - 1) * abs(self._training_loss):
+        if self._training_score - score > OVERFIT_GAP:
             logger.warning(
-                "step %d: the loss is %.2f in training and %.2f on held-out demonstrations: the network "
+                "step %d: %s is %.0f%% in training and %.0f%% on held-out demonstrations: the network "
                 "overfits. More demonstrations or augmentation help; a longer training does not.",
                 step,
-                self._training_loss,
-                loss,
+                name,
+                100 * self._training_score,
+                100 * score,
             )
 
     def _write(self, stage: Stage, metrics: Metrics) -> None:
