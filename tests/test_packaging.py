@@ -23,7 +23,11 @@ POLICY_FILES = {
 DETECTOR_FILES = {"model.safetensors", "config.yaml", "MODEL_CARD.md"}
 TRAINED = {
     *(f"openvima/detector/trained/{name}" for name in DETECTOR_FILES),
-    *(f"openvima/policies/trained/openvima-small/{name}" for name in POLICY_FILES),
+    *(
+        f"openvima/policies/trained/{policy}/{name}"
+        for policy in ("openvima-small", "openvima-vima")
+        for name in POLICY_FILES
+    ),
 }
 
 
@@ -60,11 +64,12 @@ def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
     assert load_detector().network.config
 
 
-def test_the_policy_in_the_package_is_small_and_whole() -> None:
-    from openvima.policies.bundled import BUNDLED, SMALL
+@pytest.mark.parametrize(("name", "most_bytes"), [("openvima-small", 20e6), ("openvima-vima", 8e6)])
+def test_the_policies_in_the_package_are_small_and_whole(name, most_bytes) -> None:
+    from openvima.policies.bundled import BUNDLED
 
-    policy = BUNDLED[SMALL]
+    policy = BUNDLED[name]
     files = [file for file in policy.folder.rglob("*") if file.is_file()]
     assert {file.relative_to(policy.folder).as_posix() for file in files} == POLICY_FILES
-    assert sum(file.stat().st_size for file in files) <= 20e6
+    assert sum(file.stat().st_size for file in files) <= most_bytes
     assert "TODO" not in policy.model_card.read_text(encoding="utf-8")

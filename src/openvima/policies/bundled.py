@@ -7,6 +7,7 @@ from openvima.errors import CheckpointError, PolicyError
 from openvima.policies.file_names import CHECKPOINTS_FOLDER, CONFIG_FILE, WEIGHTS_FILE
 
 SMALL = "openvima-small"
+VIMA = "openvima-vima"
 MODEL_CARD = "MODEL_CARD.md"
 
 _TRAINED = Path(__file__).parent / "trained"
@@ -42,6 +43,9 @@ class BundledPolicy:
 
 BUNDLED: dict[str, BundledPolicy] = {
     SMALL: BundledPolicy(_TRAINED / SMALL, "demonstrations of the 13 training tasks, training partition"),
+    VIMA: BundledPolicy(
+        _TRAINED / VIMA, "demonstrations of the 13 training tasks, 30% of them with random appearance"
+    ),
 }
 
 
