@@ -105,7 +105,7 @@ def test_a_policy_is_loaded_from_text_path_and_home(home: Path, kind: Callable) 
     pytest.importorskip("torch")
     from openvima.policies.inference import NetworkPolicy
 
-    policy = load_policy("nano")
+    policy = load_policy("untrained:nano")
     assert isinstance(policy, NetworkPolicy)
     policy.save_pretrained(kind("~/runs/mine"))
     for given in ("runs/mine", "~/runs/mine"):

@@ -19,7 +19,8 @@ from PIL import Image, ImageDraw
 
 from openvima.atomic_io import atomic_write_file
 from openvima.env import EnvConfig
-from openvima.env.tabletop import FRAMES_PER_SECOND, TabletopEnv, VideoFrame
+from openvima.env.running_episode import FRAMES_PER_SECOND
+from openvima.env.tabletop import TabletopEnv, VideoFrame
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.config import Batch
 from openvima.evaluation.results import EpisodeOutcome

@@ -1,6 +1,6 @@
 """A linear layer that is fast on CPUs: for few rows in inference, and in training.
 
-Training uses oneDNN, which takes half the time of torch's default library on AMD processors (results/
+Training uses oneDNN, which takes half the time of torch's default library on AMD CPUs (results/
 2026-11-28_training_step.md); both compute in float32. Its kernels are compiled for each number of rows, so
 `rounded_rows` keeps these few.
 """
