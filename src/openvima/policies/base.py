@@ -15,8 +15,8 @@ from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 # Least that torch and the libraries loaded after it map, in 2**20 bytes; measured with torch 2.13 on the CPU.
 TORCH_MB = 800
 POLICIES_THAT_EXPLAIN = (
-    "Those that do: openvima-small, openvima-vima, and networks of the presets nano, nano-bins, small, vima-* "
-    "and flamingo-*, unless their head or conditioning was exchanged."
+    "Those that do: openvima-small, openvima-vima, and networks of the presets nano, nano-bins, small, "
+    "vima-* and flamingo-*, unless their head or conditioning was exchanged."
 )
 
 
