@@ -81,7 +81,7 @@ def test_an_interrupted_run_resumes_to_a_working_policy(data, tmp_path, monkeypa
 def test_without_an_appearance_embedding_there_is_no_pretraining_and_the_image_encoder_is_trained(
     data, tmp_path, capsys
 ) -> None:
-    assert run_train(data, tmp_path, "gpt-nano") == 0
+    assert run_train(data, tmp_path, "gpt-nano", "--loader.validation-fraction", 0.3) == 0
     assert re.search(rf"2-cloning, step {STEPS}, held out: loss .*pick \d+%.*place", capsys.readouterr().err)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["training"]["pretraining"]["steps"] == 0
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]

@@ -43,9 +43,7 @@ class BundledPolicy:
 
 BUNDLED: dict[str, BundledPolicy] = {
     SMALL: BundledPolicy(_TRAINED / SMALL, "demonstrations of the 13 training tasks, training partition"),
-    VIMA: BundledPolicy(
-        _TRAINED / VIMA, "demonstrations of the 13 training tasks, 30% of them with random appearance"
-    ),
+    VIMA: BundledPolicy(_TRAINED / VIMA, "demonstrations of the 13 training tasks, 30% rendered again"),
 }
 
 
