@@ -34,7 +34,7 @@ class StudioConfig:
 
     Args:
         path: Results folder or data folder that is opened first.
-        policies: Policies to offer besides "openvima-small", "oracle", "random" and "you".
+        policies: Policies to offer besides the bundled ones, "oracle", "random" and "you".
         record: Folder that demonstrations of users are written to; None: none are recorded.
         env_config: Settings of the environments.
         device: Where networks compute.

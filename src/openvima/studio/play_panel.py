@@ -5,7 +5,7 @@ import viser
 
 from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
-from openvima.policies.bundled import SMALL
+from openvima.policies.bundled import BUNDLED, SMALL
 from openvima.render.rasteriser import Rasteriser, front_above_top
 from openvima.studio.browser_session import YOU, BrowserSession
 from openvima.tasks import list_tasks, sample_episode, task_spec
@@ -35,7 +35,7 @@ class PlayPanel:
         self._seed = gui.add_number("seed", 0, min=0, max=2**53, step=1)
         packs = dict.fromkeys((self.session.config.env_config.assets, *ASSET_PACKS))
         self._assets = gui.add_dropdown("assets", [*packs])
-        names = (SMALL, "oracle", "random", YOU, *self.session.config.policies, _OTHER)
+        names = (*BUNDLED, "oracle", "random", YOU, *self.session.config.policies, _OTHER)
         self._name = gui.add_dropdown("policy", names, initial_value=SMALL)
         hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
         self._source = gui.add_text("source", "", hint=hint, visible=False)

@@ -7,7 +7,7 @@ import viser
 
 from openvima.env.clicks import pose_after
 from openvima.evaluation.session import EpisodeSession, first_difference
-from openvima.policies.bundled import SMALL
+from openvima.policies.bundled import BUNDLED
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, Pose
 from openvima.scene.explanation import Explanation
 from openvima.studio.browser_session import BrowserSession
@@ -42,7 +42,7 @@ class WhyPanel:
             self._shown = gui.add_checkbox("show why", False, hint="what the policy considers next")
             hint = "0 takes the most probable action; above, actions are sampled"
             self._temperature = gui.add_slider("temperature", 0.0, 2.0, 0.1, 0.0, hint=hint)
-            names = (_NOBODY, SMALL, "oracle", "random", *session.config.policies)
+            names = (_NOBODY, *BUNDLED, "oracle", "random", *session.config.policies)
             self._other = gui.add_dropdown("compare with", names, hint="on the same episode, in lockstep")
             self._text = gui.add_markdown("")
             blank = np.full((1, 1, 3), 255, np.uint8)
