@@ -5,7 +5,7 @@ import json
 import re
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -139,45 +139,27 @@ class LevelMean:
 
 
 @dataclass(frozen=True, slots=True)
-class InvalidActions:
-    """Episodes of one policy that ended by an invalid action, under any ablation.
+class EarlyEnds:
+    """Episodes of one policy that one kind of failure ended, under any ablation.
 
     Args:
         policy: Name of the policy.
-        invalid: Number of such episodes.
+        count: Number of such episodes.
         episodes: Number of all its episodes.
         first: Task, level and seed of the first one, and what was wrong.
+        cause: What ended them, for messages.
     """
 
     policy: str
-    invalid: int
+    count: int
     episodes: int
     first: str
+    cause: str
 
     def __str__(self) -> str:
-        count = f"{self.invalid} of {self.episodes} episodes of {self.policy}"
-        return f"{count} ended by an invalid action; {self.first}"
-
-
-@dataclass(frozen=True, slots=True)
-class PolicyErrors:
-    """Episodes of one policy that ended by an exception of its code, under any ablation.
-
-    Args:
-        policy: Name of the policy.
-        raised: Number of such episodes.
-        episodes: Number of all its episodes.
-        first: Task, level and seed of the first one, and the exception.
-    """
-
-    policy: str
-    raised: int
-    episodes: int
-    first: str
-
-    def __str__(self) -> str:
-        count = f"{self.raised} of {self.episodes} episodes of {self.policy}"
-        return f"{count} ended by an error of the policy; {self.first}"
+        return (
+            f"{self.count} of {self.episodes} episodes of {self.policy} ended by {self.cause}; {self.first}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,23 +231,25 @@ class Results:
         """The same means by policy, ablation and level; the ablation is empty for the plain score."""
         return {(mean.policy, mean.ablation, mean.level): mean for mean in self.level_means()}
 
-    def invalid_actions(self) -> list[InvalidActions]:
+    def invalid_actions(self) -> list[EarlyEnds]:
         """Count invalid actions by policy, for the policies that have any."""
-        return [InvalidActions(*found) for found in self._ended_by(BAD_ACTION)]
+        return self._ended_by(BAD_ACTION, "an invalid action")
 
-    def policy_errors(self) -> list[PolicyErrors]:
+    def policy_errors(self) -> list[EarlyEnds]:
         """Count exceptions of policies in `reset` and `act`, for the policies that have any."""
-        return [PolicyErrors(*found) for found in self._ended_by(POLICY_ERROR)]
+        return self._ended_by(POLICY_ERROR, "an error of the policy")
 
-    def _ended_by(self, kind: str) -> Iterator[tuple[str, int, int, str]]:
-        """Policy, number of its episodes that ended by a kind of failure, number of all, and the first."""
+    def _ended_by(self, kind: str, cause: str) -> list[EarlyEnds]:
+        found = []
         for policy in self.policy_names():
             rows = [row for row in self.rows if row.policy == policy]
             ended = [(row, outcome) for row in rows for outcome in row.outcomes if outcome.kind == kind]
             if ended:
                 row, outcome = ended[0]
                 first = f"first in {row.task}, {row.level}, seed {outcome.seed}: {outcome.reason}"
-                yield policy, len(ended), sum(row.episodes for row in rows), first
+                episodes = sum(row.episodes for row in rows)
+                found.append(EarlyEnds(policy, len(ended), episodes, first, cause))
+        return found
 
     def to_json(self) -> str:
         """Return the text of `results.json`; equal results give equal bytes."""
@@ -274,8 +258,14 @@ class Results:
             "schema": SCHEMA,
             "rows": [_row_record(row) for row in self.rows],
             "levels": [_level_record(mean) for mean in self.level_means()],
-            **({"invalid_actions": [asdict(found) for found in invalid]} if invalid else {}),
-            **({"policy_errors": [asdict(found) for found in raised]} if raised else {}),
+            **(
+                {"invalid_actions": [_early_ends_record(found, "invalid") for found in invalid]}
+                if invalid
+                else {}
+            ),
+            **(
+                {"policy_errors": [_early_ends_record(found, "raised") for found in raised]} if raised else {}
+            ),
             "policies": self.policies,
             "config": self.config,
             "versions": self.versions,
@@ -438,6 +428,15 @@ def _check_types(values: Iterable[object], allowed: type) -> None:
             raise TypeError(f"{value!r} stands for a value of type {allowed.__name__}")
         if isinstance(value, int) and not 0 <= value < 2**63:
             raise ValueError(f"{value!r} is no count or seed")
+
+
+def _early_ends_record(found: EarlyEnds, count: str) -> dict[str, object]:
+    return {
+        "policy": found.policy,
+        count: found.count,
+        "episodes": found.episodes,
+        "first": found.first,
+    }
 
 
 def _level_record(mean: LevelMean) -> dict[str, object]:

@@ -1,12 +1,18 @@
 """Training a policy: contrastive pretraining, then behaviour cloning."""
 
 import math
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from openvima.catalog.packs import load_assets
-from openvima.data.object_cache.cache import Boxes, ObjectCache, check_object_cache, open_object_cache
+from openvima.data.object_cache.cache import (
+    Boxes,
+    ObjectCache,
+    Variant,
+    check_object_cache,
+    open_object_cache,
+)
 from openvima.data.object_cache.random_appearance import check_scenes
 from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
@@ -98,7 +104,8 @@ def train(
                 "leave it out, or take a preset that takes objects."
             )
         if parallel.is_first:  # before pretraining, which comes first and may take hours
-            _check_caches(config, dataset, boxes, learner)
+            for variant, _ in _variants(config, boxes):
+                check_object_cache(dataset, learner.input_kind, variant, folder=config.object_cache)
         trainer = Trainer(
             config,
             dataset,
@@ -114,15 +121,18 @@ def train(
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
 
 
-def _check_caches(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None, learner: Learner) -> None:
-    """Check that the object caches are there or can be written."""
-    check = partial(check_object_cache, dataset, learner.input_kind, folder=config.object_cache)
-    if (config.loader.detected_prob or 0.0) < 1:
-        check()
-    if boxes:
-        check(boxes=boxes)
-    for variant in range(config.loader.rerendered_variants if config.loader.rerendered_prob else 0):
-        check(appearance=variant)
+def _variants(config: TrainingConfig, boxes: Boxes | None) -> list[tuple[Variant, float]]:
+    """Return which object caches a run reads, each with the probability of using it.
+
+    The first is that of validation: true boxes, if any are used. Those of detected boxes and of random
+    appearance follow.
+    """
+    loader, detected_prob = config.loader, config.loader.detected_prob or 0.0
+    stored = [(Variant(), 1 - detected_prob - loader.rerendered_prob)] if detected_prob < 1 else []
+    detected = [(Variant(boxes), detected_prob)] if detected_prob > 0 else []
+    numbers = range(loader.rerendered_variants if loader.rerendered_prob else 0)
+    prob = loader.rerendered_prob / loader.rerendered_variants
+    return [*stored, *detected, *((Variant(appearance=number), prob) for number in numbers)]
 
 
 def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:  # Any: YAML
@@ -224,31 +234,27 @@ class _Stages:
 
     @cached_property
     def _caches(self) -> list[tuple[ObjectCache, float]]:
-        """Object caches, each with the probability of using it; the first process builds missing ones.
-
-        The first is that of validation: true boxes, if any are used. Those of detected boxes and of random
-        appearance follow.
-        """
-        loader, folder, kind = self.config.loader, self.config.object_cache, self.learner.input_kind
-        timeout_s = math.inf  # another training may write the cache now
+        """Object caches of `_variants`, with their probabilities; the first process builds missing ones."""
+        # Another training may write the cache now.
+        common: dict[str, Any] = {"folder": self.config.object_cache, "timeout_s": math.inf}
         workers = self._workers(len(self.dataset) // _DEMONSTRATIONS_PER_WORKER)
-        opened = partial(
-            open_object_cache, self.dataset, kind, folder=folder, timeout_s=timeout_s, workers=workers
-        )
-        detected_prob, caches = loader.detected_prob or 0.0, []
+        caches = []
         if not self.parallel.is_first:
             self.parallel.wait()
-        if detected_prob < 1:
-            caches.append((opened(report=self._say), 1 - detected_prob - loader.rerendered_prob))
-        if detected_prob > 0:
-            assert self.boxes is not None  # `resolved` has checked it
-            detected = detected_object_cache(
-                self.dataset, self.boxes, folder=folder, report=self._say, timeout_s=timeout_s
-            )
-            caches.append((detected, detected_prob))
-        for variant in range(loader.rerendered_variants if loader.rerendered_prob else 0):
-            rerendered = opened(appearance=variant, report=self._say_rerendering)
-            caches.append((rerendered, loader.rerendered_prob / loader.rerendered_variants))
+        for variant, prob in _variants(self.config, self.boxes):
+            if variant.boxes is not None:
+                cache = detected_object_cache(self.dataset, variant.boxes, report=self._say, **common)
+            else:
+                say = self._say if variant.appearance is None else self._say_rerendering
+                cache = open_object_cache(
+                    self.dataset,
+                    self.learner.input_kind,
+                    appearance=variant.appearance,
+                    workers=workers,
+                    report=say,
+                    **common,
+                )
+            caches.append((cache, prob))
         if self.parallel.is_first:
             self.parallel.wait()
         return caches

@@ -240,33 +240,26 @@ def open_object_cache(
         raise DatasetError(f"boxes are those of {boxes.name}, but whole frames have none; leave them out.")
     variant = Variant(boxes, appearance)
     target = _cache_folder(dataset, kind, folder, variant.name)
-    if check_object_cache(dataset, kind, folder=folder, boxes=boxes, appearance=appearance):
+    if check_object_cache(dataset, kind, variant, folder=folder):
         with folder_lock(target, timeout_s=timeout_s):
             _write_missing(_missing(dataset, kind, target, variant), workers, report)
     return ObjectCache(dataset, kind, folder, variant.name)
 
 
 def check_object_cache(
-    dataset: Dataset,
-    kind: InputKind = "objects",
-    *,
-    folder: str | Path | None = None,
-    boxes: Boxes | None = None,
-    appearance: int | None = None,
+    dataset: Dataset, kind: InputKind, variant: Variant, *, folder: str | Path | None = None
 ) -> bool:
     """Return whether `open_object_cache` has anything to write, and make the folder for it.
 
     Args:
-        dataset: As in `open_object_cache`, like the others.
-        kind: See there.
-        folder: See there.
-        boxes: See there.
-        appearance: See there.
+        dataset: As in `open_object_cache`.
+        kind: As in `open_object_cache`.
+        variant: Its boxes and appearance.
+        folder: As in `open_object_cache`.
 
     Raises:
         DatasetError: The folder would have to be written to, and cannot be.
     """
-    variant = Variant(boxes, appearance)
     target = _cache_folder(dataset, kind, folder, variant.name)
     if not _missing(dataset, kind, target, variant):
         return False

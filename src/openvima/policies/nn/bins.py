@@ -23,7 +23,7 @@ from openvima.policies.nn.actions import (
     nll,
     to_unit_range,
 )
-from openvima.policies.nn.mlp import last_bias, mlp, scale_last
+from openvima.policies.nn.mlp import layer_of, mlp, scale_last
 
 NUM_BINS = (50, 100, 50, 50, 50, 50) * 2  # x, y, quaternion of pose0, then of pose1
 
@@ -93,7 +93,7 @@ def fit_bins(classifiers: nn.ModuleList, actions_NC: torch.Tensor) -> None:
     for component, classifier in enumerate(classifiers):
         counts = torch.bincount(bins_NC[:, component], minlength=NUM_BINS[component]).to(torch.float64)
         frequencies = 0.99 * counts / counts.sum() + 0.01 / len(counts)
-        last_bias(classifier).copy_(frequencies.log())
+        layer_of(classifier, -1).bias.copy_(frequencies.log())
 
 
 def bins_loss(

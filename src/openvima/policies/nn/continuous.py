@@ -27,7 +27,7 @@ from openvima.policies.nn.actions import (
     to_unit_range,
     yaw_between,
 )
-from openvima.policies.nn.mlp import last_bias, mlp, scale_last
+from openvima.policies.nn.mlp import layer_of, mlp, scale_last
 
 _POSITIONS = 4  # x, y of pick and of place
 
@@ -96,7 +96,7 @@ class MixtureHead(ActionHead):
         # Of each component: means, cosine and sine, logarithms of the five standard deviations.
         count = config.num_components * (_POSITIONS + 2 + _POSITIONS + 1)
         self.out = scale_last(mlp((*hidden, count)), gain=0.01)
-        bias = last_bias(self.out).view(config.num_components, -1)
+        bias = layer_of(self.out, -1).bias.view(config.num_components, -1)
         with torch.no_grad():
             nn.init.uniform_(bias[:, :_POSITIONS])  # equal components would stay equal
             bias[:, _POSITIONS] = 1.0
@@ -118,7 +118,7 @@ class MixtureHead(ActionHead):
         mean_2 = yaws_N2.mean(dim=0)
         # Standard deviation of the wrapped normal distribution with this mean vector.
         yaw_std = (-2 * mean_2.norm().clamp(1e-3, 1 - 1e-3).log()).sqrt().clamp(self.min_std, 1.0)
-        bias = last_bias(self.out).view(self.num_components, -1)
+        bias = layer_of(self.out, -1).bias.view(self.num_components, -1)
         bias[:, :_POSITIONS] = positions_NP[places]
         bias[:, _POSITIONS : _POSITIONS + 2] = F.normalize(mean_2, dim=-1)
         bias[:, _POSITIONS + 2 :] = torch.cat([spread_P, yaw_std[None]]).log()
@@ -160,7 +160,7 @@ class RegressionHead(ActionHead):
         self.huber_delta = config.huber_delta
         hidden = config.hidden_width
         self.out = scale_last(mlp((width, hidden, hidden, _POSITIONS + 2)), gain=0.01)
-        bias = last_bias(self.out)
+        bias = layer_of(self.out, -1).bias
         with torch.no_grad():
             bias[:_POSITIONS] = 0.5
             bias[_POSITIONS] = 1.0
@@ -168,7 +168,7 @@ class RegressionHead(ActionHead):
     @torch.no_grad()
     def fit_prior(self, actions_NC: torch.Tensor) -> None:
         """Start from the mean of these actions."""
-        last_bias(self.out).copy_(torch.cat(_planar(actions_NC, torch.float32), dim=-1).mean(dim=0))
+        layer_of(self.out, -1).bias.copy_(torch.cat(_planar(actions_NC, torch.float32), dim=-1).mean(dim=0))
 
     def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
         """Return the Huber loss of positions and rotation, in units of its delta, and the actions."""

@@ -35,16 +35,14 @@ def normal_weights(module: nn.Module, std: float) -> None:
 
 def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:
     """Reinitialise the last layer orthogonally with another gain, so that heads start near zero."""
-    last = stack[-1]
-    assert isinstance(last, nn.Linear)
     with torch.no_grad():
-        nn.init.orthogonal_(last.weight, gain=gain)
+        nn.init.orthogonal_(layer_of(stack, -1).weight, gain=gain)
     return stack
 
 
-def last_bias(stack: nn.Module) -> torch.Tensor:
-    """Return the bias of the last layer of an MLP."""
+def layer_of(stack: nn.Module, index: int) -> nn.Linear:
+    """Return a linear layer of an MLP: 0 is the first one, -1 the last."""
     assert isinstance(stack, nn.Sequential)
-    last = stack[-1]
-    assert isinstance(last, nn.Linear)
-    return last.bias
+    layer = stack[index]
+    assert isinstance(layer, nn.Linear)
+    return layer

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from openvima.errors import ConfigError
 from openvima.policies.nn.conv_encoder import ConvConfig, ConvEncoder
-from openvima.policies.nn.mlp import mlp
+from openvima.policies.nn.mlp import layer_of, mlp
 from openvima.policies.nn.relative_rotation import RelativeRotation
 from openvima.policies.nn.vit import VisionTransformer, VitConfig
 
@@ -98,8 +98,7 @@ class ObjectEncoder(nn.Module):
         """
         mean, std = torch.tensor(_BOX_MEAN), torch.tensor(_BOX_STD)
         for encoder in self.box_encoders:
-            layers = [layer for layer in encoder.modules() if isinstance(layer, nn.Linear)]
-            first, last = layers[0], layers[-1]
+            first, last = layer_of(encoder, 0), layer_of(encoder, -1)
             if first.weight.is_meta:  # weights are loaded later
                 return
             first.weight.div_(std)
