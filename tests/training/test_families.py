@@ -132,6 +132,22 @@ def test_training_from_a_preset_says_that_it_has_no_weights(data, tmp_path, caps
     assert not (tmp_path / "run" / "config.yaml").exists()
 
 
+@pytest.mark.slow
+def test_crops_without_an_appearance_embedding_can_be_pretrained_and_then_stay(data, tmp_path) -> None:
+    options = ("--pretraining.steps", 2, "--pretraining.num-scenes", 40, "--pretraining.batch-size", 16)
+    assert run_train(data, tmp_path, "vima-nano", "--schedule.keep-every", 1, *options) == 0
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert any("validation_retrieval_accuracy" in line for line in lines)
+    files = sorted((tmp_path / "checkpoints").glob("*/model.safetensors"))
+    trained = load_file(files[-1])
+    fresh = build_network(presets.preset("vima-nano"), seed=step_seed(0, "weights", 0)).state_dict()
+    crops = [name for name in trained if name.startswith("images.crop_encoder.")]
+    assert crops and any(not torch.equal(trained[name], fresh[name]) for name in crops)
+    first, *_, last = (load_file(file) for file in files if file.parent.name.startswith("2-"))
+    assert all(torch.equal(first[name], last[name]) for name in crops)
+    assert any(not torch.equal(first[name], last[name]) for name in trained)
+
+
 def test_an_unknown_preset_is_wrong_usage_and_leaves_no_run_folder(data, tmp_path, capsys) -> None:
     assert run_train(data, tmp_path / "run", "gato-nanno") != 0
     assert "Did you mean 'gato-nano'?" in capsys.readouterr().err
