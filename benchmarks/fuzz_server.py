@@ -32,8 +32,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from openvima.env import TabletopEnv
 from openvima.scene import RenderedPrompt
-from openvima.serving.packing import pack
-from openvima.serving.protocol import encode_observation, encode_prompt
+from openvima.serving.protocol import encode_observation, encode_prompt, pack
 from sim import circumstances
 
 VIEWS = ("front", "top")

@@ -33,8 +33,7 @@ import openvima
 from fuzz_server import served
 from long_day_loads import QUANTILES, Plan, evaluate_again, play_clients, step_vectors
 from openvima.policies import load_policy
-from openvima.serving.batching import WaitingRequest
-from openvima.serving.session import Session
+from openvima.serving.server import Session, WaitingRequest
 from serving import record_batch
 from sim import circumstances
 

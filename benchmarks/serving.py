@@ -30,8 +30,7 @@ import numpy as np
 import openvima
 from fuzz_server import connected, served
 from openvima.env import TabletopEnv
-from openvima.serving.packing import pack
-from openvima.serving.protocol import encode_observation, encode_prompt
+from openvima.serving.protocol import encode_observation, encode_prompt, pack
 from sim import circumstances
 
 LARGE = 64  # episodes of the client with many

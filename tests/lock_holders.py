@@ -9,7 +9,7 @@ from pathlib import Path
 _SCRIPT = """
 import sys
 from pathlib import Path
-from openvima.folder_lock import folder_lock
+from openvima.atomic_io import folder_lock
 
 part = (int(sys.argv[2]), int(sys.argv[3])) if len(sys.argv) > 2 else None
 with folder_lock(Path(sys.argv[1]), part):

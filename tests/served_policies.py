@@ -9,8 +9,7 @@ import numpy as np
 from websockets.sync.server import serve
 
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
-from openvima.serving.packing import pack
-from openvima.serving.protocol import PROTOCOL
+from openvima.serving.protocol import PROTOCOL, pack
 
 VIEWS = ("front", "top")
 SIZE = (4, 8)

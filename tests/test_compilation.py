@@ -12,7 +12,7 @@ import pytest
 from openvima import compilation
 from openvima.catalog.cache import cached_array
 from openvima.errors import ConfigError
-from openvima.paths import as_path, cache_dir
+from openvima.input_files import as_path, cache_dir
 
 KERNEL = "from openvima.compilation import njit\n\n@njit\ndef double(value):\n    return 2 * value\n"
 

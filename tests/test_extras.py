@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from openvima.errors import MissingExtraError
-from openvima.extras import import_extra
-from openvima.memory import lacks_memory, require_address_space
+from openvima.imports import import_extra, lacks_memory, require_address_space
 
 
 @pytest.mark.parametrize(

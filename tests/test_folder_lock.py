@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from lock_holders import holding
-from openvima import folder_lock as module
+from openvima import atomic_io as module
+from openvima.atomic_io import LOCK_NAME, folder_lock
 from openvima.errors import FolderLockedError, StorageError
-from openvima.folder_lock import LOCK_NAME, folder_lock
 
 
 def write_owner(folder: Path, host: str, process: int, **changes: object) -> Path:
@@ -171,7 +171,7 @@ def test_a_link_folder_or_pipe_as_lock_file_is_refused(tmp_path) -> None:
 
 def test_one_of_many_processes_gets_in_at_a_time(tmp_path) -> None:
     script = (
-        "import sys, time; from pathlib import Path; from openvima.folder_lock import folder_lock\n"
+        "import sys, time; from pathlib import Path; from openvima.atomic_io import folder_lock\n"
         "for _ in range(10):\n"
         "    with folder_lock(Path(sys.argv[1]), timeout_s=30):\n"
         "        file = Path(sys.argv[1]) / 'inside'\n"

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from openvima.cli.lists import parse_sources
 from openvima.cli.main import main
+from openvima.cli.terminal import parse_sources
 from openvima.data import Dataset, GenerateConfig, verify
 from openvima.data.lerobot import LerobotConfig
 from openvima.data.published import ImportConfig
@@ -16,7 +16,7 @@ from openvima.errors import CheckpointError, UnknownPolicyError
 from openvima.evaluation import EvaluationConfig, Results, score
 from openvima.evaluation.config import plan
 from openvima.evaluation.sources import policy_sources
-from openvima.paths import cache_dir, expand_home
+from openvima.input_files import cache_dir, expand_home
 from openvima.policies import RandomPolicy, load_policy
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import progress_bar
 from openvima.data import Dataset
 from openvima.errors import FolderLockedError
 from openvima.evaluation import EvaluationConfig, evaluate

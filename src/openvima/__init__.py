@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from openvima.env.registration import make, register_with_gymnasium
-from openvima.lazy import lazy_names
+from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
     from openvima.env import SceneObject, TabletopEnv, compose, load_episode, make_vec, save_episode

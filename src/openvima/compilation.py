@@ -14,7 +14,7 @@ import numba
 from numba.core import config as numba_config
 
 from openvima.errors import ConfigError
-from openvima.paths import cache_dir, temporary_cache_dir
+from openvima.input_files import cache_dir, temporary_cache_dir
 
 
 def njit(kernel: Callable[..., Any]) -> Callable[..., Any]:  # Any: kernels have signatures of their own

@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Literal
 
 from openvima.errors import HubError, echo
-from openvima.extras import import_extra
+from openvima.imports import import_extra
 
 HubKind = Literal["model", "dataset"]
 

@@ -16,7 +16,7 @@ from openvima.catalog import OBJECTS, TEXTURES, CollisionHull, load_assets, pack
 from openvima.catalog.importing import import_pack, imported_pack
 from openvima.catalog.original import OriginalAssets
 from openvima.errors import AssetError
-from openvima.paths import cache_dir
+from openvima.input_files import cache_dir
 
 REFERENCE = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
 SIZE = OBJECTS["cross"].size_max

@@ -13,7 +13,7 @@ from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
 from openvima.catalog.procedural import _DRAWING_MODULES, ProceduralAssets
 from openvima.errors import AssetError, UnknownTextureError
-from openvima.paths import cache_dir
+from openvima.input_files import cache_dir
 
 SIZE = (0.16, 0.16, 0.05)
 

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from openvima.cli.main import main
-from openvima.cli.progress import Pace, generation_table, plain_lines, table_of
+from openvima.cli.terminal import Pace, generation_table, plain_lines, table_of
 from openvima.data import Dataset, GenerationProgress, Shard, TaskProgress
 from openvima.tasks import list_tasks
 

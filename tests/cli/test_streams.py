@@ -8,8 +8,7 @@ import pytest
 from rich.table import Table
 
 from openvima.cli.main import VERBS, main
-from openvima.cli.streams import accept_any_text
-from openvima.cli.tables import print_table
+from openvima.cli.terminal import accept_any_text, print_table
 
 
 @contextlib.contextmanager

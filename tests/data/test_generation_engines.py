@@ -11,7 +11,7 @@ import worker_jobs
 from openvima.data import GenerateConfig, GenerationProgress, generate, plan
 from openvima.data.resuming import is_finished
 from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
-from openvima.ray_backend import ray_imap_unordered
+from openvima.multiprocess import ray_imap_unordered
 from small_data_sets import contents
 from small_generations import config
 

@@ -7,10 +7,10 @@ import pytest
 import openvima
 from openvima.catalog import load_assets
 from openvima.env import TabletopEnv
-from openvima.env.clicks import clicked_action, pose_after
 from openvima.errors import SceneError
 from openvima.render.raycast import Hit, first_hit
 from openvima.scene import Scene
+from openvima.studio.browser_session import clicked_action, pose_after
 from openvima.tasks import sample_episode
 
 

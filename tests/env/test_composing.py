@@ -11,7 +11,7 @@ import openvima
 from compose import outcome_of, random_scene
 from openvima import SceneObject, compose
 from openvima.catalog import load_assets
-from openvima.env.photos import photo_from_bytes
+from openvima.env.composing import photo_from_bytes
 from openvima.errors import InputFileError, OpenVimaError, SceneError, UnknownObjectError, UnknownTextureError
 from openvima.perception.objects import observe_prompt_image
 from openvima.render.rasteriser import Rasteriser

@@ -9,7 +9,7 @@ from PIL import Image
 
 import openvima
 from openvima.env import EnvConfig
-from openvima.env.episode_code import compose_values, python_code, shell_command
+from openvima.env.composition import compose_values, python_code, shell_command
 from openvima.errors import SceneError
 from openvima.scene import Episode
 from openvima.tasks import sample_episode

@@ -12,7 +12,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 import openvima
 from faulty_environments import Faulty
 from openvima.env import TabletopEnv, stack_actions
-from openvima.env.action_validation import ActionValidator
+from openvima.env.sub_environments import ActionValidator
 from openvima.env.vector import SyncTabletopEnvs
 from openvima.errors import (
     ActionError,

@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode
 import openvima
 from faulty_environments import FailsToStart, Faulty
 from openvima.env import stack_actions
-from openvima.env.action_validation import ActionValidator
+from openvima.env.sub_environments import ActionValidator
 from openvima.env.workers import AsyncTabletopEnvs
 from openvima.errors import SamplingError, WorkerError
 
@@ -27,7 +27,7 @@ SCRIPT = """
 import mujoco  # starts a process that looks for a graphics library, and is none of ours
 import openvima
 from openvima.env import stack_actions
-from openvima.env.action_validation import ActionValidator
+from openvima.env.sub_environments import ActionValidator
 
 def main():
     print("starting", flush=True)

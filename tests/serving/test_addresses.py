@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from openvima.errors import ConfigError
-from openvima.serving.config import check_can_listen, is_own_page
+from openvima.serving.server import check_can_listen, is_own_page
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,8 @@ import pytest
 
 from openvima.errors import PolicyError
 from openvima.serving import RemotePolicy, serve_in_thread
-from openvima.serving.batching import DynamicBatcher, fair_shares
-from openvima.serving.packing import pack, unpack
-from openvima.serving.protocol import encode_observation, encode_prompt
-from openvima.serving.session import Session
+from openvima.serving.protocol import encode_observation, encode_prompt, pack, unpack
+from openvima.serving.server import DynamicBatcher, Session, fair_shares
 from served_policies import ForMany, made_up_observation, made_up_prompt, told
 
 BAD = 99  # observation that a batch cannot hold
@@ -248,7 +246,7 @@ def test_requests_that_wait_leave_no_tasks_behind() -> None:
 
 
 def test_one_client_alone_does_not_wait_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("openvima.serving.batching.WINDOW_S", 3600.0)
+    monkeypatch.setattr("openvima.serving.server.WINDOW_S", 3600.0)
     policy = Batched()
     with serve_in_thread(policy) as url, RemotePolicy(url) as client, RemotePolicy(url):  # type: ignore[arg-type]
         client.reset([made_up_prompt(4)])

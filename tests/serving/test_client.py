@@ -9,8 +9,7 @@ from websockets.server import ServerProtocol
 
 from openvima.errors import ConfigError, PolicyError, ServerError
 from openvima.serving import PROTOCOL, RemotePolicy, serve_in_thread
-from openvima.serving.packing import pack
-from openvima.serving.protocol import TOKEN_VARIABLE
+from openvima.serving.protocol import TOKEN_VARIABLE, pack
 from served_policies import (
     ForMany,
     Telltale,
@@ -161,7 +160,7 @@ def test_a_server_that_is_silent_before_the_handshake_is_named_with_the_time() -
 
 
 def test_a_server_that_is_silent_after_the_handshake_is_named_with_the_time(monkeypatch) -> None:
-    monkeypatch.setattr("openvima.serving.connection.CONNECT_S", 2)  # the handshake may take as long
+    monkeypatch.setattr("openvima.serving.client.CONNECT_S", 2)  # the handshake may take as long
     with (
         running(lambda connection: connection.recv()) as url,
         pytest.raises(ServerError, match=rf"{url} sent no first frame within 2 s after the handshake"),

@@ -19,8 +19,7 @@ from websockets.sync.client import connect
 from fuzz_server import Fuzzer
 from openvima.errors import ServerError
 from openvima.serving import RemotePolicy, serve_in_thread
-from openvima.serving.packing import pack, unpack
-from openvima.serving.protocol import encode_observation, encode_prompt
+from openvima.serving.protocol import encode_observation, encode_prompt, pack, unpack
 from served_policies import ForMany, made_up_observation, made_up_prompt, told
 
 SETTINGS = {"max_message_bytes": 2**18}

@@ -11,10 +11,8 @@ import pytest
 from openvima.policies.prompt_limits import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
-from openvima.serving.batching import WaitingRequest
-from openvima.serving.packing import pack, unpack
-from openvima.serving.protocol import MAX_PIXELS, encode_prompt
-from openvima.serving.session import Calls, Session
+from openvima.serving.protocol import MAX_PIXELS, encode_prompt, pack, unpack
+from openvima.serving.server import Calls, Session, WaitingRequest
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
 
@@ -134,7 +132,7 @@ def test_a_request_that_takes_long_to_read_keeps_nobody_waiting(monkeypatch: pyt
             assert finished.wait(10)
         return unpack(data)
 
-    monkeypatch.setattr("openvima.serving.session.unpack", slow)
+    monkeypatch.setattr("openvima.serving.server.unpack", slow)
     with serve_in_thread(ForMany()) as url, RemotePolicy(url) as bad, RemotePolicy(url) as good:
         assert bad._connection is not None
         bad._connection._socket.send(b"slow")

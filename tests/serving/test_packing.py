@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openvima.errors import MessageError
-from openvima.serving.packing import DTYPES, MAX_LENGTH, MAX_VALUES, pack, unpack
+from openvima.serving.protocol import DTYPES, MAX_LENGTH, MAX_VALUES, pack, unpack
 
 
 def array_message(**changes: object) -> bytes:

@@ -9,7 +9,6 @@ import pytest
 from openvima.env import TabletopEnv
 from openvima.errors import ConfigError, MessageError
 from openvima.policies.base import RandomPolicy
-from openvima.serving.packing import pack, unpack
 from openvima.serving.protocol import (
     check_protocol,
     check_token,
@@ -19,6 +18,8 @@ from openvima.serving.protocol import (
     encode_action,
     encode_observation,
     encode_prompt,
+    pack,
+    unpack,
 )
 from served_policies import made_up_observation, made_up_prompt
 

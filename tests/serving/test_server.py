@@ -14,9 +14,8 @@ from websockets.sync.client import ClientConnection, connect
 from openvima import __version__
 from openvima.errors import ConfigError, PolicyError
 from openvima.serving import PROTOCOL, RemotePolicy, serve, serve_in_thread
-from openvima.serving.config import ServerConfig
-from openvima.serving.packing import pack, unpack
-from openvima.serving.protocol import encode_observation, encode_prompt
+from openvima.serving.protocol import encode_observation, encode_prompt, pack, unpack
+from openvima.serving.server import ServerConfig
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
 SETTINGS = {"max_episodes": 3, "max_connections": 2, "max_message_bytes": 2**16}

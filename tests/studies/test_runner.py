@@ -9,8 +9,8 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
+from openvima.atomic_io import folder_lock
 from openvima.errors import ConfigError, FolderLockedError
-from openvima.folder_lock import folder_lock
 from openvima.studies import (
     Demonstrations,
     EvaluationSettings,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from openvima.atomic_io import atomic_write
-from openvima.paths import cache_dir
+from openvima.input_files import cache_dir
 
 _logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from openvima.atomic_io import atomic_write
 from openvima.catalog.original import decode_file
 from openvima.catalog.pack_files import ARCHIVE_NAME, CheckoutFiles, ImportedFiles, known_hashes
 from openvima.errors import AssetError
-from openvima.paths import cache_dir
+from openvima.input_files import cache_dir
 
 Report = Callable[[int, int, str], None]
 

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Protocol
 
 from openvima.errors import AssetError
-from openvima.paths import cache_dir
+from openvima.input_files import cache_dir
 
 PACK_FOLDER = Path("vima_bench/tasks/assets")  # inside a checkout
 ARCHIVE_NAME = "original-pack-1.zip"  # the number is that of the archive's layout

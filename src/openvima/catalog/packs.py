@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from openvima.catalog.geometry import Assets, is_pack
 from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, unknown_name
-from openvima.paths import as_path
+from openvima.input_files import as_path
 from openvima.user_code import is_code
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from openvima.errors import (
     echo,
     unknown_name,
 )
-from openvima.paths import as_path
+from openvima.input_files import as_path
 
 MAX_NAME = 40  # characters
 MAX_ALIASES = 10

@@ -10,7 +10,7 @@ from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vec
 from openvima.catalog.meshes import TEXTURE_PER_M, scaled
 from openvima.catalog.obj_file import ObjMesh, face_normals, parse_obj
 from openvima.errors import AssetError, InputFileError, ShapeError
-from openvima.paths import as_path
+from openvima.input_files import as_path
 
 MAX_TRIANGLES = 20_000
 MAX_VERTICES = 60_000

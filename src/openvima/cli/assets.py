@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import progress_bar
 
 
 def gallery(*, out: Path, assets: str = "procedural") -> int:
@@ -77,7 +77,7 @@ def info() -> int:
     from openvima.catalog.importing import imported_pack
     from openvima.catalog.objects import REGISTERED_OBJECTS
     from openvima.catalog.textures import REGISTERED_TEXTURES
-    from openvima.paths import cache_dir
+    from openvima.input_files import cache_dir
     from openvima.tasks import list_tasks
 
     pack = imported_pack()

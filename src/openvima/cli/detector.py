@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.cli.progress import Report, progress_bar
+from openvima.cli.terminal import Report, progress_bar
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ def _one_thread() -> "Iterator[None]":
 
 def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
     """Generate enough episodes for the frames."""
-    from openvima.cli.progress import generation_table
+    from openvima.cli.terminal import generation_table
     from openvima.data import GenerateConfig, generate
 
     config = GenerateConfig(out=folder, level=level, start_seed=seed)

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from openvima.cli.lists import parse_list, parse_shard_range, parse_sources
-from openvima.cli.progress import progress_bar
-from openvima.cli.tables import print_table
+from openvima.cli.terminal import parse_list, parse_shard_range, parse_sources, print_table, progress_bar
 
 if TYPE_CHECKING:
     from rich.table import Table

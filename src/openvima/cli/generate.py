@@ -5,8 +5,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from openvima.cli.lists import parse_list, parse_shard_range
-from openvima.cli.progress import generation_table
+from openvima.cli.terminal import generation_table, parse_list, parse_shard_range
 
 
 def main(

@@ -12,10 +12,10 @@ from typing import Any
 
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE, NO_SPACE
-from openvima.cli.streams import accept_any_text
+from openvima.cli.terminal import accept_any_text
 from openvima.errors import OpenVimaError, Terminated, UnknownWordWarning, echo, unknown_name
-from openvima.memory import address_space_remedy, lacks_memory, require_address_space
-from openvima.paths import expand_home
+from openvima.imports import address_space_remedy, lacks_memory, require_address_space
+from openvima.input_files import expand_home
 
 # Verb → summary. Each verb is a module of this package.
 VERBS = {

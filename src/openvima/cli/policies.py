@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from openvima.cli.pushing import print_files
-from openvima.cli.tables import print_table, table_console
+from openvima.cli.terminal import print_files, print_table, table_console
 
 if TYPE_CHECKING:
     from openvima.policies.bundled import BundledPolicy

@@ -4,7 +4,7 @@ import json
 import sys
 from pathlib import Path
 
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 from openvima.multiprocess import num_cpus
 from openvima.policies.bundled import SMALL, bundled_folder

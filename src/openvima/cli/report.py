@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.cli.lists import parse_list
+from openvima.cli.terminal import parse_list
 
 if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison

@@ -63,9 +63,8 @@ def main(
     from openvima.evaluation.versions import versions
     from openvima.policies import load_policy
     from openvima.serving import serve
-    from openvima.serving.config import server_config
-    from openvima.serving.packing import require_extra
-    from openvima.serving.protocol import TOKEN_VARIABLE
+    from openvima.serving.protocol import TOKEN_VARIABLE, require_extra
+    from openvima.serving.server import server_config
 
     require_extra()  # before the seconds that loading takes
     settings = server_config(

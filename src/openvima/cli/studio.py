@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from openvima.cli.lists import parse_sources
+from openvima.cli.terminal import parse_sources
 
 
 def main(
@@ -58,7 +58,7 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.extras import import_extra
+    from openvima.imports import import_extra
     from openvima.serving.protocol import TOKEN_VARIABLE
 
     for module in ("viser", "trimesh"):

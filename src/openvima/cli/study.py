@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from openvima.cli.lists import parse_list
-from openvima.cli.progress import progress_bar
-from openvima.cli.tables import print_table
+from openvima.cli.terminal import parse_list, print_table, progress_bar
 
 if TYPE_CHECKING:
     from openvima.studies import StudyInputs

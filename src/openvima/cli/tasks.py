@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.cli.tables import print_table, table_console
+from openvima.cli.terminal import print_table, table_console
 from openvima.tasks.options import option_descriptions
 from openvima.tasks.oracle_success import oracle_record
 
@@ -139,7 +139,7 @@ def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
 
 
 def _write_gallery(folder: Path, assets: str) -> int:
-    from openvima.cli.progress import progress_bar
+    from openvima.cli.terminal import progress_bar
     from openvima.env import EnvConfig
     from openvima.report.task_gallery import save_task_gallery
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 
 if TYPE_CHECKING:

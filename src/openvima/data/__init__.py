@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from openvima.lazy import lazy_names
+from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
     from openvima.data.generation import generate

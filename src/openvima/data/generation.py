@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from openvima.atomic_io import FINISH_S, folder_lock, parts_in_range
 from openvima.data.checksums import spans_of
 from openvima.data.manifest import FAILED_FOLDER, ShardSummary, finish_folder, previous_summaries, set_aside
 from openvima.data.oracle_rollouts import write_block
@@ -18,7 +19,6 @@ from openvima.data.resuming import (
     storage_error,
 )
 from openvima.errors import DatasetError
-from openvima.folder_lock import FINISH_S, folder_lock, parts_in_range
 from openvima.multiprocess import Counts, imap_with_progress
 
 
@@ -105,7 +105,7 @@ def _engine(
     if config.engine == "processes":
         num_workers = config.workers or 1
         return imap_with_progress(write_block, missing, num_workers, num_counts=NUM_COUNTS, watch=watch)
-    from openvima.ray_backend import ray_imap_unordered
+    from openvima.multiprocess import ray_imap_unordered
 
     num_workers = config.workers or (1 if config.address is None else None)
     return ray_imap_unordered(

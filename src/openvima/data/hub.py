@@ -6,7 +6,7 @@ from pathlib import Path
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, parse_manifest, read_inside
 from openvima.errors import DatasetError
 from openvima.hub import cache_folder, dataset_name, fetch
-from openvima.paths import as_path
+from openvima.input_files import as_path
 
 _MAX_MANIFEST_BYTES = 2**28  # of 500,000 shards
 

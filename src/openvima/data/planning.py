@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from openvima.brief import brief_repr
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.catalog.user_assets import recorded_assets
@@ -20,9 +19,9 @@ from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.errors import ConfigError, LevelError, unknown_name
+from openvima.errors import ConfigError, LevelError, brief_repr, unknown_name
+from openvima.input_files import settle
 from openvima.multiprocess import MAX_WORKERS
-from openvima.paths import settle
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.registry import named_tasks
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from openvima.brief import brief_repr
 from openvima.data.planning import Block
+from openvima.errors import brief_repr
 from openvima.multiprocess import Counts
 
 NUM_COUNTS = 3  # that a block tells: episodes written, seeds tried, redraws

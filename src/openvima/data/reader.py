@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.brief import MAX_CHARACTERS, cut
 from openvima.data.checksums import Envelope, Span
 from openvima.data.hub import data_folder
 from openvima.data.manifest import (
@@ -22,9 +21,9 @@ from openvima.data.manifest import (
 from openvima.data.records import Demonstration, Step
 from openvima.data.schema import VIEWS
 from openvima.data.shard import Shard, remedy
-from openvima.errors import DatasetError, unknown_name
+from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
 from openvima.html import notebook_html
-from openvima.paths import names_of
+from openvima.input_files import names_of
 
 
 class Dataset:

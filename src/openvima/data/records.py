@@ -14,9 +14,9 @@ import numpy as np
 import xxhash
 
 from openvima import __version__
-from openvima.brief import brief_repr
 from openvima.data.image_layout import ImageBuffers, pixels
 from openvima.data.schema import VIEWS
+from openvima.errors import brief_repr
 from openvima.html import notebook_html
 from openvima.scene import (
     ACTION_SHAPES,

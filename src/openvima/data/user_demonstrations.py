@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from openvima.atomic_io import folder_lock
 from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import MANIFEST_NAME, ShardSummary, finish_folder, previous_summaries, set_aside
@@ -19,8 +20,7 @@ from openvima.data.writer import ShardWriter
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import DatasetError, EpisodeError
-from openvima.folder_lock import folder_lock
-from openvima.paths import as_path
+from openvima.input_files import as_path
 from openvima.render.raycast import object_below
 from openvima.scene import COMPOSED, HOST_TASK, Action, Episode, Scene
 from openvima.scene.goal import object_of

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from openvima.detector.config import DETECTORS, BackboneConfig, DetectorConfig, detector_config
 from openvima.errors import CheckpointError
-from openvima.paths import as_path
+from openvima.input_files import as_path
 
 if TYPE_CHECKING:
     from openvima.detector.detector import FrameDetector

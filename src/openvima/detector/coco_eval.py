@@ -10,7 +10,7 @@ import numpy as np
 
 from openvima.detector.frames import Frame
 from openvima.errors import ConfigError
-from openvima.extras import import_extra
+from openvima.imports import import_extra
 from openvima.policies.detection import Detections
 
 _CATEGORY = 1  # of all objects

@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING
 
 from openvima.env.config import EnvConfig
 from openvima.env.registration import make, register_environments
-from openvima.lazy import lazy_names
+from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
-    from openvima.env.action_validation import stack_actions
     from openvima.env.composed_objects import SceneObject
     from openvima.env.composing import compose
     from openvima.env.episode_file import load_episode, save_episode
+    from openvima.env.sub_environments import stack_actions
     from openvima.env.tabletop import TabletopEnv, VideoFrame
     from openvima.env.vector import make_vec
 
@@ -36,7 +36,7 @@ _HOMES = {
     "load_episode": "episode_file",
     "make_vec": "vector",
     "save_episode": "episode_file",
-    "stack_actions": "action_validation",
+    "stack_actions": "sub_environments",
 }
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)  # importing the environment imports MuJoCo and Numba

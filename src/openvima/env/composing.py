@@ -1,20 +1,366 @@
-"""Composed episodes: scenes, prompts and goals of users."""
+"""Composed episodes: scenes, prompts, photos and goals of users."""
 
+import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # of whatever type a user gives; checked here
 
 import numpy as np
+from PIL import Image
 
-from openvima.catalog import Assets, Pool, load_assets
-from openvima.env.checked_values import shown
-from openvima.env.composed_goals import composed_goals
-from openvima.env.composed_objects import ObjectLike, add_object, scene_objects
-from openvima.env.composed_prompt import ImageMaker, composed_prompt
-from openvima.env.photos import read_photo
-from openvima.errors import SceneError, unknown_name
-from openvima.scene import COMPOSED, END_EFFECTORS, EndEffector, Episode, PhotoImage, Placement, Problem
+from openvima.catalog import Assets, Pool, load_assets, object_spec
+from openvima.catalog.objects import FULL_SYMMETRY, NO_SYMMETRY
+from openvima.env.composed_objects import (
+    FIELDS,
+    MAX_ANGLE_DEG,
+    WORKSPACE,
+    ObjectLike,
+    SceneObject,
+    add_object,
+    check_inside,
+    checked_appearance,
+    entries,
+    handles_hint,
+    known_object,
+    number,
+    odd_character,
+    outline,
+    pair,
+    put,
+    scene_object,
+    scene_objects,
+    shown,
+)
+from openvima.errors import InputFileError, SceneError, unknown_name
+from openvima.input_files import decode_png, read_png
+from openvima.perception.objects import MAX_OBJECTS
+from openvima.perception.preprocessing import image_names
+from openvima.render.rasteriser import PHOTO_WHITE
+from openvima.scene import (
+    COMPOSED,
+    END_EFFECTORS,
+    AtPose,
+    EndEffector,
+    Episode,
+    Goal,
+    InZone,
+    ObjectImage,
+    PhotoImage,
+    Placement,
+    Pose,
+    Problem,
+    Prompt,
+    PromptFill,
+    SceneImage,
+    Tolerance,
+    Zone,
+    in_workspace,
+)
+from openvima.scene.goal import is_condition
+from openvima.scene.prompt import PHOTO_SIDE
+from openvima.tasks.into_base import TOLERANCE
+from openvima.tasks.rotation import TOLERANCE_DEG, rotation_goal
+from openvima.tasks.sweep_table import MAGNIFICATION
 from openvima.tasks.table import TableSampler
+
+MAX_PNG_BYTES = 32 * 2**20
+MAX_PNG_SIDE = 4096  # pixels
+
+
+def read_photo(file: Path) -> PhotoImage:
+    """Read a PNG file with an object on white or transparent background.
+
+    The background is cut off; the rest is resized to the size of rendered prompt objects.
+
+    Raises:
+        InputFileError: There is no such file, it is no regular file, no PNG, too large, or empty.
+    """
+    try:
+        picture = read_png(file, max_bytes=MAX_PNG_BYTES, max_side=MAX_PNG_SIDE)
+    except InputFileError as error:
+        raise InputFileError(f"photo {error}") from None
+    return _photo(picture, f"photo {str(file)!r}")
+
+
+def photo_from_bytes(content: bytes) -> PhotoImage:
+    """Read the content of a PNG file; see `read_photo`.
+
+    Raises:
+        InputFileError: It is no PNG, too large, or empty.
+    """
+    label = "the photo"
+    return _photo(decode_png(content, label, max_bytes=MAX_PNG_BYTES, max_side=MAX_PNG_SIDE), label)
+
+
+def _photo(picture: Image.Image, label: str) -> PhotoImage:
+    """Cut a picture to its object and resize it."""
+    paper = Image.new("RGBA", picture.size, "white")
+    pixels = np.asarray(Image.alpha_composite(paper, picture).convert("RGB"))
+    is_object = (pixels < PHOTO_WHITE).any(axis=-1)
+    if not is_object.any():
+        raise InputFileError(f"{label} is all white; it must show an object on white.")
+    rows, columns = np.flatnonzero(is_object.any(axis=-1)), np.flatnonzero(is_object.any(axis=0))
+    return _fitted(Image.fromarray(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]))
+
+
+def _fitted(picture: Image.Image) -> PhotoImage:
+    """Resize a picture so that its longer side is `PHOTO_SIDE`."""
+    scale = PHOTO_SIDE / max(picture.size)
+    width, height = (max(1, round(side * scale)) for side in picture.size)
+    how = Image.Resampling.BOX if scale < 1 else Image.Resampling.NEAREST
+    return PhotoImage(width, height, picture.resize((width, height), how).tobytes())
+
+
+Handles = Mapping[str, Placement]
+
+# The angles of the catalogue are those of the benchmark, which differ from the shapes or are unset for these.
+_SYMMETRY_RAD = {
+    **dict.fromkeys(("block", "shorter block", "small block", "cross"), math.pi / 2),
+    **dict.fromkeys(("triangle", "pan"), NO_SYMMETRY),
+    **dict.fromkeys(("round", "disk"), FULL_SYMMETRY),
+}
+
+
+def composed_goals(
+    given: object, handles: Handles, end_effector: EndEffector, assets: Assets
+) -> tuple[Goal, ...]:
+    """Make goals of what a user gives.
+
+    Args:
+        given: A list of goals, each its name and arguments, a mapping with the key "goal" and the arguments
+            by name, or a goal of `openvima.scene`; None for no goals.
+        handles: Objects of the scene.
+        end_effector: Tool of the arm.
+        assets: Asset pack.
+
+    Raises:
+        SceneError: A goal is unknown or malformed; the message lists the allowed ones.
+    """
+    listed = () if given is None else entries(given, "goals")
+    return tuple(_goal(each, f"goal {n}", handles, end_effector, assets) for n, each in enumerate(listed))
+
+
+def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, assets: Assets) -> Goal:
+    if is_condition(given):
+        return given
+    allowed = f"Allowed: {'; '.join(_usage(known) for known in _GOALS)}."
+    if isinstance(given, Mapping):
+        named = dict(given)
+        name, arguments = named.pop("goal", None), ()
+    elif isinstance(given, Sequence) and given and not isinstance(given, str):
+        (name, *arguments), named = entries(given, label), {}
+    else:
+        raise SceneError(f"{label} is {shown(given)}; give a list of goals. {allowed}")
+    if not isinstance(name, str) or name not in _GOALS:
+        shown_name = name if isinstance(name, str) else shown(name)
+        raise SceneError(f"{label}: {unknown_name('goal', shown_name, _GOALS, allowed)}")
+    make = _GOALS[name]
+    needed = "spatula" if make is _swept_into else "suction"
+    if end_effector != needed:
+        raise SceneError(f"{label}: {name!r} needs the end effector {needed}, not {end_effector}.")
+    parameters = inspect.signature(make).parameters
+    try:
+        bound = inspect.signature(make).bind(*arguments, **named, assets=assets)
+    except TypeError:
+        raise SceneError(f"{label} has other arguments than {_usage(name)}. {allowed}") from None
+    for parameter in ("a", "b"):
+        if parameter in parameters:
+            bound.arguments[parameter] = known_object(bound.arguments[parameter], handles, label)
+    moved = bound.arguments["a"]
+    if moved.fixed:
+        raise SceneError(f"{label} ({name}): the {moved.texture} {moved.object} is fixed to the table.")
+    try:
+        return make(*bound.args, **bound.kwargs)
+    except SceneError as error:
+        raise SceneError(f"{label} ({name}, {moved.texture} {moved.object}): {error}") from None
+
+
+def _usage(name: str) -> str:
+    parameters = inspect.signature(_GOALS[name]).parameters.values()
+    shown_ones = [
+        p.name if p.default is p.empty else f"[{p.name}]" for p in parameters if p.kind is not p.KEYWORD_ONLY
+    ]
+    return f"({', '.join([name, *shown_ones])})"
+
+
+def _in(a: Placement, b: Placement, *, assets: Assets) -> Goal:
+    """The position of a is within 0.1 m of that of b, as in the tasks; so a is in b or on it."""
+    _check_two_objects(a, b)
+    return AtPose(a.id, b.pose, TOLERANCE, relative_to=b.id)
+
+
+def _at(a: Placement, position: object, yaw_deg: object = None, *, assets: Assets) -> Goal:
+    """The position of a is within 0.1 m of one on the table, and its heading within 15 degrees if given."""
+    x, y = pair(position, "position")
+    if not in_workspace(Pose((x, y, 0.0))):
+        raise SceneError(f"position is ({x:.3g}, {y:.3g}); {WORKSPACE}.")
+    if yaw_deg is None:
+        return AtPose(a.id, Pose((x, y, a.pose.z), a.pose.quaternion), TOLERANCE)
+    yaw_rad = math.radians(number(yaw_deg, "yaw_deg", -MAX_ANGLE_DEG, MAX_ANGLE_DEG))
+    tolerance = Tolerance(TOLERANCE.position_m, math.radians(TOLERANCE_DEG))
+    symmetry_rad = _SYMMETRY_RAD.get(a.object, object_spec(a.object).symmetry_rad)
+    target = Pose.planar(x, y, yaw_rad, z=a.pose.z)
+    return AtPose(a.id, target, tolerance, NO_SYMMETRY if symmetry_rad is None else symmetry_rad)
+
+
+def _rotated(a: Placement, degrees: object, *, assets: Assets) -> Goal:
+    """The object a is rotated in place, clockwise, within 15 degrees."""
+    angle_deg = number(degrees, "degrees", -360, 360)
+    if abs(math.remainder(angle_deg, 360)) <= TOLERANCE_DEG:
+        raise SceneError(f"degrees is {angle_deg:g}; it must be more than {TOLERANCE_DEG}, the tolerance.")
+    return rotation_goal(a, angle_deg, position_m=TOLERANCE.position_m)
+
+
+def _swept_into(a: Placement, b: Placement, *, assets: Assets) -> Goal:
+    """The small block a is inside the outline of b."""
+    if a.object != "small block":
+        raise SceneError(f"only a small block can be swept, not a {a.object}.")
+    _check_two_objects(a, b)
+    if abs(math.remainder(b.pose.yaw_rad, math.pi / 2)) > 1e-6:
+        yaw_deg = math.degrees(b.pose.yaw_rad)
+        raise SceneError(f"the {b.object} has a yaw of {yaw_deg:.1f} degrees; it must be a multiple of 90.")
+    corners = outline(b, assets)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    (x, y), (size_x, size_y) = ((low + high) / 2).tolist(), np.subtract(high, low).tolist()
+    return InZone(a.id, Zone(x, y, size_x, size_y), relative_to=b.id)
+
+
+def _check_two_objects(a: Placement, b: Placement) -> None:
+    if a.id == b.id:
+        raise SceneError(f"{a.texture} {a.object} cannot be in itself; name two objects.")
+
+
+_GOALS: dict[str, Callable[..., Goal]] = {
+    "in": _in,
+    "at": _at,
+    "rotated": _rotated,
+    "swept_into": _swept_into,
+}
+
+
+MAX_PROMPT_CHARS = 1000
+MAX_IMAGES = 64
+SMALL_BLOCK = "small block"
+
+
+@dataclass(frozen=True, slots=True)
+class ImageMaker:
+    """Makes prompt images of what users give.
+
+    Args:
+        handles: Objects of the scene.
+        table: Sampler of the scene.
+        photo: Reads a PNG file.
+    """
+
+    handles: Mapping[str, Placement]
+    table: TableSampler
+    photo: Callable[[str], PhotoImage]
+
+    def fill(self, slot: str, given: object) -> PromptFill:
+        """Make the image of one placeholder.
+
+        Raises:
+            SceneError: It is none of the allowed forms.
+        """
+        label = f"image {slot!r}"
+        if isinstance(given, ObjectImage | SceneImage | PhotoImage):
+            return given
+        if isinstance(given, Path) or (isinstance(given, str) and given.lower().endswith(".png")):
+            try:
+                return self.photo(str(given))
+            except InputFileError as error:
+                raise InputFileError(f"{label}: {error}") from None
+        if isinstance(given, str) or type(given) is int:
+            return _object_image(known_object(given, self.handles, label))
+        if isinstance(given, Mapping):
+            if set(given) != {"object", "texture"}:
+                names = shown(sorted(map(str, given)))
+                raise SceneError(f"{label} has fields {names}; allowed are object and texture.")
+            return self._from_catalogue(given["object"], given["texture"], label)
+        parts = entries(given, label)
+        if len(parts) == 2 and all(isinstance(part, str) for part in parts):
+            return self._from_catalogue(parts[0], parts[1], label)
+        if not 1 <= len(parts) <= MAX_OBJECTS:
+            raise SceneError(f"{label} shows {len(parts)} objects; a scene has 1 to {MAX_OBJECTS}.")
+        return self._scene(parts, label)
+
+    def _from_catalogue(self, object_name: object, texture: object, label: str) -> ObjectImage:
+        known, known_texture = checked_appearance(object_name, texture, label)
+        pose = Pose.planar(0.5, 0.0)
+        return _object_image(Placement(0, known, known_texture, object_spec(known).size_max, pose))
+
+    def _scene(self, listed: Sequence[Any], label: str) -> SceneImage:
+        """Place objects on an empty table; what overlaps lies on top."""
+        table = self.table.blank()
+        for n, entry in enumerate(listed):
+            given = self._moved(entry, f"{label}, object {n}")
+            placed = put(table, given, on_top=True)
+            check_inside(placed, table.assets, f"{label}, object {n} ({given.texture} {given.object})")
+        return SceneImage.of(table.placements)
+
+    def _moved(self, entry: object, label: str) -> SceneObject:
+        """Read an object of a prompt scene: one of its own, or one of the scene at another position."""
+        is_moved = (
+            isinstance(entry, Sequence)
+            and not isinstance(entry, str)
+            and 2 <= len(entry) <= 3
+            and not isinstance(entry[1], str)
+        )
+        if not is_moved:
+            return scene_object(entry, label, "")
+        handle, position, *yaw = entry  # type: ignore[misc]  # a sequence, as checked
+        known = known_object(handle, self.handles, label)
+        yaw_deg = yaw[0] if yaw else math.degrees(known.pose.yaw_rad)
+        moved = (known.object, known.texture, position, yaw_deg)
+        values = dict(zip(FIELDS[:4], moved, strict=True))
+        return scene_object({**values, "scale": known.scale[0]}, label, "")
+
+
+def _object_image(placement: Placement) -> ObjectImage:
+    return ObjectImage(placement, MAGNIFICATION if placement.object == SMALL_BLOCK else 1.0)
+
+
+def _checked_text(text: object) -> str:
+    """Return a text in one line: other blanks than the space, such as ends of lines, become one."""
+    if isinstance(text, str) and len(text) <= 2 * MAX_PROMPT_CHARS and not text.isprintable():
+        text = " ".join(text.split())
+    if not isinstance(text, str) or not text.strip() or len(text) > MAX_PROMPT_CHARS:
+        raise SceneError(
+            f"prompt is {shown(text)}; give 1 to {MAX_PROMPT_CHARS} characters, not blanks alone, such as "
+            "'Put the {a} into the {b}.'"
+        )
+    if odd := odd_character(text):
+        raise SceneError(
+            f"prompt is {shown(text)}, with the character {odd}, which is not for text; leave it out."
+        )
+    return text
+
+
+def composed_prompt(text: object, images: object, fills: ImageMaker) -> Prompt:
+    """Make a prompt of its text and the images that a user gives.
+
+    Raises:
+        SceneError: The text or an image is malformed, or a placeholder has no image.
+        UnknownObjectError, UnknownTextureError, InputFileError: As for `compose`.
+    """
+    text = _checked_text(text)
+    if not isinstance(images, Mapping | None):
+        raise SceneError(f"images is {shown(images)}; give a mapping of placeholders to images.")
+    slots = image_names(text)
+    if len(slots) > MAX_IMAGES:
+        raise SceneError(f"the prompt has {len(slots)} placeholders; at most {MAX_IMAGES} are allowed.")
+    given = dict(images or {})
+    if unused := [name for name in given if name not in slots]:
+        raise SceneError(unknown_name("placeholder in the prompt for image", unused[0], slots))
+    for slot in slots:
+        if slot not in given and slot not in fills.handles:
+            what = "image or object for placeholder"
+            raise SceneError(unknown_name(what, slot, fills.handles, handles_hint(fills.handles)))
+    return Prompt(text, tuple((slot, fills.fill(slot, given.get(slot, slot))) for slot in slots))
+
 
 COMPOSE_KEYS = ("objects", "prompt", "images", "goals", "max_steps", "end_effector")
 DEFAULT_MAX_STEPS, MAX_STEPS_WITHOUT_GOALS = 10, 3

@@ -20,10 +20,8 @@ import yaml
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog import LEVELS, Assets, load_assets, object_spec, texture_spec
-from openvima.env.checked_values import MAX_ENTRIES, odd_character, shown
-from openvima.env.composed_objects import WORKSPACE
-from openvima.env.composing import MAX_STEPS, composed
-from openvima.env.photos import read_photo
+from openvima.env.composed_objects import MAX_ENTRIES, WORKSPACE, odd_character, shown
+from openvima.env.composing import MAX_STEPS, composed, read_photo
 from openvima.errors import InputFileError, OpenVimaError, SceneError, echo, unknown_name
 from openvima.input_files import read_json, read_yaml
 from openvima.perception.objects import MAX_OBJECTS

@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
-from openvima.errors import ActionError, echo
+from openvima.errors import ActionError, brief_repr, echo
 from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
 from openvima.scene.command import END_EFFECTOR, PRIMITIVES, STAY, ToolCommand, steps_per_primitive
 from openvima.sim.tool_path import PathFollower, onward_path, tool_path
@@ -18,6 +17,38 @@ from openvima.tasks import goals
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision
 from openvima.tasks.seeding import make_rng
+
+
+class ObjectNames(Mapping[int, dict[str, str]]):
+    """Maps the id of every placement to the names of its object and texture.
+
+    Not a dictionary: Gymnasium's vector environments split those and require string keys.
+
+    Args:
+        scene: The scene.
+
+    Example:
+        >>> info["objects"][5]  # doctest: +SKIP
+        {'object': 'letter A', 'texture': 'red swirl'}
+    """
+
+    __slots__ = ("_names",)
+
+    def __init__(self, scene: Scene) -> None:
+        self._names = {p.id: {"object": p.object, "texture": p.texture} for p in scene.placements}
+
+    def __getitem__(self, object_id: int) -> dict[str, str]:
+        return self._names[object_id]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __repr__(self) -> str:
+        return repr(self._names)
+
 
 FRAMES_PER_SECOND = 30
 

@@ -14,15 +14,15 @@ from gymnasium import spaces
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
-from openvima.env.action_validation import reset_option
 from openvima.env.episode_file import episode_from_values, load_episode
-from openvima.env.object_names import ObjectNames
 from openvima.env.running_episode import (
     RUNS,
+    ObjectNames,
     PrimitiveRun,
     ToolRun,
     VideoFrame,
 )
+from openvima.env.sub_environments import reset_option
 from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
 from openvima.html import notebook_html
 from openvima.render.camera import VIEWS, View

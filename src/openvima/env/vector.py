@@ -13,9 +13,8 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from openvima.env.action_validation import RESET_MASK, ActionValidator
 from openvima.env.registration import make
-from openvima.env.sub_environments import SubEnvironments, batch_infos
+from openvima.env.sub_environments import RESET_MASK, ActionValidator, SubEnvironments, batch_infos
 from openvima.env.tabletop import TabletopEnv
 from openvima.env.workers import AsyncTabletopEnvs
 from openvima.errors import ConfigError, OpenVimaError, echo, unknown_name

@@ -28,8 +28,14 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory, read_from_shared_memory
 
-from openvima.env.action_validation import RESET_MASK, ActionValidator
-from openvima.env.sub_environments import Info, SubEnvironments, batch_infos, rows
+from openvima.env.sub_environments import (
+    RESET_MASK,
+    ActionValidator,
+    Info,
+    SubEnvironments,
+    batch_infos,
+    rows,
+)
 from openvima.errors import WorkerError
 from openvima.multiprocess import defer_sigint, exit_with_parent, init_worker, single_threaded_workers
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Literal
 
-from openvima.brief import brief_repr
-from openvima.errors import ConfigError, UnknownPolicyError, unknown_name
+from openvima.errors import ConfigError, UnknownPolicyError, brief_repr, unknown_name
 from openvima.evaluation.ablations import scenes_of
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import TRAINED_KINDS

@@ -12,11 +12,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from openvima.brief import brief_repr
 from openvima.catalog.packs import ASSET_PACKS, load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.errors import ConfigError, LevelError, unknown_name
+from openvima.errors import ConfigError, LevelError, brief_repr, unknown_name
 from openvima.evaluation.ablations import (
     ABLATIONS,
     DETECTED_BOXES,
@@ -31,7 +30,7 @@ from openvima.evaluation.ablations import (
 from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
-from openvima.paths import as_path, settle
+from openvima.input_files import as_path, settle
 from openvima.policies.bundled import BUNDLED
 from openvima.scene.command import steps_per_primitive
 from openvima.serving.lerobot import is_lerobot, lerobot_server
@@ -82,7 +81,7 @@ class EvaluationConfig:
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
         engine: "processes" of this machine, or "ray".
-        address: Ray cluster; None starts Ray on this machine. See `openvima.ray_backend`.
+        address: Ray cluster; None starts Ray on this machine. See `openvima.multiprocess`.
         trust_code: Run the code that run folders name, as those of learners of your own do.
         python: For policies "lerobot:PATH" or "lerobot:OWNER/NAME": the Python of an environment with LeRobot
             and the plugin `lerobot-env-openvima`, which serves them.

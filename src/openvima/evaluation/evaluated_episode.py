@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.brief import brief_repr
-from openvima.errors import DatasetError, OpenVimaError, PolicyError, echo, unknown_name
+from openvima.errors import DatasetError, OpenVimaError, PolicyError, brief_repr, echo, unknown_name
 from openvima.evaluation.ablations import DETECTED_BOXES, ablated_environment
 from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch

@@ -12,7 +12,7 @@ from openvima.errors import PolicyError
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import begin_episode, play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, RolloutPolicy
-from openvima.paths import as_path
+from openvima.input_files import as_path
 from openvima.scene import Episode
 from openvima.scene.explanation import Explanation
 from openvima.video.clips import png

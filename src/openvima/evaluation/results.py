@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
-from openvima.brief import MAX_CHARACTERS, brief_repr, cut
-from openvima.errors import DatasetError, InputFileError, echo
+from openvima.errors import MAX_CHARACTERS, DatasetError, InputFileError, brief_repr, cut, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
 from openvima.html import notebook_html
-from openvima.input_files import read_text
-from openvima.paths import as_path
+from openvima.input_files import as_path, read_text
 
 SCHEMA = 1
 FILE_NAME = "results.json"

@@ -16,7 +16,7 @@ from openvima.errors import (
 )
 from openvima.evaluation.results import BAD_ACTION, POLICY_ERROR, EpisodeOutcome, failure_kind
 from openvima.evaluation.rollout_policies import Decision, RolloutPolicy
-from openvima.memory import lacks_memory
+from openvima.imports import lacks_memory
 from openvima.scene import Episode
 from openvima.scene.goal import object_of
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from openvima.atomic_io import atomic_write_file
+from openvima.atomic_io import FINISH_S, Part, atomic_write_file, folder_lock, parts_in_range
 from openvima.catalog.packs import load_assets
 from openvima.detector.plugins import plugged_boxes
 from openvima.errors import ConfigError, differences
@@ -17,7 +17,6 @@ from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
-from openvima.folder_lock import FINISH_S, Part, folder_lock, parts_in_range
 from openvima.multiprocess import imap_unordered
 from openvima.policies.base import require_torch
 from openvima.policies.loading import load_policy
@@ -254,7 +253,7 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Ro
     if config.engine == "processes":
         yield from imap_unordered(play_batch, jobs, config.workers or 1)
         return
-    from openvima.ray_backend import ray_imap_unordered
+    from openvima.multiprocess import ray_imap_unordered
 
     sent = {replace(job, batch=job.batch.with_whole_paths()): job for job in jobs}
     workers = config.workers or (1 if config.address is None else None)

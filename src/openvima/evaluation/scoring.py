@@ -11,7 +11,7 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy
 from openvima.evaluation.sources import object_record
 from openvima.evaluation.versions import versions
-from openvima.paths import names_of
+from openvima.input_files import names_of
 from openvima.policies.base import Policy
 from openvima.scene.command import PRIMITIVES
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
 from openvima.env.tabletop import TabletopEnv, VideoFrame
-from openvima.errors import EpisodeError, OpenVimaError, OracleError, PolicyError
+from openvima.errors import EpisodeError, OpenVimaError, OracleError, PolicyError, brief_repr
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import EpisodeSlot
 from openvima.evaluation.rollout_policies import Decision, PromptedRolloutPolicy, RolloutPolicy

@@ -10,8 +10,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
-from openvima.input_files import open_regular
-from openvima.paths import expand_home
+from openvima.input_files import expand_home, open_regular
 from openvima.policies.base import Policy
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.own_code import (

@@ -8,8 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from openvima.errors import PolicyError
-from openvima.extras import import_extra
-from openvima.memory import require_address_space
+from openvima.imports import import_extra, require_address_space
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 
 # Least that torch and the libraries loaded after it map, in 2**20 bytes; measured with torch 2.13 on the CPU.

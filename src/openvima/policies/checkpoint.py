@@ -17,8 +17,7 @@ import yaml
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
 from openvima.errors import CheckpointError, ConfigError, InputFileError
-from openvima.input_files import read_yaml
-from openvima.paths import as_path
+from openvima.input_files import as_path, read_yaml
 from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig, config_from_dict, config_to_dict
 from openvima.policies.differences import described, listed

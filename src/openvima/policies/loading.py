@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.errors import ConfigError, PolicyError, UnknownPolicyError
-from openvima.paths import as_text
+from openvima.input_files import as_text
 from openvima.policies.base import Policy, RandomPolicy, require_torch
 from openvima.policies.own_code import learner_code, policy_of_code, policy_of_run
 from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset

@@ -6,8 +6,7 @@ from pathlib import Path
 from openvima.atomic_io import restore_folder
 from openvima.errors import CheckpointError, unknown_name
 from openvima.hub import HubName, fetch, hub_name
-from openvima.input_files import read_text
-from openvima.paths import as_path
+from openvima.input_files import as_path, read_text
 from openvima.policies.bundled import BUNDLED, bundled_folder
 from openvima.policies.file_names import (
     BEST_FILE,

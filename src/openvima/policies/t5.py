@@ -20,10 +20,9 @@ from openvima.errors import (
     PromptError,
     echo,
 )
-from openvima.extras import import_extra
 from openvima.hub import HubName, fetch, hub_name
-from openvima.input_files import open_regular
-from openvima.paths import as_path
+from openvima.imports import import_extra
+from openvima.input_files import as_path, open_regular
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs

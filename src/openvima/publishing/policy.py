@@ -12,8 +12,7 @@ from openvima.evaluation.results import FILE_NAME, Results
 from openvima.evaluation.sources import weights_hash
 from openvima.evaluation.verification import is_marked_verified
 from openvima.hub import HubName, commit
-from openvima.input_files import read_text, read_yaml
-from openvima.paths import as_path
+from openvima.input_files import as_path, read_text, read_yaml
 from openvima.policies.base import require_torch
 from openvima.policies.file_names import CHECKPOINTS_FOLDER, CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE
 from openvima.policies.sources import find_checkpoint

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 from openvima.catalog.geometry import Assets, TriangleMesh, Vector3
-from openvima.extras import import_extra
+from openvima.imports import import_extra
 
 Shape = tuple[Assets, str, str, Vector3, Vector3]  # of an object: arguments of `object_glb`
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from openvima.lazy import lazy_names
+from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
     from openvima.report.assets import VideoSelection, evaluate_and_report

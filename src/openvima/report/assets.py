@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from openvima.atomic_io import folder_lock
 from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation.config import Batch, EvaluationConfig, cells
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import ORACLE, TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
-from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.bundled import BUNDLED
 from openvima.report.confirmation import Confirmation

@@ -11,7 +11,7 @@ from openvima.evaluation.config import DEFAULT_BATCH
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
-from openvima.paths import as_path, names_of
+from openvima.input_files import as_path, names_of
 from openvima.policies.presets import UNTRAINED
 from openvima.report import episodes, figures, fragments, published, reasons, tables, text
 from openvima.report.ablations import ablated_policies

@@ -2,7 +2,7 @@
 
 import re
 
-from openvima.brief import cut
+from openvima.errors import cut
 from openvima.evaluation.results import BAD_ACTION
 
 _MAX_CHARACTERS = 300  # results come from anywhere

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, TypeAlias
 
-from openvima.brief import brief_repr
+from openvima.errors import brief_repr
 from openvima.scene.goal import AtPose, Condition, Goal, Zone, block_points, kind_of, object_of
 from openvima.scene.scene import Scene
 

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from openvima.brief import brief_repr
-from openvima.errors import SceneError
+from openvima.errors import SceneError, brief_repr
 from openvima.html import notebook_html
 from openvima.scene.constraint import Constraint
 from openvima.scene.goal import AtPose, Goal, is_condition

@@ -7,8 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from openvima.brief import brief_repr
-from openvima.errors import PromptError, echo
+from openvima.errors import PromptError, brief_repr, echo
 from openvima.html import notebook_html
 from openvima.scene.scene import Placement, Scene
 

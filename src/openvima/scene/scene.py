@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from openvima.brief import brief_repr
 from openvima.catalog.geometry import Vector3
-from openvima.errors import SceneError
+from openvima.errors import SceneError, brief_repr
 from openvima.scene.pose import Pose
 
 EndEffector = Literal["suction", "spatula"]

@@ -3,26 +3,525 @@
 import asyncio
 import hmac
 import http
+import ipaddress
 import logging
+import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+import time
+import traceback
+from collections.abc import Awaitable, Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, field, fields
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import urlsplit
+from weakref import WeakKeyDictionary
+
+import numpy as np
 
 from openvima import __version__
-from openvima.errors import ConfigError, echo
+from openvima.errors import ConfigError, MessageError, OpenVimaError, echo, unknown_name
 from openvima.policies.base import Policy
 from openvima.policies.own_code import checked_policy
 from openvima.policies.prompt_limits import PromptLimits
+from openvima.scene import RenderedPrompt
 from openvima.scene.command import PRIMITIVES
-from openvima.serving.batching import DynamicBatcher
-from openvima.serving.config import ServerConfig, server_config
-from openvima.serving.packing import pack, require_extra
-from openvima.serving.protocol import DEFAULT_MODALITIES, PROTOCOL, check_control, check_modalities
-from openvima.serving.session import Session
+from openvima.serving.protocol import (
+    DEFAULT_MODALITIES,
+    MAX_LENGTH,
+    PROTOCOL,
+    TOKEN_VARIABLE,
+    check_control,
+    check_modalities,
+    check_protocol,
+    check_token,
+    decode_observation,
+    decode_prompt,
+    encode_action,
+    pack,
+    read_list,
+    require_extra,
+    type_of,
+    unpack,
+)
+from openvima.tasks.prompts import MULTIMODAL, check_prompts, described
+
+
+@dataclass(frozen=True, slots=True)
+class ServerConfig:
+    """Where a policy is served, and what its clients may ask for.
+
+    Args:
+        host: Interface to listen on. Any but the loopback interface needs a token.
+        port: TCP port; 0 takes a free one.
+        token: Clients must know it. None lets in everyone who reaches the port.
+        max_message_bytes: Size of the largest message. A prompt image takes 0.26 MB, and so does an
+            observation.
+        max_episodes: Episodes of the largest batch, for which 128 MiB are enough.
+        max_connections: Clients at the same time.
+        max_batch: Episodes of several clients that a network computes at once; with 1 it answers one request
+            after the other.
+        idle_s: Seconds after which a client is dropped that has not sent a whole message, or not taken an
+            answer.
+        num_threads: Threads that a network computes with. One gives the last bits of `openvima evaluate`.
+        prompts: "multimodal": prompts as clients send them. "text" or "mixed": with descriptions in place of
+            object images, see `openvima.make`; a policy that reads language alone serves every client.
+
+    Raises:
+        ConfigError: A setting is out of its range, there is no such form of prompts, or the server would be
+            open to others without a token.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8000
+    token: str | None = field(default=None, repr=False)
+    max_message_bytes: int = 128 * 2**20
+    max_episodes: int = 64
+    max_connections: int = 16
+    max_batch: int = 16
+    idle_s: float = 600.0
+    num_threads: int = 1
+    prompts: str = "multimodal"
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{name} is {value:g}; it must lie within {least:,} and {most:,}."
+            for name, value, least, most in (
+                ("port", self.port, 0, 65535),
+                ("max_message_bytes", self.max_message_bytes, 1024, 2**32),
+                ("max_episodes", self.max_episodes, 1, MAX_LENGTH),
+                ("max_batch", self.max_batch, 1, 1024),
+                ("max_connections", self.max_connections, 1, 10_000),
+                ("idle_s", self.idle_s, 0.01, 10**6),
+                ("num_threads", self.num_threads, 1, 1024),
+            )
+            if not least <= value <= most
+        ]
+        if self.token is None and not is_loopback(self.host):
+            problems.append(
+                f"host is {self.host!r}, which other machines may reach; give a token with --token or "
+                f"{TOKEN_VARIABLE}, or serve on 127.0.0.1 and let clients in through `ssh -L`."
+            )
+        if problems:
+            raise ConfigError(" ".join(problems))
+        check_token(self.token)
+        check_prompts(self.prompts)
+
+
+def server_config(**settings: Any) -> ServerConfig:  # Any: of several kinds
+    """Return the config with these fields.
+
+    Raises:
+        ConfigError: There is no such field, or as for `ServerConfig`.
+    """
+    known = [field.name for field in fields(ServerConfig)]
+    if unknown := [name for name in settings if name not in known]:
+        raise ConfigError(" ".join(unknown_name("setting of a server", name, known) for name in unknown))
+    return ServerConfig(**settings)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address is certain to mean this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def is_own_page(headers: Mapping[str, str], *, any_host: bool) -> bool:
+    """Whether a browser opens a WebSocket from a page of the same server.
+
+    Pages of other sites could open one to the loopback interface, or give a name of theirs its address.
+
+    Args:
+        headers: Of the request.
+        any_host: Whether the server may have names that do not mean this machine alone.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != host:
+        return False
+    return any_host or is_loopback(urlsplit(f"//{host}").hostname or "")
+
+
+def check_can_listen(host: str, port: int) -> None:
+    """Check that an address can be listened on, for servers that would try other ports or wait for ever.
+
+    Raises:
+        ConfigError: It is taken, or not one of this machine.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.create_server((host, port), family=family):
+            pass
+    except OSError as error:
+        raise ConfigError(f"cannot listen on {host}, port {port}: {error}; choose another one.") from error
+
+
+# Objects in the images of a request, on average over the largest batch. The benchmark's hardest prompts have
+# 20, and demonstrations as prompts three times as many; its observations have 9, and ids of arm and table.
+MAX_IN_PROMPTS, MAX_IN_VIEW = 64, 24
+_MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolicyCall:
+    """A call that a policy is to compute.
+
+    Args:
+        kind: The name of the method.
+        inputs: Its prompts or observations.
+    """
+
+    kind: Literal["reset", "act"]
+    inputs: Sequence[Any]
+
+
+# Gives the calls that an answer needs, is sent what they return, and returns the answer.
+Calls = Generator[PolicyCall, Any, Any]  # Any: actions; plain values and arrays
+ReplyCalls = Generator[PolicyCall, Any, bytes | str]
+
+
+class Session:
+    """Answers the requests of one client.
+
+    A request is read and checked in one thread and answered in that of the policy, so one that is refused
+    delays other clients only briefly. No method raises: a refusal is a text, and the next request may be a
+    better one.
+
+    Args:
+        policy: Has no other user. Its `prompt_limits`, if any, bound the prompts.
+        max_episodes: Episodes of the largest batch.
+        prompts: Form in which the policy gets prompts, see `ServerConfig`.
+    """
+
+    def __init__(self, policy: Policy, max_episodes: int, prompts: str = MULTIMODAL) -> None:
+        self.policy = policy
+        self._limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
+        self._control: str = getattr(policy, "control", PRIMITIVES)
+        self._max_episodes = max_episodes
+        self._prompts = prompts
+        self._num_episodes = 0
+
+    def read(self, data: bytes | str) -> Calls | str:
+        """Read a request, whatever it is, and return what answers it; nothing is called yet."""
+        try:
+            return self._read(data)
+        except OpenVimaError as error:
+            return _refusal(error)
+
+    def reply(self, request: Calls) -> ReplyCalls:
+        """Answer a request that `read` returned. Whoever runs this makes the calls."""
+        try:
+            return pack((yield from request))
+        except OpenVimaError as error:
+            return _refusal(error)
+        except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
+            where = "\n".join(map(echo, traceback.format_exc().splitlines()[-40:]))
+            _LOG.error("the policy failed\n%s", where)
+            return f"the policy failed: {type(error).__name__}: {echo(str(error))}"
+
+    def _read(self, data: bytes | str) -> Calls:
+        if isinstance(data, str):
+            raise MessageError("a text frame came in; requests are binary frames of MessagePack.")
+        message = unpack(data)
+        kind = type_of(message)
+        if kind == "reset":
+            assert isinstance(message, dict)  # it has a type
+            protocol = message.get("protocol", PROTOCOL)
+            check_protocol(protocol, theirs="the client", ours="this server")
+            prompts = read_list(message, "reset", "prompts", self._max_episodes, optional=("protocol",))
+            return self._begin(self._decoded(prompts))
+        if kind == "act":
+            seen = read_list(message, "act", "observations", self._max_episodes)
+            observations = [
+                decode_observation(one, f"observation {n}", control=self._control)
+                for n, one in enumerate(seen)
+            ]
+            num_ids = sum(_num_ids(one["segm"]) for one in observations if one and "segm" in one)
+            self._check_objects(num_ids, MAX_IN_VIEW)
+            return self._act(observations)
+        if isinstance(message, dict) and "type" not in message:
+            prompt = message.pop("prompt", None)
+            sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
+            return self._infer(decode_observation(message, control=self._control), self._decoded(sent))
+        raise MessageError(
+            f"a request must be a map with type 'reset' or 'act', or an observation ({PROTOCOL})."
+        )
+
+    def _decoded(self, sent: Sequence[object]) -> list[RenderedPrompt]:
+        prompts = [decode_prompt(prompt, f"prompt {n}") for n, prompt in enumerate(sent)]
+        for prompt in prompts:
+            self._limits.check(prompt)
+        num_objects = sum(len(image.objects) for prompt in prompts for image in prompt.images.values())
+        self._check_objects(num_objects, MAX_IN_PROMPTS)
+        return [described(prompt, self._prompts) for prompt in prompts]
+
+    def _check_objects(self, count: int, per_episode: int) -> None:
+        allowed = max(256, per_episode * self._max_episodes)  # of a single one as many as an image may have
+        if count > allowed:
+            raise MessageError(
+                f"the images have {count:,} objects in all; at most {allowed:,} are allowed. "
+                "Send fewer episodes."
+            )
+
+    def _begin(self, prompts: Sequence[RenderedPrompt]) -> Calls:
+        yield from self._reset(prompts)
+        return {"type": "reset", "episodes": self._num_episodes}
+
+    def _reset(self, prompts: Sequence[RenderedPrompt]) -> Calls:
+        if not prompts:
+            raise MessageError("reset has no prompts; give one for each episode.")
+        self._num_episodes = 0  # should the policy fail, there is nothing to go on with
+        yield PolicyCall("reset", prompts)
+        self._num_episodes = len(prompts)
+
+    def _act(self, observations: Sequence[dict[str, Any] | None]) -> Calls:  # Any: values and arrays
+        actions = yield from self._actions(observations)
+        near_ties = getattr(self.policy, "near_ties", None)
+        extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
+        return {"type": "act", "actions": actions, **extra}
+
+    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> Calls:  # Any: values and arrays
+        """Ask the policy."""
+        if not self._num_episodes:
+            raise MessageError("there are no episodes yet; send a reset with their prompts first.")
+        if len(observations) != self._num_episodes:
+            raise MessageError(
+                f"act has {len(observations)} observations for {self._num_episodes} prompts; send one for "
+                "each, and nil for episodes that have ended."
+            )
+        given = yield PolicyCall("act", observations)
+        actions = [encode_action(action, self._control) for action in given]
+        if len(actions) != len(observations):
+            raise MessageError(
+                f"the policy gave {len(actions)} actions for {len(observations)} observations."
+            )
+        return actions
+
+    def _infer(self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]) -> Calls:
+        """Act in a single episode, which an observation with a prompt begins."""
+        if prompts:
+            yield from self._reset(prompts)
+        return (yield from self._actions([observation]))[0]
+
+
+def _num_ids(segm: Mapping[str, np.ndarray]) -> int:
+    """Count the values of a segmentation, in the view with most of them."""
+    return max(
+        (int(np.count_nonzero(np.bincount(ids.ravel(), minlength=256))) for ids in segm.values()), default=0
+    )
+
+
+def _refusal(error: OpenVimaError) -> str:
+    return echo(f"{type(error).__name__}: {error}", _MAX_REFUSAL)
+
+
+if TYPE_CHECKING:
+    from openvima.policies.joint_inference import JointCall
+
+# Of waiting for the other clients, which are those that asked within the last second. A client that was just
+# answered needs a few ms for its next request, and a batch of 16 takes ten times the window.
+WINDOW_S = 0.01
+ACTIVE_S = 1.0
+
+
+class DynamicBatcher:
+    """Answers the requests of sessions, in order of arrival.
+
+    While one batch is computed, the requests for the next one arrive. It takes the same number of episodes of
+    each client, as far as they have so many, so a client with many episodes is answered in several batches
+    and the others wait for one of them at most.
+
+    Policies without `joint_call`, and those for which it returns None, are called once for each request.
+
+    Args:
+        readers: Threads that read and check requests.
+        computing: The one thread that policies are called in.
+        max_batch: Episodes of several requests that are computed at once; with 1 each request is computed by
+            itself.
+    """
+
+    def __init__(self, readers: Executor, computing: Executor, max_batch: int) -> None:
+        self._readers, self._computing = readers, computing
+        self._max_batch = max_batch
+        self._changed = threading.Condition()
+        self._last_asked_s: WeakKeyDictionary[Session, float] = WeakKeyDictionary()
+        self._arrived: list[WaitingRequest] = []
+        self._is_running = False  # or about to: `_run` is submitted once, however many requests wait
+        self._waiting: list[WaitingRequest] = []  # those that have waited longest come first
+
+    async def submit(self, session: Session, data: bytes | str) -> Awaitable[bytes | str] | str:
+        """Read a message.
+
+        Returns:
+            The answer, which is to be awaited, or a refusal. The message is no longer needed.
+        """
+        loop = asyncio.get_running_loop()
+        with self._changed:
+            self._last_asked_s[session] = time.monotonic()
+        calls = await loop.run_in_executor(self._readers, session.read, data)
+        if isinstance(calls, str):
+            return calls
+        request = WaitingRequest(session, calls, is_joint=self._max_batch > 1)
+        with self._changed:
+            self._arrived.append(request)
+            self._changed.notify()
+            was_running, self._is_running = self._is_running, True
+        if not was_running:
+            self._computing.submit(self._run)
+        return asyncio.wrap_future(request.reply)
+
+    def _run(self) -> None:
+        """Compute batches until no request waits."""
+        try:
+            while self._is_needed():
+                self._gather(self._compute_batch() if self._waiting else [])
+        except BaseException:  # the next request runs it again
+            with self._changed:
+                self._is_running = False
+            raise
+
+    def _is_needed(self) -> bool:
+        """Whether a request waits; if not, the next one will run the batcher again."""
+        with self._changed:
+            self._is_running = bool(self._waiting or self._arrived)
+            return self._is_running
+
+    def _gather(self, unfinished: "Sequence[WaitingRequest]") -> None:
+        """Take the requests that have arrived, and some behind them; wait a little for other clients."""
+        self._take_arrived()
+        if count := len(self._waiting) + len(unfinished):
+            since_s = time.monotonic() - ACTIVE_S
+            with self._changed:
+                num_active = sum(asked_s > since_s for asked_s in self._last_asked_s.values())
+                full = min(num_active, self._max_batch)
+                self._changed.wait_for(lambda: count + len(self._arrived) >= full, WINDOW_S)
+            self._take_arrived()
+        self._waiting += unfinished
+
+    def _take_arrived(self) -> None:
+        with self._changed:
+            arrived, self._arrived = self._arrived, []
+        self._waiting += [each for each in arrived if each.begin()]
+
+    def _compute_batch(self) -> "list[WaitingRequest]":
+        """Compute rows of the request that has waited longest, and of those that join it.
+
+        Returns:
+            Those of them that are not finished; they no longer wait.
+        """
+        calls = [(each, each.joint) for each in self._waiting if each.joint]
+        first = calls[0][1]
+        calls = [(each, call) for each, call in calls if call.joins(first)]
+        shares = fair_shares([call.num_left for _, call in calls], self._max_batch)
+        pieces = [(*call, share) for call, share in zip(calls, shares, strict=True) if share]
+        _compute(pieces)
+        served = [each for each, _, _ in pieces]
+        self._waiting = [each for each in self._waiting if each not in served]
+        return [each for each in served if each.joint]
+
+
+class WaitingRequest:
+    """A request that waits for its answer.
+
+    Attributes:
+        reply: The answer, once it is there.
+        joint: A call of the policy that is to be computed with those of others; None if there is none.
+    """
+
+    def __init__(self, session: Session, calls: Calls, *, is_joint: bool) -> None:
+        self._policy: Any = session.policy  # Any: `joint_call` is optional
+        self._calls = session.reply(calls)
+        self._is_joint = is_joint and hasattr(session.policy, "joint_call")
+        self.reply: Future[bytes | str] = Future()
+        self.joint: JointCall | None = None
+
+    def begin(self) -> bool:
+        """Make the calls before the first joint one; whether there is one."""
+        if self.reply.set_running_or_notify_cancel():  # else the server stops
+            self._resume(lambda: None)
+        return self.joint is not None
+
+    def go_on(self) -> None:
+        """Go on with the answer if the joint call is computed."""
+        joint = self.joint
+        if joint is not None and not joint.num_left:
+            self.joint = None
+            self._resume(joint.finish)
+
+    def fail(self, error: Exception) -> None:
+        """Go on with the error of the joint call."""
+        self.joint = None
+        self._resume(partial(_raise, error))
+
+    def _resume(self, result: Callable[[], Any]) -> None:  # Any: what a policy returns
+        """Send what a call returned, or raised, and make those that follow, up to a joint one."""
+        while True:
+            try:
+                given = result()
+            except Exception as error:
+                resume = partial(self._calls.throw, error)
+            else:
+                if self.joint is not None:
+                    return
+                resume = partial(self._calls.send, given)
+            try:
+                call = resume()
+            except StopIteration as end:
+                self.reply.set_result(end.value)
+                return
+            result = partial(self._made, call)
+
+    def _made(self, call: PolicyCall) -> Any:  # Any: what a policy returns
+        """Make a call, unless it is a joint one."""
+        joint: JointCall | None = None
+        if self._is_joint:
+            joint = self._policy.joint_call(call.kind, call.inputs)
+        if joint is None:
+            return getattr(self._policy, call.kind)(call.inputs)
+        if not joint.num_left:
+            return joint.finish()
+        self.joint = joint
+        return None
+
+
+def fair_shares(wanted: Sequence[int], total: int) -> list[int]:
+    """Divide a number of rows in turns, one at a time, so that whoever wants few gets them.
+
+    Example:
+        >>> fair_shares([1, 64, 1, 5], total=16)
+        [1, 9, 1, 5]
+    """
+    shares = [0] * len(wanted)
+    total = min(total, sum(wanted))
+    while total:
+        for index, most in enumerate(wanted):
+            if shares[index] < most and total:
+                shares[index] += 1
+                total -= 1
+    return shares
+
+
+def _compute(pieces: "Sequence[tuple[WaitingRequest, JointCall, int]]") -> None:
+    """Compute rows of calls in one batch; if that fails each by itself, for errors of its own."""
+    try:
+        pieces[0][1].compute_together([(call, count) for _, call, count in pieces])
+    except Exception as error:
+        if len(pieces) == 1:
+            pieces[0][0].fail(error)
+        else:
+            for piece in pieces:
+                _compute([piece])
+        return
+    for request, _, _ in pieces:
+        request.go_on()
+
+
+def _raise(error: Exception) -> None:
+    raise error
+
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection

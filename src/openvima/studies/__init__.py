@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from openvima.lazy import lazy_names
+from openvima.imports import lazy_names
 from openvima.studies.scales import SCALES, Scale, scale_named
 from openvima.studies.study import (
     Demonstrations,

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from openvima.atomic_io import atomic_write_file
+from openvima.atomic_io import atomic_write_file, folder_lock, is_lock_file
 from openvima.catalog.packs import load_assets
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.resuming import is_finished
@@ -14,10 +14,8 @@ from openvima.data.subsets import SubsetConfig, sample
 from openvima.errors import ConfigError, InputFileError, differences
 from openvima.evaluation.results import Results
 from openvima.evaluation.runner import evaluate_prepared, prepare
-from openvima.folder_lock import folder_lock, is_lock_file
-from openvima.input_files import read_json
+from openvima.input_files import as_path, read_json
 from openvima.multiprocess import check_workers, imap_unordered
-from openvima.paths import as_path
 from openvima.policies.base import require_torch
 from openvima.report.assets import require_extra
 from openvima.studies.page import study_page
@@ -67,7 +65,7 @@ class Execution:
         if self.engine == "processes":
             yield from imap_unordered(job, items, self.workers or 1)
             return
-        from openvima.ray_backend import ray_imap_unordered
+        from openvima.multiprocess import ray_imap_unordered
 
         workers = self.workers or (1 if self.address is None else None)
         yield from ray_imap_unordered(job, items, workers, address=self.address)

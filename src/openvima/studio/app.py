@@ -7,13 +7,11 @@ import viser
 from viser.infra import ClientId
 
 from openvima.catalog.packs import load_assets
-from openvima.serving.config import check_can_listen, is_own_page
+from openvima.serving.server import check_can_listen, is_own_page
 from openvima.studio.browse_panel import BrowsePanel
 from openvima.studio.browser_session import BrowserSession, StudioConfig
 from openvima.studio.compose_panel import ComposePanel
-from openvima.studio.play_panel import PlayPanel
-from openvima.studio.user_panel import UserPanel
-from openvima.studio.why_panel import WhyPanel
+from openvima.studio.play_panel import PlayPanel, UserPanel, WhyPanel
 
 PANELS = (PlayPanel, WhyPanel, ComposePanel, UserPanel, BrowsePanel)  # in the order of their tabs
 

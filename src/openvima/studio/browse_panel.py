@@ -15,7 +15,7 @@ from openvima.errors import DatasetError, PolicyError
 from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode, success_rates
 from openvima.evaluation.results import FILE_NAME, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy
-from openvima.paths import as_path
+from openvima.input_files import as_path
 from openvima.render import channels_last
 from openvima.sim.ur5 import HOME
 from openvima.studio.browser_session import BrowserSession

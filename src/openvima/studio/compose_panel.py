@@ -10,16 +10,14 @@ from typing import Any
 import viser
 
 from openvima.catalog import OBJECTS, TEXTURES
-from openvima.env.composition import Composition, shelf
-from openvima.env.episode_code import python_code, shell_command
+from openvima.env.composing import photo_from_bytes
+from openvima.env.composition import Composition, python_code, shelf, shell_command
 from openvima.env.episode_file import load_episode, save_episode
-from openvima.env.photos import photo_from_bytes
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
 from openvima.scene.pose import quaternion_yaw
-from openvima.studio.browser_session import BrowserSession
-from openvima.studio.table import hit_of, move
+from openvima.studio.browser_session import BrowserSession, hit_of, move
 
 _GIZMO, _REFUSED = "/compose/gizmo", "refused"
 _GIZMO_M = 0.12

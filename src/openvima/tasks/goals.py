@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import cast
 
-from openvima.brief import brief_repr
+from openvima.errors import brief_repr
 from openvima.scene import Outcome, Problem, Scene, StepConstraint, StepContext, in_workspace
 from openvima.scene.goal import distance_to, is_condition, is_monitored, object_of, unmet_reason
 

@@ -14,11 +14,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from openvima.brief import brief_repr
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
 from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.catalog.registration import with_registered
-from openvima.errors import ConfigError, LevelError, OpenVimaError, UnknownTaskError, echo, unknown_name
+from openvima.errors import (
+    ConfigError,
+    LevelError,
+    OpenVimaError,
+    UnknownTaskError,
+    brief_repr,
+    echo,
+    unknown_name,
+)
 from openvima.scene import END_EFFECTORS, EndEffector, Problem
 from openvima.user_code import described, load_file
 

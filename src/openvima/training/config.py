@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from openvima.errors import ConfigError, unknown_name
-from openvima.paths import settle
+from openvima.input_files import settle
 from openvima.policies.presets import PRESETS
 from openvima.training.validation import (
     Count,

@@ -22,9 +22,17 @@ from typing import Any
 import torch
 import yaml
 
-from openvima.atomic_io import atomic_write_file, naming, remove_stale, sync_file, sync_files, sync_folder
+from openvima.atomic_io import (
+    atomic_write_file,
+    folder_lock,
+    is_lock_file,
+    naming,
+    remove_stale,
+    sync_file,
+    sync_files,
+    sync_folder,
+)
 from openvima.errors import CheckpointError, ConfigError, InputFileError, differences
-from openvima.folder_lock import folder_lock, is_lock_file
 from openvima.input_files import read_json, read_yaml
 from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_order
 from openvima.policies.tensor_files import read_safetensors, write_safetensors

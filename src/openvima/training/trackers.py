@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from openvima.errors import InputFileError
-from openvima.extras import import_extra
+from openvima.imports import import_extra
 from openvima.input_files import read_text
 from openvima.training.config import RunConfig
 from openvima.video.animation import Animation

@@ -8,7 +8,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from openvima.errors import ConfigError, unknown_name
-from openvima.paths import as_path
+from openvima.input_files import as_path
 
 
 @dataclass(frozen=True, slots=True)

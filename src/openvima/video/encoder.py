@@ -9,7 +9,7 @@ import numpy as np
 
 from openvima.atomic_io import atomic_path
 from openvima.errors import ShapeError
-from openvima.extras import import_extra
+from openvima.imports import import_extra
 
 FRAMES_PER_SECOND = 30
 _CRF = "21"  # keeps textures clear at about 100 kB for 5 s

@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from openvima.cli.lists import parse_list
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import parse_list, progress_bar
 
 
 def import_published(

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from openvima.cli.progress import progress_bar
-from openvima.cli.tables import print_table
+from openvima.cli.terminal import print_table, progress_bar
 
 if TYPE_CHECKING:
     from rich.table import Table

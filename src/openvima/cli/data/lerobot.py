@@ -6,8 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from openvima.cli.lists import parse_tasks
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import parse_tasks, progress_bar
 
 
 def export_lerobot(

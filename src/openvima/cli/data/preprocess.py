@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import progress_bar
 
 
 def preprocess(

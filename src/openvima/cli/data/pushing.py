@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from openvima.cli.pushing import print_files
+from openvima.cli.terminal import print_files
 
 
 def push_to_hub(

@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from openvima.cli.lists import parse_tasks
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import parse_tasks, progress_bar
 
 Compression = Literal["lz4", "zstd"]
 

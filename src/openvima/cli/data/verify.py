@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.cli.progress import progress_bar
+from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima import __version__
-from openvima.atomic_io import atomic_folder
+from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
 from openvima.data.lerobot import layout
 from openvima.data.lerobot.dense import DenseLayout, dense_settings, dense_trajectory
 from openvima.data.lerobot.features import FrameLayout
@@ -17,8 +17,7 @@ from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
 from openvima.data.lerobot.writer import LerobotWriter, write_json
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
-from openvima.folder_lock import folder_lock, is_lock_file
-from openvima.paths import settle
+from openvima.input_files import settle
 from openvima.scene.command import CONTROL_HZ
 from openvima.video.encoder import import_av
 

@@ -11,7 +11,7 @@ from typing import Any, overload
 import numpy as np
 import pyarrow as pa
 
-from openvima.atomic_io import NO_SPACE
+from openvima.atomic_io import NO_SPACE, folder_lock
 from openvima.data.checksums import Envelope, spans_of
 from openvima.data.hash_split import split_hashes
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
@@ -28,9 +28,8 @@ from openvima.data.object_cache.random_appearance import RERENDERING_VERSION, wi
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
-from openvima.folder_lock import folder_lock
+from openvima.input_files import as_path
 from openvima.multiprocess import imap_unordered
-from openvima.paths import as_path
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import KINDS, InputKind
 from openvima.scene import COMPOSED

@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from openvima.atomic_io import NO_SPACE, atomic_write_file
+from openvima.atomic_io import NO_SPACE, atomic_write_file, folder_lock
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import BROKEN_NAME, MANIFEST_NAME, finish_folder
 from openvima.data.published.episode import ASSETS, DOMAIN, LEVEL, package_versions
@@ -23,9 +23,8 @@ from openvima.data.resuming import clear, is_finished, remove_leftovers, storage
 from openvima.data.shard import Shard
 from openvima.data.writer import ShardWriter
 from openvima.errors import ConfigError, DatasetError
-from openvima.folder_lock import folder_lock
+from openvima.input_files import settle
 from openvima.multiprocess import MAX_WORKERS, Counts, imap_with_progress
-from openvima.paths import settle
 
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set

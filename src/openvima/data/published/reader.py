@@ -11,7 +11,7 @@ from openvima.data.published.names import split_of, todays_task
 from openvima.data.published.zip_archive import ZipArchive
 from openvima.data.records import Demonstration
 from openvima.errors import ConfigError, DatasetError, MemberError, unknown_name
-from openvima.paths import as_path, names_of
+from openvima.input_files import as_path, names_of
 from openvima.tasks import task_spec
 
 SPLITS = ("all", "train", "validation")

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from openvima.atomic_io import is_lock_file
 from openvima.data.manifest import (
     BROKEN_NAME,
     CACHE_FOLDER,
@@ -13,7 +14,6 @@ from openvima.data.manifest import (
     PREVIOUS_NAME,
 )
 from openvima.errors import DatasetError
-from openvima.folder_lock import is_lock_file
 
 _NAMES = (MANIFEST_NAME, PREVIOUS_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
 

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 
-from openvima.atomic_io import atomic_folder
+from openvima.atomic_io import atomic_folder, folder_lock
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset
@@ -17,8 +17,7 @@ from openvima.data.subsets.folders import check_out, joined_licence, joined_vers
 from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, write_shards
 from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, unknown_name
-from openvima.folder_lock import folder_lock
-from openvima.paths import as_path, names_of, settle
+from openvima.input_files import as_path, names_of, settle
 from openvima.tasks.prompts import MULTIMODAL
 
 Duplicates = Literal["refuse", "skip"]

@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from openvima.atomic_io import atomic_folder
+from openvima.atomic_io import atomic_folder, folder_lock
 from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset, of_tasks
 from openvima.data.subsets.choosing import Splits, assign_splits, select_sample
 from openvima.data.subsets.folders import check_out, provenance
 from openvima.data.subsets.shards import NewShard, plan_shards, write_shards
 from openvima.errors import DatasetError
-from openvima.folder_lock import folder_lock
-from openvima.paths import settle
+from openvima.input_files import settle
 
 Report = Callable[[int, int, str], None]
 

@@ -18,8 +18,8 @@ from openvima.data.verification.findings import Problem, Report, Verification, V
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
 from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
+from openvima.input_files import as_path
 from openvima.multiprocess import imap_unordered
-from openvima.paths import as_path
 from openvima.user_code import is_code
 
 DEFAULT = VerifyConfig()

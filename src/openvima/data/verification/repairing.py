@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from openvima.atomic_io import naming
+from openvima.atomic_io import folder_lock, naming
 from openvima.catalog.packs import load_assets
 from openvima.data.checksums import spans_of
 from openvima.data.generation import finish
@@ -27,9 +27,8 @@ from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.salvage import rewrite
 from openvima.env.config import ENV_SETTINGS
 from openvima.errors import DatasetError, OpenVimaError
-from openvima.folder_lock import folder_lock
+from openvima.input_files import as_path
 from openvima.multiprocess import Counts, imap_with_progress
-from openvima.paths import as_path
 
 _STAGING = ".repair.tmp"
 

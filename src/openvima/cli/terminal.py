@@ -1,13 +1,114 @@
-"""Progress on stderr: bars for `report(done, total, note)` callbacks, and a table for generating.
+"""What commands read and print: options that hold several values, streams of any encoding, progress, tables.
 
-Where stderr is no terminal, both are lines: one at each stage, one a minute and one at the end.
+Progress is shown on stderr: bars for `report(done, total, note)` callbacks, and a table for generating. Where
+stderr is no terminal, both are lines: one at each stage, one a minute and one at the end.
 """
 
+import codecs
+import io
+import os
+import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from openvima.errors import ConfigError
+from openvima.input_files import expand_home
+from openvima.user_code import is_code
+
+
+def parse_list(text: str) -> tuple[str, ...]:
+    """Split an option such as "rotate,twist"."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def parse_sources(text: str) -> tuple[str, ...]:
+    """Split policies, such as "oracle,mine=runs/first"; an existing path is one of them, with its commas."""
+    words, found = text.split(","), []
+    while words:
+        counts = range(len(words), 0, -1)
+        count = next((n for n in counts if _is_path(",".join(words[:n]).strip())), 1)
+        found.append(",".join(words[:count]).strip())
+        del words[:count]
+    return tuple(filter(None, found))
+
+
+def _is_path(word: str) -> bool:
+    """Whether a policy, perhaps with a name before it, is an existing path, or code in one."""
+    given = expand_home(word)
+    named = re.fullmatch(r"\w[\w.+-]*=(.*)", given)
+    texts = (given, *(named.groups() if named else ()))
+    return any(os.path.exists(text.rpartition(":")[0] if is_code(text) else text) for text in texts)
+
+
+def parse_tasks(text: str) -> tuple[str, ...] | None:
+    """Split the names of tasks; None for "all"."""
+    names = parse_list(text)
+    return None if names == ("all",) else names
+
+
+def parse_shard_range(text: str | None) -> tuple[int, int] | None:
+    """Split a range such as "0:10".
+
+    Raises:
+        ConfigError: It is none, or empty.
+    """
+    found = None if text is None else re.fullmatch(r"(\d+):(\d+)", text)
+    if text is not None and (found is None or int(found[1]) >= int(found[2])):
+        raise ConfigError(f"shard_range is {text!r}; it must be a:b with 0 ≤ a < b, such as 0:10.")
+    return None if found is None else (int(found[1]), int(found[2]))
+
+
+_ALIKE = {
+    **dict.fromkeys("–−—", "-"),
+    **dict.fromkeys("“”„", '"'),
+    **dict.fromkeys("‘’", "'"),
+    **dict.fromkeys("─━═╌╴╶╸╺", "-"),
+    **dict.fromkeys("│┃║", "|"),
+    "×": "x",
+    "·": ".",
+    "•": "*",
+    "→": "->",
+    "≈": "~",
+    "≤": "<=",
+    "°": " deg",
+    "±": "+-",
+}
+
+
+def accept_any_text() -> None:
+    """Let stdout and stderr replace letters that their encoding lacks, instead of failing.
+
+    Undecodable bytes of file names are written as they are.
+    """
+    codecs.register_error("openvima.alike", _alike)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="openvima.alike")
+
+
+def _alike(error: UnicodeError) -> tuple[str | bytes, int]:
+    """Replace the first letter of an encoding error by similar ASCII letters."""
+    if not isinstance(error, UnicodeEncodeError):
+        return codecs.backslashreplace_errors(error)
+    letter = error.object[error.start]
+    if "\udc80" <= letter <= "\udcff":  # as `os.fsdecode` stands for a byte
+        return bytes([ord(letter) - 0xDC00]), error.start + 1
+    return _ascii(letter), error.start + 1
+
+
+def _ascii(letter: str) -> str:
+    if letter in _ALIKE:
+        return _ALIKE[letter]
+    if "\u2500" <= letter <= "\u257f":  # box drawing
+        return "+"
+    plain = unicodedata.normalize("NFKD", letter)
+    return "".join(c for c in plain if c.isascii()) or "?"
+
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -206,3 +307,57 @@ def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}"
+
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+PIPE_WIDTH = 150  # characters, where nothing says how wide the reader is
+
+
+def table_console() -> "Console":
+    """Return a console on stdout as wide as the terminal; a file or a pipe takes long lines."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=PIPE_WIDTH)
+
+
+def print_table(table: "Table", console: "Console | None" = None, *, num_heads: int = 1) -> None:
+    """Print a table, or a short paragraph for each row where the terminal is too narrow for it.
+
+    Args:
+        table: The table; columns that must not be cut are `no_wrap`.
+        console: Where to print.
+        num_heads: Columns that name a row.
+    """
+    from rich.measure import Measurement
+    from rich.padding import Padding
+    from rich.text import Text
+
+    console = console or table_console()
+    if Measurement.get(console, console.options.update(max_width=10_000), table).minimum <= console.width:
+        console.print(table)
+        return
+    names = [str(column.header) for column in table.columns]
+    rows = list(zip(*(column.cells for column in table.columns), strict=True))
+    if table.title:
+        console.print(Text(str(table.title), style="bold"))
+    for cells in rows:
+        texts = [cell.plain if isinstance(cell, Text) else str(cell) for cell in cells]
+        if any(texts):
+            console.print(Text(" ".join(texts[:num_heads]), style="bold"))
+            for name, text in zip(names[num_heads:], texts[num_heads:], strict=True):
+                console.print(Padding(Text(f"{name}: {text}"), (0, 0, 0, 2)))
+
+
+def print_files(files: Mapping[str, Path | bytes]) -> None:
+    """Print the card to stdout, and the names and sizes of all files to stderr."""
+    from openvima.publishing.card import CARD_NAME
+
+    for name, content in files.items():
+        size = len(content) if isinstance(content, bytes) else content.stat().st_size
+        print(f"{name}: {size:,} bytes", file=sys.stderr)
+        if name == CARD_NAME and isinstance(content, bytes):
+            print(content.decode(), end="")

@@ -1,0 +1,110 @@
+"""Imports on first use, packages that are not always installed, and too little memory for them."""
+
+import mmap
+import re
+import sys
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from types import ModuleType
+
+from openvima.errors import MissingExtraError, echo
+
+
+def lazy_names(
+    package: str, modules: Mapping[str, str]
+) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+    """Return the `__getattr__` and `__dir__` of a package.
+
+    Listing the names, as tab completion does, imports nothing.
+
+    Args:
+        package: Name of the package; its `__all__` holds the public names.
+        modules: For each lazy name the module below `package` that defines it.
+    """
+
+    def load(name: str) -> object:
+        if name in modules:
+            return getattr(import_module(f"{package}.{modules[name]}"), name)
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    def public_names() -> list[str]:
+        module = sys.modules[package]
+        present = {
+            name
+            for name, value in vars(module).items()
+            if name.startswith("__")
+            or (isinstance(value, ModuleType) and value.__name__ == f"{package}.{name}")
+        }
+        return sorted({*module.__all__, *present})
+
+    return load, public_names
+
+
+# How torch, MuJoCo, Arrow, threads and the loader of shared libraries say that there is no memory. Libraries
+# from a volume that forbids execution cannot be mapped either, for another reason.
+_MESSAGES = re.compile(
+    r"(can.?t|cannot|could not) allocate|out of memory|start new thread|bad_alloc"
+    r"|failed to map segment from shared object(?!: [^C])",
+    re.IGNORECASE,
+)
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether an exception, or one that it came from, says that there is too little memory."""
+    known: BaseException | None = error
+    while known is not None:
+        if isinstance(known, MemoryError) or _MESSAGES.search(str(known)):
+            return True
+        known = known.__cause__ or (None if known.__suppress_context__ else known.__context__)
+    return False
+
+
+def address_space_remedy() -> str:
+    """Return what to do about the limit of this process's address space; empty if there is none."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return ""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return "" if limit == resource.RLIM_INFINITY else f"raise `ulimit -v`, which is {limit // 1024} kB"
+
+
+def require_address_space(size_mb: int) -> None:
+    """Check that this process may still map that much memory; none of it is used.
+
+    Under `ulimit -v` libraries end the process when they cannot map memory (Arrow, LLVM), or try it again for
+    ever (OpenBLAS while it is loaded), so it has to be known before.
+
+    Args:
+        size_mb: Size in 2**20 bytes.
+
+    Raises:
+        MemoryError: The system allows less.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    try:  # what cannot be accessed does not count as memory in use
+        mmap.mmap(-1, size_mb * 2**20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
+    except OSError as error:
+        raise MemoryError(f"less than {size_mb} MB can be mapped") from error
+
+
+def import_extra(module: str, message: str) -> ModuleType:
+    """Import an optional package.
+
+    Args:
+        module: The module.
+        message: What needs it and how to install it, for the error.
+
+    Raises:
+        MissingExtraError: It is not installed, or it is broken.
+        MemoryError: It does not fit into memory.
+    """
+    try:
+        return import_module(module)
+    except (ImportError, OSError) as error:
+        if lacks_memory(error):
+            raise MemoryError(f"{module} cannot be loaded") from error
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            raise MissingExtraError(message) from error
+        raise MissingExtraError(f"{module} cannot be imported ({echo(str(error))}); {message}") from error
