@@ -36,15 +36,14 @@ from safetensors.torch import save_file
 
 from openvima import __version__
 from openvima.errors import OpenVimaError
+from openvima.policies.architectures import vima
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
-from openvima.policies.file_names import CONFIG_FILE, WEIGHTS_FILE
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.nn.text_encoder import TextEncoderConfig
-from openvima.policies.published.checkpoint import load_published
-from openvima.policies.published.names import to_published
+from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
+from openvima.policies.published import load_published
+from openvima.policies.published_names import to_published
 from openvima.policies.sizes import Size
-from openvima.policies.vima.config import vima
 
 CLEAR_REFS = Path("/proc/self/clear_refs")
 LIMIT_S = 10

@@ -28,11 +28,11 @@ import torch
 from openvima.data.records import rollout_oracle
 from openvima.detector import BUNDLED, detector_config, load_detector
 from openvima.detector.augmentation import augment_frame
+from openvima.detector.detection import JOINT_PAIRS, DetectedObjects
 from openvima.detector.detector import FrameDetector
 from openvima.detector.frames import Frame, frame_of
 from openvima.detector.network import MaskRCNN
 from openvima.env import TabletopEnv
-from openvima.policies.detection import JOINT_PAIRS, DetectedObjects
 from openvima.render.camera import VIEWS
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
 from openvima.tasks import list_tasks, task_spec

@@ -128,7 +128,7 @@ def _tiny_networks() -> Iterator[None]:
     import small_networks
     from openvima.detector import config as detectors
     from openvima.policies import presets
-    from openvima.policies.nn.conv_encoder import ConvConfig
+    from openvima.policies.nn.image_encoders import ConvConfig
 
     nano = presets.preset("nano")
     tiny = replace(

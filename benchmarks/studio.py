@@ -32,7 +32,7 @@ import viser
 import zstandard
 from websockets.sync.client import connect
 
-from openvima.policies.bundled import SMALL
+from openvima.policies.naming import SMALL
 from openvima.tasks import list_tasks
 from sim import circumstances
 

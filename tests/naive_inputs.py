@@ -24,8 +24,7 @@ from openvima.perception.objects import (
     part_of,
     whole_frames,
 )
-from openvima.policies.batch import WORD, HistoryBatch, PromptBatch
-from openvima.policies.input_layout import InputLayout
+from openvima.policies.batch import WORD, HistoryBatch, InputLayout, PromptBatch
 from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import VIEWS

@@ -4,14 +4,12 @@ from pathlib import Path
 
 import torch
 
+from openvima.policies.architectures import VimaConfig, vima
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.nn.text_encoder import TextEncoderConfig
-from openvima.policies.published.names import to_published
-from openvima.policies.published.rules import T5
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
+from openvima.policies.published_names import T5, to_published
 from openvima.policies.sizes import Size
-from openvima.policies.vima.config import VimaConfig, vima
 
 VOCABULARY_SIZE = 160
 _UNUSED_VOCABULARY_SIZE = 40478  # of the first GPT, whose unused embedding Gato and GPT contain

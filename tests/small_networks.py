@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from openvima.detector.config import BackboneConfig, DetectorConfig
-from openvima.policies.nn.conv_encoder import ConvConfig
+from openvima.policies.nn.image_encoders import ConvConfig
 from openvima.policies.pointer.config import CorrespondenceConfig, PointerConfig, small
 
 

@@ -66,7 +66,7 @@ def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
 
 @pytest.mark.parametrize(("name", "most_bytes"), [("openvima-small", 20e6), ("openvima-vima", 8e6)])
 def test_the_policies_in_the_package_are_small_and_whole(name, most_bytes) -> None:
-    from openvima.policies.bundled import BUNDLED
+    from openvima.policies.naming import BUNDLED
 
     policy = BUNDLED[name]
     files = [file for file in policy.folder.rglob("*") if file.is_file()]

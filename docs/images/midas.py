@@ -15,8 +15,8 @@ from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.evaluation.in_context import in_context_prompt
 from openvima.policies import preset
+from openvima.policies.nn.action_head import encode_bins
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
-from openvima.policies.nn.bins import encode_bins
 from openvima.policies.processor import Processor
 from openvima.scene import Action
 from openvima.training.augmentation.inverse_dynamics import motion_prompt

@@ -19,8 +19,8 @@ import openvima
 from openvima.perception.objects import observe, whole_frames
 from openvima.policies import preset
 from openvima.policies.batch import WORD
+from openvima.policies.nn.action_head import NUM_BINS, encode_bins
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
-from openvima.policies.nn.bins import NUM_BINS, encode_bins
 from openvima.policies.nn.decoder import PrefixDecoderConfig
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, benchmark_vocabulary

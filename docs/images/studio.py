@@ -14,7 +14,7 @@ from pathlib import Path
 from PIL import Image
 
 from openvima.evaluation import EvaluationConfig, evaluate
-from openvima.policies.bundled import SMALL
+from openvima.policies.naming import SMALL
 from openvima.studio.app import Studio
 from openvima.studio.browser_session import StudioConfig
 from studio_page import Page, launched_browser

@@ -19,9 +19,9 @@ from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.data import Dataset
+from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
-from openvima.policies.parameter_counts import policy_size
-from openvima.policies.sources import find_checkpoint
+from openvima.policies.naming import find_checkpoint
 from openvima.training.costs import logged_costs
 from openvima.training.run_folder import TIMINGS_FILE, whole_lines
 

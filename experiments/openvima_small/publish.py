@@ -28,7 +28,7 @@ from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.actions import ACTIONS_NAME
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.sources import weights_hash
-from openvima.policies.bundled import BUNDLED, SMALL
+from openvima.policies.naming import BUNDLED, SMALL
 from openvima.report.typesetting import Line, Table, markdown
 from tables import tables
 from weights import facts, settings, ship, shipped

@@ -15,7 +15,7 @@ from findings import (
 )
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
-from openvima.policies.bundled import BUNDLED
+from openvima.policies.naming import BUNDLED
 from openvima.report.paper import paper_tables
 from openvima.report.published import PublishedModel, leading_models, published_models
 from openvima.report.text import ablation_name, counted

@@ -14,9 +14,9 @@ from openvima.atomic_io import atomic_write_file
 from openvima.data import Dataset
 from openvima.data.appearance_stats import appearance_record, appearance_text
 from openvima.errors import ConfigError, DatasetError
+from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import load_network, read_info, write_checkpoint
-from openvima.policies.file_names import WEIGHTS_FILE
-from openvima.policies.parameter_counts import policy_size
+from openvima.policies.naming import WEIGHTS_FILE
 from openvima.policies.t5 import tokenizer_for
 from openvima.training.costs import logged_costs
 from openvima.training.run_folder import CONFIG_FILE, METRICS_FILE, SESSIONS_FILE, TIMINGS_FILE, whole_lines

@@ -18,9 +18,9 @@ from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.statistics.proportions import mean_of_rates
+from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
-from openvima.policies.parameter_counts import policy_size
-from openvima.policies.sources import find_checkpoint
+from openvima.policies.naming import find_checkpoint
 from openvima.training.costs import logged_costs
 from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, whole_lines
 

@@ -16,7 +16,7 @@ from openvima.detector import config as sizes  # noqa: E402
 from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
 from openvima.detector.config import DetectorConfig  # noqa: E402
 from openvima.detector.network import MaskRCNN  # noqa: E402
-from openvima.policies.devices import torch_threads  # noqa: E402
+from openvima.policies.base import torch_threads  # noqa: E402
 from small_networks import one_level_detector  # noqa: E402
 
 

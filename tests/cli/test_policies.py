@@ -9,11 +9,10 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.cli.main import main  # noqa: E402
-from openvima.policies import PRESETS, load_policy, parameter_counts, preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies import PRESETS, build, load_policy, preset  # noqa: E402
+from openvima.policies.build import build_network, policy_size  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE  # noqa: E402
-from openvima.policies.parameter_counts import policy_size  # noqa: E402
+from openvima.policies.naming import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE  # noqa: E402
 from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
 
 
@@ -21,7 +20,7 @@ from published_policies import small_vima, write_published, write_tokenizer  # n
 def count_each_preset_once() -> Iterator[None]:
     """Of the presets, each list counts all."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parameter_counts, "policy_size", cache(policy_size))
+        patch.setattr(build, "policy_size", cache(policy_size))
         yield
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from openvima.detector.detection import Detections
 from openvima.detector.visualize import draw_detections, save_grid
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.policies.detection import Detections
 
 coco = pytest.importorskip("pycocotools")
 from openvima.detector.coco_eval import evaluate_detector  # noqa: E402

@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.policies import presets  # noqa: E402
-from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
 
 TASKS = "rotate,sweep_without_exceeding"
 

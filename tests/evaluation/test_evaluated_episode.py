@@ -11,7 +11,7 @@ from openvima.errors import DatasetError, PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 from openvima.evaluation.evaluated_episode import evaluated_episode, find_source, success_rates
 from openvima.evaluation.rollout import play
-from openvima.policies.file_names import CHECKPOINTS_FOLDER
+from openvima.policies.naming import CHECKPOINTS_FOLDER
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import baselines
 from ablations import VARIANTS, Recorded, attribute_table, differences_table, read_rows, settings_of, solved
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import PairCounts, difference_over_seeds
-from openvima.policies.parameter_counts import policy_size
+from openvima.policies.build import policy_size
 from openvima.policies.pointer.config import small
 from openvima.policies.variants import with_variant
 from openvima.training import TrainingConfig

@@ -17,7 +17,7 @@ from openvima.evaluation.runner import Job
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy, load_policy
-from openvima.policies.own_code import parameters_hash
+from openvima.policies.loading import parameters_hash
 from openvima.report.assets import record_clip
 
 CODE = """

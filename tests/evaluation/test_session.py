@@ -13,7 +13,7 @@ from openvima.evaluation.free_play import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, load_own_rollout_policy
 from openvima.evaluation.session import EpisodeSession, first_difference
 from openvima.policies import RandomPolicy
-from openvima.policies.bundled import SMALL
+from openvima.policies.naming import SMALL
 from openvima.scene import Action
 from openvima.tasks import sample_episode
 

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch")
 
 from openvima.policies import preset
-from openvima.policies.parameter_counts import policy_size
+from openvima.policies.build import policy_size
 
 PAGE = Path(__file__).parents[2] / "docs" / "policies.md"
 TEXT = PAGE.read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("torch")
 
 from openvima.policies import preset
-from openvima.policies.parameter_counts import policy_size
+from openvima.policies.build import policy_size
 from openvima.training.recipes import RECIPES
 
 DOCS = Path(__file__).parents[2] / "docs"

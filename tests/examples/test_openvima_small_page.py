@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 
 
 from findings import Findings
-from openvima.policies.bundled import BUNDLED, SMALL
+from openvima.policies.naming import BUNDLED, SMALL
 from openvima.policies.pointer.candidates import GridCandidates
 from publish import _FIGURES, weights_tables
 from tables import tables

@@ -62,7 +62,7 @@ def small_bins_sizes():
 def _narrow(name: str):
     pytest.importorskip("torch")
     from openvima.policies import preset
-    from openvima.policies.nn.conv_encoder import ConvConfig
+    from openvima.policies.nn.image_encoders import ConvConfig
 
     sizes = preset(name)
     return replace(

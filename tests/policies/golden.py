@@ -32,12 +32,11 @@ from naive_inputs import (
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectViews, see_nothing
 from openvima.policies.build import outline_network
+from openvima.policies.nn.action_head import BinsHead, decode_bins, shift_actions
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
-from openvima.policies.nn.bins import BinsHead, decode_bins
-from openvima.policies.nn.history import shift_actions
 from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork
-from openvima.policies.published.config import config_from_published
-from openvima.policies.published.names import from_published
+from openvima.policies.published import config_from_published
+from openvima.policies.published_names import from_published
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import VIEWS
 

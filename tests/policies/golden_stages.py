@@ -28,12 +28,11 @@ from tests.policies.golden import (
 )
 
 from naive_inputs import WORD, HistoryBatch, NaiveProcessor, StepInput
+from openvima.policies.nn.action_head import ObservationTokens, decode_bins, encode_bins
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, to_unit_range
-from openvima.policies.nn.bins import decode_bins, encode_bins
 from openvima.policies.nn.decoder import Decoder, PrefixDecoder
-from openvima.policies.nn.history import ObservationTokens
+from openvima.policies.nn.layers import Unpadder
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
-from openvima.policies.nn.unpad import Unpadder
 from openvima.render.camera import VIEWS
 
 

@@ -14,6 +14,7 @@ from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.action_head import NUM_BINS, decode_bins, encode_bins  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
     ACTION_WIDTH,
@@ -21,12 +22,11 @@ from openvima.policies.nn.actions import (  # noqa: E402
     from_unit_range,
     to_unit_range,
 )
-from openvima.policies.nn.autoregressive import (  # noqa: E402
+from openvima.policies.nn.heads import (  # noqa: E402
     AutoregressiveConfig,
     AutoregressiveHead,
     ComponentTokens,
 )
-from openvima.policies.nn.bins import NUM_BINS, decode_bins, encode_bins  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.variants import with_head, with_visual_residual  # noqa: E402

@@ -10,21 +10,21 @@ torch = pytest.importorskip("torch")
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from openvima.policies.nn.action_encoder import ActionEncoder  # noqa: E402
-from openvima.policies.nn.action_head import spread  # noqa: E402
+from openvima.policies.nn.action_head import (  # noqa: E402
+    NUM_BINS,
+    BinsHead,
+    ObservationTokens,
+    decode_bins,
+    encode_bins,
+    spread,
+)
 from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
+    ActionEncoder,
     ActionTargets,
     from_unit_range,
     to_unit_range,
 )
-from openvima.policies.nn.bins import (  # noqa: E402
-    NUM_BINS,
-    BinsHead,
-    decode_bins,
-    encode_bins,
-)
-from openvima.policies.nn.history import ObservationTokens  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 
 

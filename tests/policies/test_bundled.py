@@ -20,11 +20,15 @@ from openvima.evaluation.rollout_policies import PromptedRolloutPolicy  # noqa: 
 from openvima.evaluation.sources import policy_sources, weights_hash  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.bundled import BUNDLED, MODEL_CARD, SMALL  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.file_names import CHECKPOINTS_FOLDER  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.sources import find_checkpoint  # noqa: E402
+from openvima.policies.naming import (  # noqa: E402
+    BUNDLED,
+    CHECKPOINTS_FOLDER,
+    MODEL_CARD,
+    SMALL,
+    find_checkpoint,
+)
 from openvima.report import assets  # noqa: E402
 from openvima.report.assets import find_metrics  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402

@@ -21,9 +21,12 @@ from openvima.policies.checkpoint import (  # noqa: E402
     save_checkpoint,
 )
 from openvima.policies.config import config_to_dict  # noqa: E402
-from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER  # noqa: E402
 from openvima.policies.loading import load_policy  # noqa: E402
-from openvima.policies.sources import checkpoint_folder  # noqa: E402
+from openvima.policies.naming import (  # noqa: E402
+    BEST_FILE,
+    CHECKPOINTS_FOLDER,
+    checkpoint_folder,
+)
 from openvima.policies.tokenizer import VOCABULARY_FILE  # noqa: E402
 
 

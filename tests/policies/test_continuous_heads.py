@@ -12,13 +12,16 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import config_from_dict, config_to_dict  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.action_encoder import ActionEncoder  # noqa: E402
-from openvima.policies.nn.actions import ActionTargets, greedy  # noqa: E402
-from openvima.policies.nn.continuous import (  # noqa: E402
+from openvima.policies.nn.actions import (  # noqa: E402
+    ActionEncoder,
+    ActionTargets,
+    greedy,
+)
+from openvima.policies.nn.heads import (  # noqa: E402
     MixtureConfig,
     RegressionConfig,
+    build_head,
 )
-from openvima.policies.nn.heads import build_head  # noqa: E402
 from openvima.policies.variants import with_head  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from openvima.detector.detection import DetectedObjects, Detections
 from openvima.env import TabletopEnv
 from openvima.errors import DetectionError, PolicyError, ShapeError
 from openvima.perception.objects import (
@@ -16,7 +17,6 @@ from openvima.perception.objects import (
     observe,
     observe_prompt_image,
 )
-from openvima.policies.detection import DetectedObjects, Detections
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 from openvima.tasks import list_tasks
 

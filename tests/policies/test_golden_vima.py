@@ -17,8 +17,8 @@ from tests.policies.golden import (
 )
 from tests.policies.golden_stages import closed_loop, stages
 
-from openvima.policies.nn.bins import NUM_BINS, encode_bins
-from openvima.policies.nn.text_encoder import relative_bucket
+from openvima.policies.nn.action_head import NUM_BINS, encode_bins
+from openvima.policies.nn.prompt_encoder import relative_bucket
 
 NAME = "vima_tiny"
 pytestmark = needs(NAME)

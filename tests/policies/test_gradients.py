@@ -7,19 +7,18 @@ torch = pytest.importorskip("torch")
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
+from openvima.policies.architectures import flamingo, gato, gpt, midas, vima  # noqa: E402
 from openvima.policies.batch import PromptBatch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.flamingo.config import flamingo  # noqa: E402
-from openvima.policies.gato.config import gato  # noqa: E402
-from openvima.policies.gpt.config import gpt  # noqa: E402
-from openvima.policies.midas.config import midas  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
-from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
+from openvima.policies.nn.prompt_encoder import (  # noqa: E402
+    PromptEncoder,
+    PromptEncoderConfig,
+    TextEncoderConfig,
+)
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.sizes import VOCABULARY_SIZE, Size  # noqa: E402
-from openvima.policies.vima.config import vima  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 

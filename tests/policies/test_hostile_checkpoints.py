@@ -17,8 +17,8 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.file_names import CONFIG_FILE, WEIGHTS_FILE  # noqa: E402
-from openvima.policies.published.checkpoint import load_published  # noqa: E402
+from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE  # noqa: E402
+from openvima.policies.published import load_published  # noqa: E402
 from published_policies import small_vima, write_published  # noqa: E402
 
 

@@ -7,11 +7,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.detector.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402

@@ -12,8 +12,8 @@ torch = pytest.importorskip("torch")
 from openvima.errors import PolicyError  # noqa: E402
 from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.episodes import JointCall  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.joint_inference import JointCall  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 

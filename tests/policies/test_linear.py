@@ -8,8 +8,8 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional as F  # noqa: E402
 
-from openvima.policies.nn import linear  # noqa: E402
-from openvima.policies.nn.linear import Linear  # noqa: E402
+from openvima.policies.nn import layers as linear  # noqa: E402
+from openvima.policies.nn.layers import Linear  # noqa: E402
 
 
 @pytest.fixture

@@ -4,8 +4,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.policies.nn.linear import Linear, rounded_rows  # noqa: E402
-from openvima.policies.nn.unpad import Unpadder  # noqa: E402
+from openvima.policies.nn.layers import (  # noqa: E402
+    Linear,
+    Unpadder,
+    rounded_rows,
+)
 
 
 @pytest.mark.parametrize("bias", [True, False])

@@ -10,7 +10,7 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn.actions import from_unit_range, to_unit_range  # noqa: E402
-from openvima.policies.pointer.geometry import yaw_to_bin  # noqa: E402
+from openvima.policies.pointer.inputs import yaw_to_bin  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from training_examples import check_mixed_precision, collate_examples, examples_of  # noqa: E402
 

@@ -7,8 +7,14 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.policies import PRESETS, preset  # noqa: E402
-from openvima.policies.build import build_network, outline_network  # noqa: E402
-from openvima.policies.parameter_counts import PARTS, Count, count_parameters, policy_size  # noqa: E402
+from openvima.policies.build import (  # noqa: E402  # noqa: E402
+    PARTS,
+    Count,
+    build_network,
+    count_parameters,
+    outline_network,
+    policy_size,
+)
 from openvima.policies.presets import PUBLISHED  # noqa: E402
 
 # Millions of parameters in the blocks of the published VIMA.

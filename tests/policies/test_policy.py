@@ -14,8 +14,8 @@ from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.base import Policy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.action_head import shift_actions  # noqa: E402
 from openvima.policies.nn.actions import ActionTargets  # noqa: E402
-from openvima.policies.nn.history import shift_actions  # noqa: E402
 from openvima.scene import ACTION_SHAPES, WORKSPACE_HIGH, WORKSPACE_LOW  # noqa: E402
 
 

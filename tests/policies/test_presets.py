@@ -12,9 +12,8 @@ from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # no
 from openvima.policies import PRESETS, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import config_from_dict, config_to_dict  # noqa: E402
-from openvima.policies.nn.bins import NUM_BINS  # noqa: E402
-from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
-from openvima.policies.nn.vit import VitConfig  # noqa: E402
+from openvima.policies.nn.action_head import NUM_BINS  # noqa: E402
+from openvima.policies.nn.image_encoders import ConvConfig, VitConfig  # noqa: E402
 from openvima.policies.presets import PUBLISHED, SIZE_NAMES  # noqa: E402
 from openvima.policies.sizes import SIZES, VOCABULARY_SIZE  # noqa: E402
 

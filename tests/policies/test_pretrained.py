@@ -14,8 +14,8 @@ from openvima.evaluation.sources import weights_hash  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, load_network  # noqa: E402
-from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.naming import TOKENIZER_FOLDER  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer  # noqa: E402
 from openvima.policies.tokenizer import VOCABULARY_FILE, benchmark_vocabulary  # noqa: E402
 from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402

@@ -12,21 +12,16 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import CheckpointError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
+from openvima.policies.architectures import flamingo, gato, gpt, vima  # noqa: E402
 from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.flamingo.config import flamingo  # noqa: E402
-from openvima.policies.gato.config import gato  # noqa: E402
-from openvima.policies.gpt.config import gpt  # noqa: E402
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig  # noqa: E402
-from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig  # noqa: E402
 from openvima.policies.presets import SIZE_NAMES  # noqa: E402
-from openvima.policies.published.checkpoint import load_published  # noqa: E402
-from openvima.policies.published.config import config_from_published  # noqa: E402
-from openvima.policies.published.names import from_published, to_published  # noqa: E402
+from openvima.policies.published import config_from_published, load_published  # noqa: E402
+from openvima.policies.published_names import from_published, to_published  # noqa: E402
 from openvima.policies.sizes import Size  # noqa: E402
-from openvima.policies.vima.config import vima  # noqa: E402
 from published_policies import with_unused_entries  # noqa: E402
 
 ARCHITECTURES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}

@@ -7,9 +7,12 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
-from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
-from openvima.policies.nn.relative_rotation import RelativeRotation  # noqa: E402
+from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
+from openvima.policies.nn.object_encoder import (  # noqa: E402
+    ObjectEncoder,
+    ObjectEncoderConfig,
+    RelativeRotation,
+)
 
 BINS = 72
 FRONT, TOP = 0, 1

@@ -16,7 +16,7 @@ from openvima.errors import CheckpointError, MissingExtraError, PolicyError, Pro
 from openvima.hub import HubName  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.nn.text_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
+from openvima.policies.nn.prompt_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer, load_t5, tokenizer_for  # noqa: E402
 from openvima.policies.tokenizer import benchmark_vocabulary  # noqa: E402
 from openvima.scene import PromptImage, RenderedPrompt  # noqa: E402

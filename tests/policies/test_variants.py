@@ -12,8 +12,8 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.config import config_from_dict, config_to_dict  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.image_encoders import Resampler, ResamplerConfig  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.nn.resampler import Resampler, ResamplerConfig  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.variants import SWITCHES, image_tokens, with_variant  # noqa: E402
 from openvima.training.config import ModelConfig  # noqa: E402

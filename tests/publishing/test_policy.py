@@ -19,7 +19,7 @@ from openvima.evaluation.sources import PolicySource, weights_hash  # noqa: E402
 from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.sources import find_checkpoint  # noqa: E402
+from openvima.policies.naming import find_checkpoint  # noqa: E402
 from openvima.publishing import policy_card, push_policy  # noqa: E402
 
 SETTINGS = {

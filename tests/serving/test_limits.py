@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from openvima.policies.prompt_limits import PromptLimits
+from openvima.policies.base import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
 from openvima.serving.protocol import MAX_PIXELS, encode_prompt, pack, unpack

@@ -34,7 +34,7 @@ def demonstrations_of_several_steps() -> list[Demonstration]:
 def settings(data: Path, tmp_path: Path, monkeypatch) -> dict:
     """Arguments of a run of a narrow network over a few steps."""
     pytest.importorskip("torch")
-    from openvima.policies.nn.conv_encoder import ConvConfig
+    from openvima.policies.nn.image_encoders import ConvConfig
 
     def tiny():
         sizes = presets.preset("nano")

@@ -13,8 +13,8 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.evaluation.phrasings import held_out_phrasings  # noqa: E402
 from openvima.policies import presets  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.pointer.attributes import Attributes  # noqa: E402
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402
+from openvima.policies.pointer.words import Attributes  # noqa: E402
 from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer, split_words  # noqa: E402
 from openvima.scene import Placement, Pose  # noqa: E402
 from openvima.scene.prompt import PLACEHOLDER  # noqa: E402

@@ -13,7 +13,7 @@ from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.subsets.merging import MergeConfig, merge  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
-from openvima.policies.own_code import held_out_data  # noqa: E402
+from openvima.policies.loading import held_out_data  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
 from openvima.tasks.registry import held_out_tasks, list_tasks  # noqa: E402

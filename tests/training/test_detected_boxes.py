@@ -17,12 +17,12 @@ from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.object_cache.cache_file import CACHE_VERSION  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.detector.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.detector.plugins import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import ObjectViews  # noqa: E402
 from openvima.policies import load_policy  # noqa: E402
-from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402

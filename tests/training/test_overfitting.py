@@ -14,9 +14,9 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.action_head import encode_bins  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range  # noqa: E402
-from openvima.policies.nn.bins import encode_bins  # noqa: E402
-from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.scene import Action  # noqa: E402

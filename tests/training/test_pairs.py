@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch")
 from openvima.catalog.packs import load_assets  # noqa: E402
 from openvima.catalog.partitions import pool  # noqa: E402
 from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
-from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.tasks import sample_episode  # noqa: E402
 from openvima.training.augmentation.appearance_randomization import ShapeKinds, with_random_appearance  # noqa: E402

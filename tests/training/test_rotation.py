@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 from openvima.catalog.packs import load_assets  # noqa: E402
 from openvima.catalog.partitions import pool  # noqa: E402
 from openvima.catalog.random_pack import RandomAppearanceAssets, is_random  # noqa: E402
-from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.render.rasteriser import Rasteriser  # noqa: E402
 from openvima.scene import Placement, Pose, Scene  # noqa: E402

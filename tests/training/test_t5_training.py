@@ -13,8 +13,7 @@ from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets, sizes  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig  # noqa: E402
-from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer, load_t5  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402

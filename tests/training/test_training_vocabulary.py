@@ -13,8 +13,8 @@ from openvima.errors import CheckpointError, UnknownWordWarning  # noqa: E402
 from openvima.evaluation.sources import policy_sources  # noqa: E402
 from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.naming import TOKENIZER_FOLDER  # noqa: E402
 from openvima.policies.pointer.config import AttributeConfig  # noqa: E402
 from openvima.policies.presets import PRESETS, PUBLISHED  # noqa: E402
 from openvima.policies.sizes import VOCABULARY_SIZE  # noqa: E402

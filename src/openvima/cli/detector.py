@@ -221,7 +221,7 @@ def _one_thread() -> "Iterator[None]":
     from openvima.policies.base import require_torch
 
     require_torch("a detector")
-    from openvima.policies.devices import torch_threads
+    from openvima.policies.base import torch_threads
 
     with torch_threads(1):
         yield

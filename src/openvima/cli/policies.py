@@ -10,9 +10,9 @@ import tyro
 from openvima.cli.terminal import print_files, print_table, table_console
 
 if TYPE_CHECKING:
-    from openvima.policies.bundled import BundledPolicy
+    from openvima.policies.build import PolicySize
     from openvima.policies.config import PolicyConfig
-    from openvima.policies.parameter_counts import PolicySize
+    from openvima.policies.naming import BundledPolicy
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 Precision = Literal["float32", "bfloat16", "float16", "float64"]
@@ -37,12 +37,12 @@ def list_(*, as_json: Json = False) -> int:
         Exit status.
     """
     from openvima.policies.base import require_torch
-    from openvima.policies.bundled import BUNDLED
+    from openvima.policies.naming import BUNDLED
     from openvima.policies.presets import PRESETS, preset
 
     require_torch("counting parameters")
+    from openvima.policies.build import policy_size
     from openvima.policies.checkpoint import read_info
-    from openvima.policies.parameter_counts import policy_size
 
     sizes = {name: policy_size(preset(name)) for name in PRESETS}
     installed = {name: policy for name, policy in BUNDLED.items() if policy.is_installed}
@@ -76,11 +76,11 @@ def show(
         Exit status.
     """
     from openvima.policies.base import require_torch
-    from openvima.policies.bundled import BUNDLED
+    from openvima.policies.naming import BUNDLED
 
     require_torch("counting parameters")
+    from openvima.policies.build import policy_size
     from openvima.policies.config import config_to_dict
-    from openvima.policies.parameter_counts import policy_size
 
     config, bundled = _config(policy), BUNDLED.get(policy)
     size = policy_size(config)
@@ -136,8 +136,8 @@ def convert(
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
     require_torch("reading a policy")
+    from openvima.policies.build import policy_size
     from openvima.policies.checkpoint import load_network, save_checkpoint
-    from openvima.policies.parameter_counts import policy_size
     from openvima.policies.t5 import tokenizer_for
 
     network, stored = load_network(source)
@@ -203,7 +203,7 @@ def _config(policy: str) -> "PolicyConfig":
         return preset(policy)
     from openvima.errors import UnknownPolicyError
     from openvima.policies.checkpoint import load_network, read_info
-    from openvima.policies.sources import find_checkpoint, is_policy_source, unknown_policy
+    from openvima.policies.naming import find_checkpoint, is_policy_source, unknown_policy
 
     if not is_policy_source(policy):
         raise UnknownPolicyError(unknown_policy(policy, ()))

@@ -7,7 +7,7 @@ from pathlib import Path
 from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 from openvima.multiprocess import num_cpus
-from openvima.policies.bundled import SMALL, bundled_folder
+from openvima.policies.naming import SMALL, bundled_folder
 
 TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
 LEVELS = ("L1", "L2", "L3")

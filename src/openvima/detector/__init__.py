@@ -8,8 +8,8 @@ from openvima.errors import CheckpointError
 from openvima.input_files import as_path
 
 if TYPE_CHECKING:
+    from openvima.detector.detection import DetectedObjects
     from openvima.detector.detector import FrameDetector
-    from openvima.policies.detection import DetectedObjects
 
 BUNDLED = Path(__file__).parent / "trained"  # the small detector for the default assets
 CACHE_SIZE = 1024  # of extractors, in pairs of images; 30 MB, and a larger one is hardly hit more often
@@ -58,7 +58,7 @@ def load_extractor(folder: str | Path | None = None, **options: Any) -> "Detecte
     Example:
         >>> load_policy("run", extractor=load_extractor())
     """
-    from openvima.policies.detection import DetectedObjects
+    from openvima.detector.detection import DetectedObjects
 
     return DetectedObjects(load_detector(folder, **options), cache_size=CACHE_SIZE)
 

@@ -12,11 +12,9 @@ from openvima.detector.config import DetectorConfig
 from openvima.detector.network import MaskRCNN
 from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.input_files import read_yaml
-from openvima.policies.differences import described, listed
-from openvima.policies.file_names import CONFIG_FILE, WEIGHTS_FILE
-from openvima.policies.nn.meta_init import MetaInit
-from openvima.policies.sources import checkpoint_folder
-from openvima.policies.tensor_files import read_safetensors, write_safetensors
+from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
+from openvima.policies.nn.layers import MetaInit
+from openvima.policies.tensor_files import described, listed, read_safetensors, write_safetensors
 
 _KIND = "detector"
 _MAX_LISTED = 5  # names per kind of problem in a message

@@ -9,10 +9,10 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from openvima.detector.backbone import ConvNorm
+from openvima.detector.detection import Detections
 from openvima.detector.network import Instances, MaskRCNN
 from openvima.errors import ShapeError
-from openvima.policies.detection import Detections
-from openvima.policies.devices import usable_device
+from openvima.policies.base import usable_device
 
 
 class FrameDetector:

@@ -22,7 +22,7 @@ from openvima.detector.heads import WEIGHTS as BOX_WEIGHTS
 from openvima.detector.network import MaskRCNN
 from openvima.detector.rpn import WEIGHTS as PROPOSAL_WEIGHTS
 from openvima.errors import CheckpointError, InputFileError
-from openvima.policies.limits import check_limits
+from openvima.policies.config import check_limits
 from openvima.policies.tensor_files import check_finite, read_archive
 
 _CLASS_WEIGHTS = "roi_heads.box_predictor.cls_score.weight"

@@ -18,11 +18,10 @@ from typing import cast
 from openvima.data.object_cache.cache import Boxes, ObjectCache, Report, open_object_cache
 from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
+from openvima.detector.detection import MATCHING_VERSION, DetectedObjects
 from openvima.errors import ConfigError
 from openvima.perception.objects import AheadExtractor, ObjectExtractor, ObjectViews, see_nothing
-from openvima.policies.detection import MATCHING_VERSION, DetectedObjects
-from openvima.policies.file_names import WEIGHTS_FILE
-from openvima.policies.sources import checkpoint_folder
+from openvima.policies.naming import WEIGHTS_FILE, checkpoint_folder
 from openvima.scene import PromptImage
 from openvima.user_code import call_function, is_code, load_function, source_hash
 
@@ -174,7 +173,7 @@ def _folder_of(source: str) -> Path | None:
 def _one_thread() -> AbstractContextManager[None]:
     """Limit torch to one thread if it is installed; a custom extractor may not need it."""
     try:
-        from openvima.policies.devices import torch_threads
+        from openvima.policies.base import torch_threads
     except ImportError:
         return nullcontext()
     return torch_threads(1)

@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from openvima.atomic_io import atomic_write_file
+from openvima.detector.detection import Detections
 from openvima.detector.frames import Frame
-from openvima.policies.detection import Detections
 from openvima.render import channels_last
 
 COLOURS = ((0, 158, 115), (230, 159, 0), (86, 180, 233), (204, 121, 167), (240, 228, 66), (213, 94, 0))

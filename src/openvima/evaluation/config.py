@@ -31,7 +31,7 @@ from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.input_files import as_path, settle
-from openvima.policies.bundled import BUNDLED
+from openvima.policies.naming import BUNDLED
 from openvima.scene.command import steps_per_primitive
 from openvima.serving.lerobot import is_lerobot, lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec

@@ -14,8 +14,7 @@ from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
 from openvima.evaluation.sources import NAMED_POLICIES, PolicySource, weights_hash
 from openvima.evaluation.verification import recorded_env_config
-from openvima.policies.bundled import BUNDLED
-from openvima.policies.file_names import CHECKPOINTS_FOLDER
+from openvima.policies.naming import BUNDLED, CHECKPOINTS_FOLDER
 from openvima.policies.presets import PRESETS, UNTRAINED
 from openvima.scene import Episode
 from openvima.scene.command import PRIMITIVES

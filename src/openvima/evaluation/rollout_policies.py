@@ -23,8 +23,8 @@ from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource
 from openvima.policies.base import POLICIES_THAT_EXPLAIN
-from openvima.policies.own_code import checked_policy
-from openvima.policies.sources import is_own_code
+from openvima.policies.loading import checked_policy
+from openvima.policies.naming import is_own_code
 from openvima.scene import Action
 from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand
 from openvima.scene.explanation import PLACE_KINDS, Explanation
@@ -257,7 +257,7 @@ def one_thread(batch: Batch) -> Iterator[None]:
     from openvima.policies.base import require_torch
 
     require_torch(f"policy {batch.policy!r}")
-    from openvima.policies.devices import torch_threads
+    from openvima.policies.base import torch_threads
 
     with torch_threads(1):
         yield

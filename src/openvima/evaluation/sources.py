@@ -12,8 +12,7 @@ from urllib.parse import urlsplit
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
 from openvima.input_files import expand_home, open_regular
 from openvima.policies.base import Policy
-from openvima.policies.bundled import BUNDLED
-from openvima.policies.own_code import (
+from openvima.policies.loading import (
     LearnerCode,
     held_out_data,
     learner_code,
@@ -21,14 +20,15 @@ from openvima.policies.own_code import (
     policy_of_code,
     tasks_left_out,
 )
-from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
-from openvima.policies.sources import (
+from openvima.policies.naming import (
+    BUNDLED,
     find_checkpoint,
     hub_commit,
     is_own_code,
     is_policy_source,
     unknown_policy,
 )
+from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
 from openvima.serving.client import describe
 from openvima.serving.lerobot import SERVER_MODULE, is_lerobot, lerobot_name
 from openvima.serving.protocol import DEFAULT_MODALITIES, check_address, is_remote

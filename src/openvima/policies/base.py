@@ -2,14 +2,19 @@
 
 import hashlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import torch
 
-from openvima.errors import PolicyError
-from openvima.imports import import_extra, require_address_space
+from openvima.errors import PolicyError, PromptError
+from openvima.imports import import_extra
+from openvima.imports import require_address_space
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
+from openvima.scene.prompt import PLACEHOLDER
 
 # Least that torch and the libraries loaded after it map, in 2**20 bytes; measured with torch 2.13 on the CPU.
 TORCH_MB = 800
@@ -112,3 +117,68 @@ def prompt_hash(prompt: RenderedPrompt) -> int:
 def _random_action(rng: np.random.Generator) -> dict[str, np.ndarray]:
     (x0, y0), (x1, y1) = rng.uniform(WORKSPACE_LOW, WORKSPACE_HIGH, size=(2, 2)).tolist()
     return Action.planar((x0, y0), (x1, y1), float(rng.uniform(-np.pi, np.pi))).to_arrays()
+
+
+@dataclass(frozen=True, slots=True)
+class PromptLimits:
+    """The largest prompt of a policy; a policy may state its own as `prompt_limits`.
+
+    The prompts of the benchmark have up to 280 characters, 8 images and 20 objects.
+
+    Args:
+        chars: Characters of the text.
+        images: Placeholders of the text, and images.
+        objects: Objects of all images, hidden ones included.
+    """
+
+    chars: int = 4096
+    images: int = 64
+    objects: int = 256
+
+    def check(self, prompt: RenderedPrompt) -> None:
+        """Check a prompt.
+
+        Raises:
+            PromptError: It holds more than allowed; the message names the number.
+        """
+        found = {"chars": len(prompt.text), "images": 0, "objects": 0}
+        if found["chars"] <= self.chars:
+            found["images"] = max(len(prompt.images), len(PLACEHOLDER.findall(prompt.text)))
+            found["objects"] = sum(len(image.objects) for image in prompt.images.values())
+        for name, number in found.items():
+            if number > (allowed := getattr(self, name)):
+                what = "characters" if name == "chars" else name
+                raise PromptError(f"the prompt has {number:,} {what}; this policy takes {allowed:,}.")
+
+
+def usable_device(device: torch.device | str) -> torch.device:
+    """Return a device after checking that it works.
+
+    For a GPU, cuDNN's attention is turned off in this process: it plans anew for each shape, and those of
+    prompts and histories vary (`results/2026-11-26_gpu.md`).
+
+    Raises:
+        PolicyError: The device is not available.
+    """
+    try:
+        found = torch.device(device)
+        torch.zeros(1, device=found).item()  # raises on "meta", too, whose tensors have no values
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise PolicyError(
+            f"device {str(device)!r} cannot be used here; allowed: cpu, and cuda on a machine with a GPU for "
+            "which torch is installed."
+        ) from error
+    if found.type == "cuda":
+        torch.backends.cuda.enable_cudnn_sdp(False)
+    return found
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Set the number of threads; it changes the summation order, and so the last bits of results."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -9,11 +9,12 @@ observation.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from openvima.perception.kernels import CROP_SIZE
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.tensor_record import TensorRecord
 
@@ -189,3 +190,19 @@ def _empty_stack(count: int, shape: tuple[int, ...]) -> np.ndarray:
     """
     step = 1 << max(0, int(count).bit_length() - 3)
     return np.empty((-(-count // step) * step, *shape), np.uint8)[:count]
+
+
+@dataclass(frozen=True, slots=True)
+class InputLayout:
+    """How images are tokenized.
+
+    Args:
+        tokens: What a token encodes: an object in both views, an object in one view, or part of a frame.
+        image_size: Height and width of a crop or frame.
+        tokens_per_image: Number of tokens of both views of a prompt image or observation; 0 if it depends on
+            their objects.
+    """
+
+    tokens: Literal["objects", "views", "frames"]
+    image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
+    tokens_per_image: int = 0

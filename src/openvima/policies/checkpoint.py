@@ -20,13 +20,11 @@ from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.input_files import as_path, read_yaml
 from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig, config_from_dict, config_to_dict
-from openvima.policies.differences import described, listed
-from openvima.policies.file_names import CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE
+from openvima.policies.naming import CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE, find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.policies.published.checkpoint import load_published
-from openvima.policies.sources import find_checkpoint
+from openvima.policies.published import load_published
 from openvima.policies.t5 import T5Tokenizer, tokenizer_for
-from openvima.policies.tensor_files import file_digest, read_safetensors, write_safetensors
+from openvima.policies.tensor_files import described, file_digest, listed, read_safetensors, write_safetensors
 from openvima.policies.tokenizer import Tokenizer, WordTokenizer
 
 _KIND = "network"

@@ -10,9 +10,9 @@ from openvima.perception.objects import ObjectViews
 from openvima.perception.preprocessing import extract_observation
 from openvima.policies.batch import WORD, PromptBatch
 from openvima.policies.nn.actions import ACTION_PARTS
-from openvima.policies.nn.step_trace import StepTrace
-from openvima.policies.pointer.coreference import coreference
-from openvima.policies.pointer.geometry import bin_to_yaw
+from openvima.policies.nn.policy_network import StepTrace
+from openvima.policies.pointer.inputs import bin_to_yaw
+from openvima.policies.pointer.words import coreference
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
 from openvima.scene import RenderedPrompt

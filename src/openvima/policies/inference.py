@@ -13,12 +13,10 @@ import torch
 from openvima.errors import PolicyError
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectExtractor
-from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash
+from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash, usable_device
 from openvima.policies.batch import HistoryBatch
 from openvima.policies.checkpoint import load_network, save_checkpoint
-from openvima.policies.devices import usable_device
-from openvima.policies.episodes import Episodes
-from openvima.policies.joint_inference import JointAct, JointCall, JointReset
+from openvima.policies.episodes import Episodes, JointAct, JointCall, JointReset
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
 from openvima.policies.nn.decoder import MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork

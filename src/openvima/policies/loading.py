@@ -1,15 +1,188 @@
-"""Loading policies by name, from a folder or from the Hugging Face Hub."""
+"""Policies of users' code: a function that makes one, and run folders of learners of their own."""
 
+import hashlib
+import inspect
+import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from openvima.errors import ConfigError, PolicyError, UnknownPolicyError
+from openvima.errors import ConfigError, OpenVimaError, PolicyError, UnknownPolicyError, echo
+from openvima.input_files import read_yaml
 from openvima.input_files import as_text
 from openvima.policies.base import Policy, RandomPolicy, require_torch
-from openvima.policies.own_code import learner_code, policy_of_code, policy_of_run
+from openvima.policies.naming import (
+    CHECKPOINTS_FOLDER,
+    CONFIG_FILE,
+    checkpoint_folder,
+    is_own_code,
+    is_policy_source,
+    unknown_policy,
+)
 from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
-from openvima.policies.sources import is_own_code, is_policy_source, unknown_policy
+from openvima.user_code import call_function, is_code
+
+_METHODS = {"reset": "prompts", "act": "observations"}
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerCode:
+    """The code of a run folder's learner.
+
+    Args:
+        source: MODULE:FUNCTION or FILE.py:FUNCTION.
+        file: The config that names it.
+    """
+
+    source: str
+    file: Path
+
+    def check(self, *, trusted: bool) -> None:
+        """Refuse code that a file names, unless it is trusted.
+
+        Raises:
+            ConfigError: It is not.
+        """
+        if not trusted:
+            raise ConfigError(
+                f"{self.file} names code to run: {self.source}. Nothing was executed. If you trust the run "
+                "folder, add --trust-code (trust_code=True in Python)."
+            )
+
+
+def learner_code(folder: str | Path) -> LearnerCode | None:
+    """Return the code that a run folder, or one of its checkpoints, names as its learner; None without any.
+
+    Nothing is executed.
+    """
+    file, preset = _run_setting(folder, "preset")
+    return LearnerCode(preset, file) if isinstance(preset, str) and is_code(preset) else None
+
+
+def tasks_left_out(folder: str | Path) -> list[str]:
+    """Return the tasks that the training of a run folder, or of one of its checkpoints, excluded."""
+    _, loader = _run_setting(folder, "loader")
+    tasks = loader.get("exclude_tasks") if isinstance(loader, dict) else None
+    return tasks.split(",") if isinstance(tasks, str) and tasks else []
+
+
+def held_out_data(folder: str | Path) -> list[str]:
+    """Return the tasks and levels held out for evaluation on which a run folder was trained all the same."""
+    _, found = _run_setting(folder, "held_out", section="demonstrations")
+    return [echo(name) for name in found if isinstance(name, str)] if isinstance(found, list) else []
+
+
+def _run_setting(
+    folder: str | Path, name: str, *, section: str = "training"
+) -> tuple[Path, Any]:  # Any: YAML
+    """Return a setting of the run that a folder belongs to, None without any, and the file that holds it."""
+    path = Path(folder)
+    run = path.absolute().parent
+    for place in (path, run.parent) if run.name == CHECKPOINTS_FOLDER else (path,):
+        file = place / CONFIG_FILE
+        try:
+            return file, read_yaml(file)[section][name]
+        except (OSError, OpenVimaError, KeyError, TypeError):
+            continue
+    return path, None
+
+
+def policy_of_code(source: str) -> Policy:
+    """Call a function that makes a policy.
+
+    Args:
+        source: MODULE:FUNCTION or FILE.py:FUNCTION; the function needs no arguments.
+
+    Raises:
+        ConfigError: There is no such function, or it raises.
+        PolicyError: It returns something else than a policy.
+    """
+    return checked_policy(call_function(source, what="policy"), f"{source} returned")
+
+
+def policy_of_run(folder: str | Path, code: LearnerCode, *, device: str = "cpu") -> Policy:
+    """Load the learner of a run folder with its best weights, and return its policy.
+
+    Args:
+        folder: The run folder or one of its checkpoints.
+        code: The function that makes the learner; it is executed.
+        device: Where the learner computes.
+
+    Raises:
+        ConfigError: There is no such function, it raises, or the learner has no policy.
+        CheckpointError: The weights are damaged or do not fit.
+        PolicyError: `Learner.policy` returns something else than a policy.
+    """
+    require_torch(f"the policy in {folder}")
+    from openvima.policies.base import usable_device
+
+    learner = call_function(code.source, what=f"preset in {code.file}")
+    learner.read(checkpoint_folder(Path(folder)))
+    learner.to(usable_device(device)).eval()
+    return checked_policy(learner.policy(), f"policy() of {type(learner).__name__} returned")
+
+
+def checked_policy(policy: Any, what: str) -> Policy:  # Any: third parties need no base class
+    """Return an object if it has the methods of a policy.
+
+    Args:
+        policy: The object.
+        what: Begins the error, as in "my_policy.py:make returned".
+
+    Raises:
+        PolicyError: A method is missing, or takes other arguments.
+    """
+    form = "a policy has the methods reset(prompts) and act(observations), see docs/your_own_policy.md"
+    if isinstance(policy, type):
+        name = policy.__name__
+        raise PolicyError(f"{what} the class {name}, not an object of it; return {name}().")
+    missing = [name for name in _METHODS if not callable(getattr(policy, name, None))]
+    if missing:
+        raise PolicyError(f"{what} a {type(policy).__name__} without {' and '.join(missing)}; {form}.")
+    for name, argument in _METHODS.items():
+        try:
+            inspect.signature(getattr(policy, name)).bind(None)
+        except TypeError:
+            kind, call = type(policy).__name__, f"{name}({argument})"
+            raise PolicyError(f"{what} a {kind} whose {name} cannot be called as {call}; {form}.") from None
+        except ValueError:  # compiled code may have no signature
+            pass
+    return policy
+
+
+def parameters_hash(policy: Any) -> str | None:  # Any: see `checked_policy`
+    """SHA-256 of the weights of a policy object, as hexadecimal text; None if it offers none.
+
+    A policy offers weights by `weights_hash`, a text or a method that returns one, or by being or having as
+    attributes torch modules, whose parameters and buffers are hashed with their names.
+
+    Raises:
+        PolicyError: `weights_hash` is or returns no text.
+    """
+    own = getattr(policy, "weights_hash", None)
+    if own is not None:
+        own = own() if callable(own) else own
+        if not isinstance(own, str):
+            raise PolicyError(
+                f"weights_hash of {type(policy).__name__} is a {type(own).__name__}; give a text."
+            )
+        return own
+    torch = sys.modules.get("torch")
+    if torch is None:  # then no policy can have a module of it
+        return None
+    held: Mapping[str, Any] = {"": policy, **getattr(policy, "__dict__", {})}  # Any: attributes
+    modules = {name: value for name, value in sorted(held.items()) if isinstance(value, torch.nn.Module)}
+    if "" in modules:
+        modules = {"": policy}
+    digest = hashlib.sha256()
+    for name, module in modules.items():
+        for key, tensor in module.state_dict().items():
+            if isinstance(tensor, torch.Tensor):
+                digest.update(f"{name}.{key} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+                flat = tensor.detach().cpu().contiguous().reshape(-1)
+                digest.update(flat.view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest() if modules else None
 
 
 def load_policy(

@@ -17,20 +17,20 @@ UNTRAINED = "untrained"  # the policy with fresh weights of nano; with ":PRESET"
 
 
 def _config(module: str, function: str) -> "PolicyConfig":
-    return getattr(import_module(f"openvima.policies.{module}.config"), function)()
+    return getattr(import_module(f"openvima.policies.{module}"), function)()
 
 
 def _sized(architecture: str, size_name: str) -> "PolicyConfig":
+    from openvima.policies import architectures
     from openvima.policies.sizes import size
 
-    module = import_module(f"openvima.policies.{architecture}.config")
-    return getattr(module, architecture)(size(size_name))
+    return getattr(architectures, architecture)(size(size_name))
 
 
 PRESETS: dict[str, Callable[[], "PolicyConfig"]] = {
-    "nano": partial(_config, "pointer", "nano"),
-    "nano-bins": partial(_config, "vima", "nano_bins"),
-    "small": partial(_config, "pointer", "small"),
+    "nano": partial(_config, "pointer.config", "nano"),
+    "nano-bins": partial(_config, "architectures", "nano_bins"),
+    "small": partial(_config, "pointer.config", "small"),
     **{f"{name}-{size}": partial(_sized, name, size) for name in PUBLISHED for size in SIZE_NAMES},
 }
 

@@ -28,8 +28,8 @@ from openvima.perception.preprocessing import (
     preprocess_prompt,
     split_prompt,
 )
-from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
-from openvima.policies.input_layout import InputLayout
+from openvima.policies.base import PromptLimits
+from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, InputLayout, PromptBatch
 from openvima.policies.kernels import (
     find_slots,
     int64,
@@ -40,7 +40,6 @@ from openvima.policies.kernels import (
 )
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
-from openvima.policies.prompt_limits import PromptLimits
 from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import CAMERAS, VIEWS
 from openvima.scene import RenderedPrompt

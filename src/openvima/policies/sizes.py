@@ -4,10 +4,8 @@ from dataclasses import dataclass, replace
 
 from openvima.errors import UnknownPolicyError, unknown_name
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.nn.resampler import ResamplerConfig
-from openvima.policies.nn.text_encoder import TextEncoderConfig
-from openvima.policies.nn.vit import VitConfig
+from openvima.policies.nn.image_encoders import ResamplerConfig, VitConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
 
 T5_VOCABULARY_SIZE = 32128
 VOCABULARY_SIZE = 768  # padding, end, 361 numbers, the 160 words of the benchmark, and a reserve

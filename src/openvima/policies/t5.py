@@ -25,7 +25,7 @@ from openvima.imports import import_extra
 from openvima.input_files import as_path, open_regular
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
+from openvima.policies.published_names import PROMPT_RULES, T5, to_theirs
 from openvima.policies.sizes import T5_SIZES, t5_name
 from openvima.policies.tensor_files import check_finite, read_archive, read_safetensors
 from openvima.policies.tokenizer import END_ID, PADDING_ID, UNKNOWN, Tokenizer, Vocabulary, WordTokenizer

@@ -17,10 +17,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from openvima.atomic_io import FREE_SPACE
-from openvima.errors import CheckpointError, InputFileError, StorageError
+from openvima.errors import CheckpointError, InputFileError, StorageError, echo
 from openvima.input_files import open_regular
 from openvima.pickle_opcodes import OPCODES, check_opcodes
-from openvima.policies.differences import listed
 
 _MAX_HEADER_BYTES = 8 * 2**20  # names and shapes of about 80,000 tensors; VIMA-200M has 700
 _MAX_PICKLE_BYTES = 4 * 2**20  # of an archive, without the tensors; that of VIMA-200M has 0.1 MB
@@ -225,3 +224,17 @@ def _check_sizes(values: Any, num_bytes: int) -> None:  # Any: whatever the file
 def _reason(error: Exception) -> str:
     """One line about an error."""
     return " ".join(str(error).split())[:_MAX_REASON].rstrip(".") or type(error).__name__
+
+
+def listed(what: str, names: Sequence[str], *, limit: int) -> list[str]:
+    """Return ["what: first, second and 3 more"], or an empty list without names."""
+    if not names:
+        return []
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return [f"{what}: {', '.join(map(echo, names[:limit]))}{more}"]
+
+
+def described(dtype: torch.dtype, shape: Sequence[int] | None = None) -> str:
+    """Format a dtype, and a shape if given, such as "float32 (768, 4)"."""
+    name = str(dtype).removeprefix("torch.")
+    return name if shape is None else f"{name} {tuple(shape)}"

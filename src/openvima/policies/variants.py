@@ -5,18 +5,14 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
-from openvima.policies.config import PolicyConfig
-from openvima.policies.limits import check_limits
-from openvima.policies.midas.config import MidasConfig
-from openvima.policies.nn.autoregressive import AutoregressiveConfig
-from openvima.policies.nn.conv_encoder import ConvConfig
+from openvima.policies.architectures import MidasConfig, VimaConfig
+from openvima.policies.config import PolicyConfig, check_limits
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
-from openvima.policies.nn.heads import HEADS
+from openvima.policies.nn.heads import HEADS, AutoregressiveConfig
+from openvima.policies.nn.image_encoders import ConvConfig, VitConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
-from openvima.policies.nn.vit import VitConfig
 from openvima.policies.pointer.config import AttributeConfig, CandidateHeadConfig, PointerConfig
 from openvima.policies.sizes import T5_SIZES, size, t5_prompt_encoder
-from openvima.policies.vima.config import VimaConfig
 
 CONDITIONINGS = ("cross-attention", "prefix")
 TEXT_ENCODERS = ("small", *T5_SIZES)

@@ -14,8 +14,13 @@ from openvima.evaluation.verification import is_marked_verified
 from openvima.hub import HubName, commit
 from openvima.input_files import as_path, read_text, read_yaml
 from openvima.policies.base import require_torch
-from openvima.policies.file_names import CHECKPOINTS_FOLDER, CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE
-from openvima.policies.sources import find_checkpoint
+from openvima.policies.naming import (
+    CHECKPOINTS_FOLDER,
+    CONFIG_FILE,
+    TOKENIZER_FOLDER,
+    WEIGHTS_FILE,
+    find_checkpoint,
+)
 from openvima.publishing.card import (
     CARD_NAME,
     TAGS,
@@ -182,9 +187,9 @@ def _model_index(name: HubName, scores: Results) -> dict[str, Any]:  # Any: plai
 
 
 def _network(folder: Path) -> str:
+    from openvima.policies.build import policy_size
     from openvima.policies.checkpoint import read_info
-    from openvima.policies.differences import described
-    from openvima.policies.parameter_counts import policy_size
+    from openvima.policies.tensor_files import described
 
     info = read_info(folder)
     size = policy_size(info.config)

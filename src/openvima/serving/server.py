@@ -24,8 +24,8 @@ import numpy as np
 from openvima import __version__
 from openvima.errors import ConfigError, MessageError, OpenVimaError, echo, unknown_name
 from openvima.policies.base import Policy
-from openvima.policies.own_code import checked_policy
-from openvima.policies.prompt_limits import PromptLimits
+from openvima.policies.loading import checked_policy
+from openvima.policies.base import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.scene.command import PRIMITIVES
 from openvima.serving.protocol import (
@@ -319,7 +319,7 @@ def _refusal(error: OpenVimaError) -> str:
 
 
 if TYPE_CHECKING:
-    from openvima.policies.joint_inference import JointCall
+    from openvima.policies.episodes import JointCall
 
 # Of waiting for the other clients, which are those that asked within the last second. A client that was just
 # answered needs a few ms for its next request, and a batch of 16 takes ten times the window.

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError
 from openvima.evaluation.sources import policy_sources
-from openvima.policies.bundled import SMALL
+from openvima.policies.naming import SMALL
 from openvima.report.rate_curves import RateCurve
 from openvima.studies.scales import Scale
 

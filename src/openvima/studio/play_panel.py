@@ -11,7 +11,7 @@ from openvima.catalog.partitions import LEVELS
 from openvima.data.user_demonstrations import check_recordable, record_demonstration
 from openvima.errors import DatasetError
 from openvima.evaluation.session import EpisodeSession, first_difference
-from openvima.policies.bundled import BUNDLED, SMALL
+from openvima.policies.naming import BUNDLED, SMALL
 from openvima.render.rasteriser import Rasteriser, front_above_top
 from openvima.render.raycast import TABLE, Hit
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, Pose

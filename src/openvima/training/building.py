@@ -10,12 +10,12 @@ from openvima.errors import ConfigError, differences
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
 from openvima.policies.config import PolicyConfig, appearance_width, config_to_dict
+from openvima.policies.naming import find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
 from openvima.policies.sizes import t5_name
-from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
 from openvima.policies.variants import image_tokens, with_variant

@@ -18,8 +18,8 @@ from openvima.policies.base import Policy
 from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.config import config_to_dict
-from openvima.policies.file_names import TOKENIZER_FOLDER, WEIGHTS_FILE
-from openvima.policies.nn.linear import rounded_rows
+from openvima.policies.naming import TOKENIZER_FOLDER, WEIGHTS_FILE
+from openvima.policies.nn.layers import rounded_rows
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tensor_files import read_safetensors, write_safetensors

@@ -16,7 +16,7 @@ import torch.distributed as dist
 from torch import nn
 
 from openvima.errors import ConfigError, PolicyError
-from openvima.policies.devices import usable_device
+from openvima.policies.base import usable_device
 
 Sharding = Literal["ddp", "fsdp"]
 FORWARD_METHODS = ("keys_values",)  # methods of layers that are called besides `forward`

@@ -17,8 +17,8 @@ from openvima.data.object_cache.random_appearance import check_scenes
 from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
-from openvima.policies.devices import torch_threads
-from openvima.policies.own_code import held_out_data
+from openvima.policies.base import torch_threads
+from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops

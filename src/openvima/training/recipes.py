@@ -9,7 +9,7 @@ from typing import Any
 
 from openvima.errors import ConfigError, InputFileError, unknown_name
 from openvima.input_files import read_yaml
-from openvima.policies.file_names import CONFIG_FILE
+from openvima.policies.naming import CONFIG_FILE
 from openvima.training.config import TrainingConfig
 from openvima.training.validation import converted, flattened, setting_types
 

@@ -34,7 +34,7 @@ from openvima.atomic_io import (
 )
 from openvima.errors import CheckpointError, ConfigError, InputFileError, differences
 from openvima.input_files import read_json, read_yaml
-from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_order
+from openvima.policies.naming import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_order
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.learner import Learner
 from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER

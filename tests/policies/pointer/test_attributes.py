@@ -11,14 +11,13 @@ from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.build import build_network, policy_size  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.history import shift_actions  # noqa: E402
-from openvima.policies.parameter_counts import policy_size  # noqa: E402
-from openvima.policies.pointer.attributes import Attributes  # noqa: E402
+from openvima.policies.nn.action_head import shift_actions  # noqa: E402
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402
 from openvima.policies.pointer.inputs import HeadInputs  # noqa: E402
 from openvima.policies.pointer.model import Pointer  # noqa: E402
+from openvima.policies.pointer.words import Attributes  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
 from openvima.policies.variants import with_attributes  # noqa: E402

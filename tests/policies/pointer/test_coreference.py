@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies.batch import PromptBatch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.pointer.coreference import coreference  # noqa: E402
+from openvima.policies.pointer.words import coreference  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 

@@ -16,8 +16,8 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.action_head import shift_actions  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH  # noqa: E402
-from openvima.policies.nn.history import shift_actions  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402

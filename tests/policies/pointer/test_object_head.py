@@ -10,8 +10,7 @@ torch = pytest.importorskip("torch")
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets  # noqa: E402
 from openvima.policies.pointer.config import ObjectHeadConfig  # noqa: E402
-from openvima.policies.pointer.geometry import carried_to, relative_yaw, yaw_to_bin  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs, at  # noqa: E402
+from openvima.policies.pointer.inputs import HeadInputs, at, carried_to, relative_yaw, yaw_to_bin  # noqa: E402  # noqa: E402
 from openvima.policies.pointer.object_head import ObjectPointerHead  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 from pointer_inputs import object_set, pointer_prompt  # noqa: E402

@@ -18,10 +18,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.errors import ConfigError, PolicyError
-from openvima.policies.nn.linear import Linear
-from openvima.policies.nn.mlp import normal_weights
+from openvima.policies.nn.layers import Linear, Unpadder, normal_weights
 from openvima.policies.nn.tensor_record import TensorRecord
-from openvima.policies.nn.unpad import Unpadder
 
 MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history together
 MAX_PROMPT_POSITIONS = 256

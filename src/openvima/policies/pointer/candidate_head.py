@@ -13,8 +13,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
-from openvima.policies.nn.mlp import mlp
-from openvima.policies.nn.step_trace import Replay, StepTrace, normalized
+from openvima.policies.nn.layers import mlp
+from openvima.policies.nn.policy_network import Replay, StepTrace, normalized
 from openvima.policies.pointer.candidates import (
     NUM_GEOMETRY,
     GridCandidates,
@@ -24,11 +24,15 @@ from openvima.policies.pointer.candidates import (
     proximity,
 )
 from openvima.policies.pointer.config import AttributeConfig, CandidateHeadConfig
-from openvima.policies.pointer.geometry import (
+from openvima.policies.pointer.inputs import (
     OFFSET_UNIT_M,
+    HeadInputs,
+    PointerPrompt,
     accuracy,
+    at,
     bin_to_yaw,
     carried_to,
+    mask_scores,
     offset_loss,
     pick_and_place,
     pointing_metrics,
@@ -36,9 +40,8 @@ from openvima.policies.pointer.geometry import (
     rotated,
     yaw_to_bin,
 )
-from openvima.policies.pointer.grounding import TextGrounding, attention_scores
-from openvima.policies.pointer.inputs import HeadInputs, PointerPrompt, at, mask_scores
 from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
+from openvima.policies.pointer.words import TextGrounding, attention_scores
 from openvima.scene.explanation import PLACE_KINDS
 
 _ON_TOP_M = 0.04  # scale within which an object is in or on another one

@@ -11,8 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.nn.actions import ActionTargets
-from openvima.policies.pointer.geometry import OFFSET_UNIT_M
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at
+from openvima.policies.pointer.inputs import OFFSET_UNIT_M, HeadInputs, ObjectSet, at
 from openvima.scene.explanation import PLACE_KINDS
 
 NUM_GEOMETRY = 6

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from openvima.errors import ConfigError
-from openvima.policies.input_layout import InputLayout
-from openvima.policies.nn.conv_encoder import ConvConfig
+from openvima.policies.batch import InputLayout
 from openvima.policies.nn.decoder import AnyDecoderConfig, DecoderConfig
+from openvima.policies.nn.image_encoders import ConvConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.nn.text_encoder import TextEncoderConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
 from openvima.policies.sizes import VOCABULARY_SIZE, size
 
 ATTRIBUTES = ("texture", "colour", "shape", "profile", "height", "size")

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.nn.mlp import mlp, scale_last
+from openvima.policies.nn.layers import mlp, scale_last
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
 from openvima.policies.nn.tensor_record import TensorRecord, map_tensors
 from openvima.policies.pointer.config import CorrespondenceConfig

@@ -13,19 +13,20 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
-from openvima.policies.nn.action_encoder import ActionEncoder
-from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, to_unit_range
+from openvima.policies.nn.action_head import (
+    ObservationTokens,
+    action_segment,
+    decode_observations,
+    shift_actions,
+)
+from openvima.policies.nn.actions import ActionEncoder, ActionTargets, DecodingStrategy, greedy, to_unit_range
 from openvima.policies.nn.decoder import KVCache, TokenSegment, build_decoder
-from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations, shift_actions
 from openvima.policies.nn.object_encoder import ObjectEncoder
-from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
+from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork, StepTrace
 from openvima.policies.nn.prompt_encoder import PromptEncoder
-from openvima.policies.nn.step_trace import StepTrace
 from openvima.policies.nn.tensor_record import TensorRecord, join_rows
-from openvima.policies.pointer.attributes import Attributes
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
-from openvima.policies.pointer.coreference import Coreference, coreference
 from openvima.policies.pointer.correspondence import (
     Correspondence,
     ObjectFeatures,
@@ -36,6 +37,7 @@ from openvima.policies.pointer.correspondence import (
 )
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt
 from openvima.policies.pointer.object_head import ObjectPointerHead
+from openvima.policies.pointer.words import Attributes, Coreference, coreference
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.scene import END_EFFECTORS
 

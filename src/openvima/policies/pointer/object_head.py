@@ -10,20 +10,22 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
-from openvima.policies.nn.mlp import mlp
-from openvima.policies.nn.step_trace import Replay, StepTrace, normalized
+from openvima.policies.nn.layers import mlp
+from openvima.policies.nn.policy_network import Replay, StepTrace, normalized
 from openvima.policies.pointer.config import ObjectHeadConfig
-from openvima.policies.pointer.geometry import (
+from openvima.policies.pointer.inputs import (
     OFFSET_UNIT_M,
+    HeadInputs,
+    at,
     bin_to_yaw,
     carried_to,
+    mask_scores,
     offset_loss,
     pick_and_place,
     pointing_metrics,
     relative_yaw,
     yaw_to_bin,
 )
-from openvima.policies.pointer.inputs import HeadInputs, at, mask_scores
 
 _SAME_OBJECT = 0.3  # similarity of appearance from which on two images may show the same object
 _SIMILARITY_SCALE = 0.1  # a difference of similarities that is hardly significant

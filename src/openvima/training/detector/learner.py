@@ -11,7 +11,7 @@ import torch
 from openvima.detector.checkpoint import load_weights, write_network
 from openvima.detector.frames import Frame
 from openvima.detector.network import Instances, MaskRCNN
-from openvima.policies.file_names import WEIGHTS_FILE
+from openvima.policies.naming import WEIGHTS_FILE
 from openvima.training.learner import Learner
 
 

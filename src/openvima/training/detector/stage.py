@@ -15,7 +15,7 @@ from openvima.detector.detectron2 import load_detectron2
 from openvima.detector.frames import Frame, FrameSampler, held_out_frames
 from openvima.detector.network import MaskRCNN
 from openvima.errors import ConfigError, DatasetError
-from openvima.policies.devices import torch_threads
+from openvima.policies.base import torch_threads
 from openvima.training.detector.config import DetectorTrainingConfig
 from openvima.training.detector.learner import DetectorLearner, FrameBatch
 from openvima.training.detector.split import split_episodes

@@ -11,8 +11,8 @@ import torch
 from torch.nn import functional as F
 
 from openvima.policies.nn.object_encoder import ObjectEncoder
-from openvima.policies.pointer.attributes import Attributes
 from openvima.policies.pointer.config import ATTRIBUTES
+from openvima.policies.pointer.words import Attributes
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.training.pretraining.attribute_labels import AttributeLabels
 from openvima.training.pretraining.captions import Captions

@@ -4,7 +4,7 @@ import torch
 from torch.nn import functional as F
 
 from openvima.policies.nn.object_encoder import ObjectEncoder
-from openvima.policies.pointer.attributes import Attributes
+from openvima.policies.pointer.words import Attributes
 from openvima.training.augmentation.channel_mixing import channel_mixing
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.attribute_loss import attribute_loss

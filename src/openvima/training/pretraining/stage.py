@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.policies.pointer.attributes import Attributes
 from openvima.policies.pointer.model import Pointer
+from openvima.policies.pointer.words import Attributes
 from openvima.training.augmentation.box_jitter import with_box_jitter
 from openvima.training.augmentation.horizontal_flip import with_horizontal_flips
 from openvima.training.augmentation.occlusion import with_occlusion

@@ -1,23 +1,96 @@
-"""Where checkpoints come from: local folders and files, bundled checkpoints, the Hugging Face Hub."""
+"""File names in checkpoint folders and run folders."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.atomic_io import restore_folder
-from openvima.errors import CheckpointError, unknown_name
+from openvima.errors import CheckpointError, PolicyError, unknown_name
 from openvima.hub import HubName, fetch, hub_name
-from openvima.input_files import as_path, read_text
-from openvima.policies.bundled import BUNDLED, bundled_folder
-from openvima.policies.file_names import (
-    BEST_FILE,
-    CHECKPOINTS_FOLDER,
-    CONFIG_FILE,
-    TOKENIZER_FOLDER,
-    WEIGHTS_FILE,
-    checkpoint_order,
-)
+from openvima.input_files import read_text
+from openvima.input_files import as_path
 from openvima.policies.presets import PRESETS, PUBLISHED, UNTRAINED, is_untrained
 from openvima.user_code import is_code
+
+WEIGHTS_FILE = "model.safetensors"
+CONFIG_FILE = "config.yaml"
+TOKENIZER_FOLDER = "tokenizer"
+CHECKPOINTS_FOLDER = "checkpoints"
+BEST_FILE = "best.txt"  # in the checkpoints folder; contains the name of the best one
+
+
+def checkpoint_order(checkpoint: Path) -> tuple[str, int]:
+    """Return a sort key of checkpoints: stage, then step, which may have more digits than the name pads."""
+    stage, _, step = checkpoint.name.rpartition("-")
+    return stage, int(step) if step.isdigit() else -1
+
+
+SMALL = "openvima-small"
+VIMA = "openvima-vima"
+MODEL_CARD = "MODEL_CARD.md"
+
+_TRAINED = Path(__file__).parent / "trained"
+
+
+@dataclass(frozen=True, slots=True)
+class BundledPolicy:
+    """A bundled checkpoint.
+
+    Args:
+        folder: The checkpoint folder, with the model card beside the weights.
+        trained_on: Training data, in one line.
+    """
+
+    folder: Path
+    trained_on: str
+
+    @property
+    def model_card(self) -> Path:
+        """Model card: data, training, scores, weak tasks and limitations."""
+        return self.folder / MODEL_CARD
+
+    @property
+    def weights(self) -> Path:
+        """Weights file; an installation may lack it."""
+        return self.folder / WEIGHTS_FILE
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether this installation has weights and config."""
+        return self.weights.is_file() and (self.folder / CONFIG_FILE).is_file()
+
+
+BUNDLED: dict[str, BundledPolicy] = {
+    SMALL: BundledPolicy(_TRAINED / SMALL, "demonstrations of the 13 training tasks, training partition"),
+    VIMA: BundledPolicy(_TRAINED / VIMA, "demonstrations of the 13 training tasks, 30% rendered again"),
+}
+
+
+def bundled_folder(name: str) -> Path:
+    """Return the folder of a bundled checkpoint.
+
+    Args:
+        name: One of `BUNDLED`.
+
+    Raises:
+        PolicyError: A local folder has that name and holds a checkpoint, too.
+        CheckpointError: This installation lacks its weights.
+    """
+    # A folder without a checkpoint may have the name, as after
+    # `evaluate --policy openvima-small --out openvima-small`.
+    if any((Path(name) / part).exists() for part in (WEIGHTS_FILE, CHECKPOINTS_FOLDER)):
+        raise PolicyError(
+            f"{name!r} is a bundled checkpoint, and also a local folder with a checkpoint; write ./{name} "
+            "for the folder, or run in another directory for the bundled one."
+        )
+    policy = BUNDLED[name]
+    if not policy.is_installed:
+        raise CheckpointError(
+            f"this installation lacks the weights of {name!r}, which belong into {policy.folder}; "
+            "reinstall openvima, or give a run folder."
+        )
+    return policy.folder
+
 
 _HUB_FILES = (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*")
 

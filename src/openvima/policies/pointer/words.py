@@ -16,10 +16,11 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.batch import PromptBatch
-from openvima.policies.nn.mlp import mlp
+from openvima.policies.nn.layers import mlp
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
 from openvima.policies.pointer.correspondence import ObjectFeatures
+from openvima.policies.pointer.inputs import PointerPrompt, mask_scores
 
 _BOX_UNIT_PX = 32.0  # sides of boxes are of this order
 _HIDDEN_SIDE_PX = 24
@@ -148,3 +149,76 @@ class Attributes(nn.Module):
         return replace(
             objects, boxes_VN4=torch.where(is_kept_4, boxes, _HIDDEN_SIDE_PX), appearance_NA=apart_NX
         )
+
+
+class Coreference(nn.Module):
+    """Adds to a word what the images look like that followed the same word before, gated by the word."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.gate = nn.Linear(width, 1)
+
+    def forward(
+        self, tokens_BLW: torch.Tensor, images_BLW: torch.Tensor, weights_BLL: torch.Tensor
+    ) -> torch.Tensor:
+        """Map the input of the text encoder to the same shape; see `PromptEncoder.embed`, `coreference`."""
+        return tokens_BLW + torch.sigmoid(self.gate(tokens_BLW)) * (weights_BLL @ images_BLW)
+
+
+def coreference(prompts: PromptBatch) -> torch.Tensor:
+    """Compute which images each word refers to.
+
+    "This is a wug {image}." lets every later "wug" refer to that image, and "the {image}" every later "the":
+    for which words that is meaningful is learned by the gate.
+
+    Returns:
+        Attention weights from words to positions, (B, L, L): uniform over the single image tokens that follow
+        the same word earlier; zero if there are none.
+    """
+    is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
+    is_word_BL = (prompts.object_index_BL < 0) & prompts.mask_BL
+    next_is_image_BL = F.pad(is_image_BL, (0, 1))[:, 1:]
+    next_but_one_is_image_BL = F.pad(is_image_BL, (0, 2))[:, 2:]
+    is_before_BL = is_word_BL & next_is_image_BL & ~next_but_one_is_image_BL  # of one object alone
+    same_BLL = prompts.word_ids_BL[:, :, None] == prompts.word_ids_BL[:, None]
+    same_BLL = (same_BLL & is_word_BL[:, :, None] & is_before_BL[:, None]).tril(diagonal=-1)
+    weights_BLL = F.pad(same_BLL[:, :, :-1], (1, 0))  # from the earlier word to the image behind it
+    return weights_BLL / weights_BLL.sum(dim=-1, keepdim=True).clamp(min=1)
+
+
+class TextGrounding(nn.Module):
+    """Attends to words that describe appearance by their masked encoding, and returns what they describe.
+
+    "Put the … into the red and blue stripe object." The appearance of a word does not depend on its context,
+    so a texture that was named for objects to pick is known for containers, too. Attention may also go to
+    no word. Among all words of a prompt it would find one without a description early in training, and never
+    learn what the others mean.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width)
+
+    def forward(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
+        """Return the mean appearance of the attended words at each step, (B, T, A)."""
+        if prompt.describes_BL is None:
+            return context_BTD.new_zeros(*context_BTD.shape[:2], prompt.text_appearance_BLA.shape[-1])
+        return self.attention(prompt, context_BTD) @ prompt.text_appearance_BLA
+
+    def attention(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
+        """Return the weights of the words at each step, (B, T, L); the rest of 1 goes to none."""
+        if prompt.describes_BL is None:
+            return context_BTD.new_zeros(*context_BTD.shape[:2], prompt.mask_BL.shape[-1])
+        scores_BTL = attention_scores(
+            self.query(context_BTD), self.key(prompt.masked_BLD), prompt.describes_BL
+        )
+        return torch.softmax(F.pad(scores_BTL, (0, 1)), dim=-1)[
+            ..., :-1
+        ]  # the last score, 0, is that of none
+
+
+def attention_scores(query_BTD: torch.Tensor, key_BLD: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
+    """Scores of scaled dot-product attention to positions of the prompt, (B, T, L)."""
+    scores_BTL = query_BTD @ key_BLD.mT * query_BTD.shape[-1] ** -0.5
+    return mask_scores(scores_BTL, mask_BL[:, None])

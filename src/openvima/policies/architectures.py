@@ -6,25 +6,35 @@ Shape suffixes as in `nn/policy_network.py`; V views, N objects (1 with frames),
 objects and J images in all prompts, I image tokens of all prompts, M latents.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import nn
 
 from openvima.errors import ConfigError
-from openvima.policies.batch import HistoryBatch, PromptBatch
-from openvima.policies.input_layout import InputLayout
-from openvima.policies.nn.autoregressive import AutoregressiveHead
-from openvima.policies.nn.bins import BinsHead
-from openvima.policies.nn.decoder import AnyDecoderConfig, Decoder, build_decoder
-from openvima.policies.nn.heads import HeadConfig, build_action_tokens, build_head
-from openvima.policies.nn.history import ObservationTokens
+from openvima.policies.batch import HistoryBatch, InputLayout, PromptBatch
+from openvima.policies.nn.action_head import BinsConfig, BinsHead, ObservationTokens
+from openvima.policies.nn.decoder import AnyDecoderConfig, Decoder, DecoderConfig, build_decoder
+from openvima.policies.nn.heads import (
+    AutoregressiveConfig,
+    AutoregressiveHead,
+    HeadConfig,
+    build_action_tokens,
+    build_head,
+)
+from openvima.policies.nn.image_encoders import (
+    ConvConfig,
+    Resampler,
+    ResamplerConfig,
+    VisionTransformer,
+    VitConfig,
+    encode_frames,
+)
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoder, ObjectEncoderConfig, check_widths
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig
-from openvima.policies.nn.resampler import Resampler, ResamplerConfig
-from openvima.policies.nn.vit import VisionTransformer, VitConfig, encode_frames
+from openvima.policies.sizes import Size, size
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,3 +185,148 @@ class TokenPolicy(PolicyNetwork):
         mask_JNQ = mask_QS.new_zeros(shape).index_put((image_S, slot_S), mask_QS.T)
         latents_JME = resampler(tokens_JNQE.flatten(1, 2), mask_JNQ.flatten(1))
         return latents_JME[image_S].transpose(0, 1).flatten(0, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class VimaConfig(TokenPolicyConfig):
+    """Sizes of VIMA: objects, and cross-attention to the prompt."""
+
+    architecture: ClassVar[str] = "vima"
+
+
+def vima(of: Size) -> VimaConfig:
+    """Return VIMA in a size."""
+    images = ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width)
+    return VimaConfig(images, of.prompt, of.decoder(), BinsConfig(of.hidden_width, of.action_width))
+
+
+def nano_bins() -> VimaConfig:
+    """As the pointer model `nano`, with the published head: fused views, convolutions, a query token."""
+    crop = ConvConfig(width=32, output_width=128)
+    images = ObjectEncoderConfig(
+        crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
+    )
+    decoder = DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4)
+    return VimaConfig(
+        images, size("nano").prompt, decoder, BinsConfig(256, action_width=64), query_token=True
+    )
+
+
+class Vima(TokenPolicy):
+    """One token for each object in each view.
+
+    "Put the {a} into the {b}." with one object in each image, two objects on the table:
+
+        prompt   [put, the, A front, A top, into, the, B front, B top, ., end]
+        history  [front 1, front 2, top 1, top 2, action, front 1, front 2, top 1, top 2, …]
+                                             |                                       |
+                                        1st action                              2nd action
+
+    With `images.fuse_views` both views of an object are one token; with `query_token` the action is decoded
+    from a learned token behind the objects instead of the last object token.
+
+    Source: VIMA (Jiang et al. 2023), section 4.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class GatoConfig(TokenPolicyConfig):
+    """Sizes of VIMA-Gato: the patches of frames, and the prompt as prefix."""
+
+    architecture: ClassVar[str] = "gato"
+
+
+def gato(of: Size) -> GatoConfig:
+    """Return VIMA-Gato in a size."""
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return GatoConfig(of.frame_encoder(class_token=False), of.prompt, of.prefix_decoder(), head)
+
+
+class Gato(TokenPolicy):
+    """Patches of both views in one causal sequence.
+
+        [put, the, 16 patches, into, the, 16 patches, ., end, separator, 16 patches, action, 16 patches, …]
+                                                                                  |
+                                                                             1st action
+
+    Source: VIMA (Jiang et al. 2023), baselines; after Gato (Reed et al. 2022).
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class FlamingoConfig(TokenPolicyConfig):
+    """Sizes of VIMA-Flamingo: resampled patches of frames, and cross-attention to the prompt."""
+
+    architecture: ClassVar[str] = "flamingo"
+
+
+def flamingo(of: Size) -> FlamingoConfig:
+    """Return VIMA-Flamingo in a size."""
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return FlamingoConfig(of.frame_encoder(class_token=False), of.prompt, of.decoder(), head, of.resampler())
+
+
+class Flamingo(TokenPolicy):
+    """A Perceiver resampler over the patches of both views.
+
+        prompt   [put, the, 4 latents, into, the, 4 latents, ., end]
+        history  [4 latents, action, 4 latents, action, …]
+                          |
+                     1st action
+
+    Source: VIMA (Jiang et al. 2023), baselines; after Flamingo (Alayrac et al. 2022).
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class GptConfig(TokenPolicyConfig):
+    """Sizes of VIMA-GPT: one token per pair of frames, and the prompt as prefix."""
+
+    architecture: ClassVar[str] = "gpt"
+
+
+def gpt(of: Size) -> GptConfig:
+    """Return VIMA-GPT in a size."""
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return GptConfig(of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), head)
+
+
+class Gpt(TokenPolicy):
+    """The class vectors of both views, side by side, are one token.
+
+        [put, the, A, into, the, B, ., end, separator, frames, action, frames, action, …]
+                                                            |
+                                                       1st action
+
+    Source: VIMA (Jiang et al. 2023), baselines; after GPT (Radford et al. 2018).
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class MidasConfig(TokenPolicyConfig):
+    """Sizes of MIDAS: objects with a token for each view, and the prompt as prefix."""
+
+    architecture: ClassVar[str] = "midas"
+
+
+def midas(of: Size) -> MidasConfig:
+    """Return MIDAS in a size."""
+    return MidasConfig(
+        ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width),
+        replace(of.prompt, visual_residual=True),
+        of.prefix_decoder(),
+        AutoregressiveConfig(of.hidden_width, of.initial_std, of.action_width),
+    )
+
+
+class Midas(TokenPolicy):
+    """Object tokens for each view, the prompt as prefix, and one token per action component.
+
+        [put, the, A front, A top, into, …, end, separator, front 1, front 2, top 1, top 2, x0, y0, …, d1, …]
+                                                                                       |    |
+                                                                                       x0   y0
+
+    The visual residual adds what enters the text encoder for an object to what it returns.
+
+    Source: MIDAS (Li et al. 2023).
+    """

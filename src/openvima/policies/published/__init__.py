@@ -1,1 +1,0 @@
-"""Published checkpoints of VIMA and its baselines: names, sizes and files."""
