@@ -1,20 +1,22 @@
-"""The policy interface, and the random policy."""
+"""The policy interface, the random policy, and where networks compute."""
 
 import hashlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import torch
 
 from openvima.errors import PolicyError, PromptError
 from openvima.imports import import_extra
 from openvima.imports import require_address_space
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 from openvima.scene.prompt import PLACEHOLDER
+
+if TYPE_CHECKING:
+    import torch
 
 # Least that torch and the libraries loaded after it map, in 2**20 bytes; measured with torch 2.13 on the CPU.
 TORCH_MB = 800
@@ -151,7 +153,7 @@ class PromptLimits:
                 raise PromptError(f"the prompt has {number:,} {what}; this policy takes {allowed:,}.")
 
 
-def usable_device(device: torch.device | str) -> torch.device:
+def usable_device(device: "torch.device | str") -> "torch.device":
     """Return a device after checking that it works.
 
     For a GPU, cuDNN's attention is turned off in this process: it plans anew for each shape, and those of
@@ -160,6 +162,8 @@ def usable_device(device: torch.device | str) -> torch.device:
     Raises:
         PolicyError: The device is not available.
     """
+    import torch
+
     try:
         found = torch.device(device)
         torch.zeros(1, device=found).item()  # raises on "meta", too, whose tensors have no values
@@ -176,6 +180,8 @@ def usable_device(device: torch.device | str) -> torch.device:
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Set the number of threads; it changes the summation order, and so the last bits of results."""
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
