@@ -12,7 +12,6 @@ from openvima.detector.detection import Detections
 from openvima.detector.frames import Frame
 from openvima.errors import ConfigError
 from openvima.imports import import_extra
-from openvima.detector.detection import Detections
 
 _CATEGORY = 1  # of all objects
 _AP, _AP50, _AP75, _RECALL = 0, 1, 2, 8  # positions in COCOeval.stats

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from openvima.errors import PolicyError, PromptError
-from openvima.imports import import_extra
-from openvima.imports import require_address_space
+from openvima.imports import import_extra, require_address_space
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 from openvima.scene.prompt import PLACEHOLDER
 

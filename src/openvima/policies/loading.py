@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.errors import ConfigError, OpenVimaError, PolicyError, UnknownPolicyError, echo
-from openvima.input_files import read_yaml
-from openvima.input_files import as_text
+from openvima.input_files import as_text, read_yaml
 from openvima.policies.base import Policy, RandomPolicy, require_torch
 from openvima.policies.naming import (
     CHECKPOINTS_FOLDER,

@@ -7,8 +7,7 @@ from pathlib import Path
 from openvima.atomic_io import restore_folder
 from openvima.errors import CheckpointError, PolicyError, unknown_name
 from openvima.hub import HubName, fetch, hub_name
-from openvima.input_files import read_text
-from openvima.input_files import as_path
+from openvima.input_files import as_path, read_text
 from openvima.policies.presets import PRESETS, PUBLISHED, UNTRAINED, is_untrained
 from openvima.user_code import is_code
 

@@ -23,9 +23,8 @@ import numpy as np
 
 from openvima import __version__
 from openvima.errors import ConfigError, MessageError, OpenVimaError, echo, unknown_name
-from openvima.policies.base import Policy
+from openvima.policies.base import Policy, PromptLimits
 from openvima.policies.loading import checked_policy
-from openvima.policies.base import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.scene.command import PRIMITIVES
 from openvima.serving.protocol import (
