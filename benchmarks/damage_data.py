@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 from damage import BLOCKS, damaged
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, manifest_checksum
-from openvima.data.object_cache.cache import open_object_cache
+from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, merge
 from openvima.data.verification import VerifyConfig, verify
 from openvima.errors import DatasetError, OpenVimaError

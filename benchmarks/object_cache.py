@@ -29,10 +29,10 @@ import pyarrow as pa
 import torch
 
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.batching import BatchOrder
-from openvima.data.object_cache.cache import ObjectCache, open_object_cache
+from openvima.data.object_cache import ObjectCache, open_object_cache
 from openvima.policies.processor import Processor
 from openvima.tasks import list_tasks, task_spec
+from openvima.training.batches import BatchOrder
 from sim import circumstances
 
 Numbers = dict[str, Any]  # Any: nested JSON
@@ -42,15 +42,15 @@ def ways_of(cache: ObjectCache, batch: int) -> dict[str, Callable[[], object]]:
     """Return functions that read every episode once."""
     processor = Processor("objects")
     shuffled = np.random.default_rng(0).permutation(len(cache)).tolist()
-    order = BatchOrder(len(cache), batch_size=batch, lengths=cache.lengths(), drop_last=False)
+    order = BatchOrder(len(cache), batch_size=batch, lengths=cache.lengths())
     batches = [order.rows(number) for number in range(order.batches_per_epoch)]
 
     def read_batch(rows: np.ndarray, *, images: bool) -> int:
-        episodes = cache.batch(rows)
+        episodes = [cache[row] for row in rows.tolist()]
         made = processor.collate(episodes)
-        return len(
-            (made.with_images(episodes.images, episodes.num_images) if images else made).targets.steps_BT
-        )
+        if images:
+            made = made.with_images([episode.images for episode in episodes])
+        return len(made.targets.steps_BT)
 
     used = []  # images in use come first in an episode
     for rows in batches:

@@ -49,7 +49,7 @@ PROMISES = (
     ),
     (
         "Damage to data, caches and checkpoints is found when they are read.",
-        ("benchmarks/damage_data.py", "benchmarks/damage_cache.py", "benchmarks/attack_checkpoints.py"),
+        ("benchmarks/damage_data.py", "tests/data/test_object_cache.py", "benchmarks/attack_checkpoints.py"),
     ),
     (
         "A policy server, evaluations and vector environments run for hours: no answer is lost or wrong, "

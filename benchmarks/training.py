@@ -24,7 +24,7 @@ import sys, time
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from openvima.data.object_cache.cache import open_object_cache
+from openvima.data.object_cache import open_object_cache
 from openvima.data.reader import Dataset
 from openvima.training.behaviour_cloning import BehaviourCloning
 from openvima.training.building import build_learner, resolved

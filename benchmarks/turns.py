@@ -66,15 +66,19 @@ from pathlib import Path
 import pyarrow as pa
 import torch
 from openvima.data import Dataset, ShardWriter
-from openvima.data.batching import BatchOrder
-from openvima.data.object_cache.cache import open_object_cache
 from openvima.policies.processor import Processor
+try:
+    from openvima.data.object_cache import open_object_cache
+    from openvima.training.batches import BatchOrder
+except ImportError:  # of an older checkout
+    from openvima.data.batching import BatchOrder
+    from openvima.data.object_cache.cache import open_object_cache
 torch.set_num_threads(1)
 pa.set_cpu_count(1)
 folder = sys.argv[1]
 dataset = Dataset(folder)
 cache, processor = open_object_cache(dataset), Processor("objects")
-order = BatchOrder(len(cache), 128, lengths=cache.lengths(), drop_last=False)
+order = BatchOrder(len(cache), 128, lengths=cache.lengths())
 batches = [order.rows(number) for number in range(order.batches_per_epoch)]
 demos = [dataset[row] for row in range(min(100, len(dataset)))]
 info = dataset.shard(dataset.shard_names()[0]).info
@@ -85,9 +89,14 @@ rows = [both[:2] for both in rows.values() if len(both) > 1][:100]
 columns = ["rgb_front", "rgb_top", "segm_front", "segm_top", "prompt", "pose0_position", "pose1_position"]
 
 def read_batch(indices, images):
-    episodes = cache.batch(indices)
+    if hasattr(cache, "batch"):
+        episodes = cache.batch(indices)
+        own = episodes.images, episodes.num_images
+    else:
+        episodes = [cache[row] for row in indices.tolist()]
+        own = ([episode.images for episode in episodes],)
     made = processor.collate(episodes)
-    return len((made.with_images(episodes.images, episodes.num_images) if images else made).targets.steps_BT)
+    return len((made.with_images(*own) if images else made).targets.steps_BT)
 
 for line in sys.stdin:
     kind = line.strip()

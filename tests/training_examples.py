@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from openvima.data import Demonstration
-from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
-from openvima.data.object_cache.episode_batch import EpisodeBatch
+from openvima.data.preprocessed import PreprocessedEpisode, preprocess
 from openvima.policies.batch import Batch
 from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
+from openvima.training.batches import ExampleSource
 from openvima.training.dataset import Example
-from openvima.training.source import ExampleSource
 
 
 def stack_images(episodes: list[PreprocessedEpisode]) -> tuple[list[Example], torch.Tensor]:
@@ -31,7 +30,11 @@ def examples_of(demos: Iterable[Demonstration], processor: Processor):
 
 def source_of(demos: Iterable[Demonstration], processor: Processor) -> ExampleSource:
     """The same as if they had been read from an object cache."""
-    episodes = [preprocess(demo, processor.input_kind) for demo in demos]
+    return source_of_episodes([preprocess(demo, processor.input_kind) for demo in demos])
+
+
+def source_of_episodes(episodes: list[PreprocessedEpisode]) -> ExampleSource:
+    """Preprocessed demonstrations as if they had been read from an object cache."""
     counts = np.array([len(episode.images) for episode in episodes])
     lengths = np.array([[episode.num_steps, len(episode.objects)] for episode in episodes])
     return ExampleSource(episodes, np.arange(len(episodes)), np.cumsum(counts) - counts, lengths)
@@ -40,7 +43,7 @@ def source_of(demos: Iterable[Demonstration], processor: Processor) -> ExampleSo
 def collate_examples(processor: Processor, examples: Iterable[Example]) -> Batch:
     """A batch whose images are numbered as in the examples' stack."""
     examples = list(examples)
-    return processor.collate(EpisodeBatch.of([e.episode for e in examples], [e.base for e in examples]))
+    return processor.collate([e.episode for e in examples], [e.base for e in examples])
 
 
 def rngs_of(examples: list[Example], seed: int = 0) -> list[np.random.Generator]:

@@ -1,11 +1,13 @@
-"""Demonstrations that no simulation made, for tests of storage."""
+"""Demonstrations for tests of storage: some of the oracle, and some that no simulation made."""
 
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from openvima.data import Demonstration
+from openvima.data import Demonstration, GenerateConfig, generate
 from openvima.data.encoding import ShardInfo
 from openvima.scene import (
     Action,
@@ -83,3 +85,19 @@ def made_up() -> Callable[..., Demonstration]:
 @pytest.fixture
 def info() -> ShardInfo:
     return INFO
+
+
+@pytest.fixture(scope="package")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five demonstrations of each of two tasks, in shards of two."""
+    out = tmp_path_factory.mktemp("object_cache") / "demos"
+    return generate(
+        GenerateConfig(out=out, tasks=("rotate", "rearrange_then_restore"), episodes=5, shard_size=2)
+    )
+
+
+@pytest.fixture
+def copy(demos: Path, tmp_path: Path) -> Path:
+    """A copy without an object cache, to be changed."""
+    shutil.copytree(demos, tmp_path / "demos", ignore=shutil.ignore_patterns("object_cache"))
+    return tmp_path / "demos"

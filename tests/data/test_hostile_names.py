@@ -14,7 +14,7 @@ import pytest
 from openvima.data import Dataset, Demonstration, Shard, ShardWriter
 from openvima.data.encoding import ShardInfo
 from openvima.data.lerobot import LerobotConfig, export_lerobot
-from openvima.data.object_cache.cache import open_object_cache
+from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.data.verification import VerifyConfig, repair, verify
 from openvima.errors import DatasetError, OpenVimaError, ShardError

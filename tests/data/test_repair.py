@@ -22,7 +22,7 @@ from openvima.data import (
     verify,
 )
 from openvima.data.encoding import ShardInfo
-from openvima.data.object_cache.cache import open_object_cache
+from openvima.data.object_cache import open_object_cache
 from openvima.env import TabletopEnv
 from openvima.errors import DatasetError, OpenVimaError, ShardError
 from openvima.scene import Outcome

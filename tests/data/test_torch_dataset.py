@@ -1,8 +1,6 @@
-"""Demonstrations for PyTorch: the same batches for any number of workers, and a position that lasts."""
+"""Demonstrations for PyTorch, and how batches reach the main process."""
 
-import json
 import pickle
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +10,9 @@ torch = pytest.importorskip("torch")
 
 from torch.utils.data import DataLoader  # noqa: E402
 
-from openvima.data import Dataset, GenerateConfig, generate, torch_batches  # noqa: E402
-from openvima.data.batching import BatchOrder  # noqa: E402
-from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
-from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset, collate, tensors_of  # noqa: E402
-from openvima.errors import ConfigError, ShapeError  # noqa: E402
+from openvima.data import Dataset, GenerateConfig, generate, torch_dataset  # noqa: E402
+from openvima.data.torch_dataset import DemonstrationDataset, collate, tensors_of  # noqa: E402
+from openvima.errors import ShapeError  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -24,27 +20,6 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     out = tmp_path_factory.mktemp("torch") / "demos"
     tasks = ("rotate", "manipulate_old_neighbor")
     return Dataset(generate(GenerateConfig(out=out, tasks=tasks, episodes=4)))
-
-
-class Numbers(Sequence):
-    """Episodes that are just numbers."""
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index):
-        return index
-
-
-def total(episodes: list[int], number: int) -> torch.Tensor:
-    return torch.tensor(sum(episodes))
-
-
-def numbered(episodes: list[int], number: int) -> tuple[int, list[int]]:
-    return number, episodes
 
 
 def test_a_demonstration_becomes_tensors(demos: Dataset) -> None:
@@ -97,86 +72,6 @@ def test_slices_are_data_sets(demos: Dataset) -> None:
         collate([])
 
 
-@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on a machine of two processors
-@pytest.mark.parametrize("workers", [1, 3])
-def test_loader_workers_do_not_change_the_batches(workers: int) -> None:
-    order = BatchOrder(60, batch_size=4, seed=2)
-    expected = [order.rows(number).tolist() for number in range(30)]
-    loader = BatchLoader(Numbers(60), order, num_workers=workers)
-    assert [*loader, *loader] == expected
-
-
-def test_a_transform_is_told_the_number_of_its_batch() -> None:
-    order = BatchOrder(60, batch_size=4, seed=2)
-    loader = BatchLoader(Numbers(60), order, num_workers=2, transform=numbered)
-    list(loader)
-    assert next(iter(loader)) == (15, order.rows(15).tolist())
-
-
-def test_an_epoch_ends_and_the_next_one_follows() -> None:
-    order = BatchOrder(10, batch_size=4, seed=2)
-    loader = BatchLoader(Numbers(10), order, transform=total)
-    assert len(loader) == 2
-    assert len(list(loader)) == 2
-    assert loader.epoch == 1
-    assert [int(batch) for batch in loader] == [order.rows(n).sum() for n in (2, 3)]
-    forever = loader.forever()
-    assert [int(next(forever)) for _ in range(5)] == [order.rows(n).sum() for n in range(4, 9)]
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_position_is_that_of_what_was_shown_not_of_what_was_read_ahead(workers: int) -> None:
-    order = BatchOrder(60, batch_size=4, seed=2)
-    loader = BatchLoader(Numbers(60), order, num_workers=workers)
-    batches = iter(loader)
-    shown = [next(batches) for _ in range(5)]
-    state = json.loads(json.dumps(loader.state_dict()))
-    rest = list(batches)
-    other = BatchLoader(Numbers(60), order, num_workers=2 - workers)
-    other.load_state_dict(state)
-    assert list(other) == rest
-    assert [*shown, *rest] == [order.rows(number).tolist() for number in range(15)]
-
-
-def test_ranks_that_become_more_go_on_where_one_was() -> None:
-    whole = BatchOrder(60, batch_size=4, seed=2)
-    one = BatchLoader(Numbers(60), whole)
-    forever = one.forever()
-    for _ in range(17):
-        next(forever)
-    seen = []
-    for rank in range(2):
-        part = BatchLoader(Numbers(60), replace(whole, rank=rank, num_ranks=2))
-        part.load_state_dict(one.state_dict())
-        seen += next(part.forever())
-    assert sorted(seen) == sorted(whole.rows(17))
-
-
-def test_a_position_of_another_order_is_refused() -> None:
-    order = BatchOrder(60, batch_size=4, seed=2)
-    state = BatchLoader(Numbers(60), order).state_dict()
-    with pytest.raises(ConfigError, match=r"another order: seed was 2, is 3"):
-        BatchLoader(Numbers(60), replace(order, seed=3)).load_state_dict(state)
-    with pytest.raises(ConfigError, match="the order is for 60 episodes; there are 59"):
-        BatchLoader(Numbers(59), order)
-
-
-def test_the_global_generator_is_left_alone() -> None:
-    torch.manual_seed(0)
-    expected = torch.rand(1)
-    torch.manual_seed(0)
-    list(BatchLoader(Numbers(60), BatchOrder(60, batch_size=4, seed=2)))
-    assert torch.equal(torch.rand(1), expected)
-
-
-@pytest.mark.parametrize("source", ["images", "tokens"])
-def test_episodes_of_a_data_set_come_in_batches(demos: Dataset, source: str) -> None:
-    episodes = demos if source == "images" else open_object_cache(demos)
-    loader = BatchLoader(episodes, BatchOrder(8, batch_size=4, seed=0), num_workers=1)
-    seen = [(episode.task, episode.seed) for batch in loader for episode in batch]
-    assert sorted(seen) == sorted((demo.task, demo.seed) for demo in demos)
-
-
 def test_a_demonstration_without_steps_has_tensors_without_rows(demos: Dataset) -> None:
     demo = demos[0]
     start = {
@@ -186,10 +81,6 @@ def test_a_demonstration_without_steps_has_tensors_without_rows(demos: Dataset) 
     item = tensors_of(replace(demo, actions=(), pick_ids=(), place_ids=(), joint_paths=(), **start))
     assert item["pose0_position"].shape == (0, 2)
     assert item["pose1_rotation"].shape == (0, 4)
-
-
-def tensors(episodes: list[int], number: int) -> dict[str, object]:
-    return {"ones": torch.ones(100), "nested": [(torch.arange(number + 1), np.arange(3))], "text": "a"}
 
 
 def refuse(tensor: torch.Tensor) -> None:
@@ -205,7 +96,7 @@ def test_without_room_in_shared_memory_workers_send_batches_through_the_pipe(
     items = DemonstrationDataset(demos)
     expected = next(iter(DataLoader(items, batch_size=8)))
     if lack == "known":
-        monkeypatch.setattr(torch_batches, "_room", lambda: 1000)
+        monkeypatch.setattr(torch_dataset, "_room", lambda: 1000)
     else:
         monkeypatch.setattr(torch.Tensor, "share_memory_", refuse)
     options = {"num_workers": 2, "multiprocessing_context": "fork", "timeout": 60}
@@ -217,11 +108,6 @@ def test_without_room_in_shared_memory_workers_send_batches_through_the_pipe(
         else:
             assert batch[name] == value
 
-    order = BatchOrder(8, batch_size=2, seed=0)
-    for number, made in enumerate(BatchLoader(Numbers(8), order, transform=tensors, num_workers=2)):
-        assert made["ones"].sum() == 100 and made["text"] == "a"
-        assert made["nested"][0][0].tolist() == list(range(number + 1))
-
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 def test_with_room_batches_are_in_shared_memory(demos: Dataset) -> None:
@@ -229,6 +115,3 @@ def test_with_room_batches_are_in_shared_memory(demos: Dataset) -> None:
         DemonstrationDataset(demos), batch_size=4, num_workers=1, multiprocessing_context="fork"
     )
     assert all(batch["rgb_top"].is_shared() for batch in loader)
-    order = BatchOrder(8, batch_size=2, seed=0)
-    loader = BatchLoader(Numbers(8), order, transform=tensors, num_workers=1, context="fork")
-    assert all(batch["nested"][0][0].is_shared() for batch in loader)

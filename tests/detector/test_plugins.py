@@ -11,7 +11,7 @@ import pytest
 
 from object_rows import rows_of
 from openvima.data import Dataset
-from openvima.data.object_cache.episode import preprocess
+from openvima.data.preprocessed import preprocess
 from openvima.detector.plugins import (
     PluggedExtractor,
     detected_object_cache,

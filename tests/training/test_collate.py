@@ -8,8 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
-from openvima.data.object_cache.episode import preprocess  # noqa: E402
-from openvima.data.object_cache.episode_batch import EpisodeBatch  # noqa: E402
+from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
@@ -123,12 +122,12 @@ def test_an_episode_without_visible_objects_is_named(demonstrations_of_several_s
     none = np.zeros_like(tokens.objects_per_step)
     blind = replace(tokens, objects=tokens.objects.select(slice(0)), objects_per_step=none)
     with pytest.raises(DatasetError, match=f"episode {tokens.seed} of {tokens.task} shows no object before"):
-        OBJECTS.collate(EpisodeBatch.of([blind]))
+        OBJECTS.collate([blind])
 
 
 def test_a_batch_holds_each_image_in_use_once(demonstrations_of_several_steps):
     examples, stack = examples_of(demonstrations_of_several_steps, OBJECTS)
-    episodes = EpisodeBatch.of([example.episode for example in examples])
+    episodes = [example.episode for example in examples]
     numbered = OBJECTS.collate(episodes)
     left_out = numbered.history.crop_index_BTVN[1].unique()[-3]  # as if augmentation had hidden an object
     history = replace(
@@ -138,7 +137,7 @@ def test_a_batch_holds_each_image_in_use_once(demonstrations_of_several_steps):
         ),
     )
     for plain in (numbered, replace(numbered, history=history)):
-        batch = plain.with_images(episodes.images, episodes.num_images)
+        batch = plain.with_images([episode.images for episode in episodes])
         used = torch.cat([plain.prompts.crop_index_VS.flatten(), plain.history.crop_index_BTVN.flatten()])
         assert len(batch.images) == len(used.unique())
         for ours, theirs in (

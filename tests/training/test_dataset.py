@@ -1,6 +1,6 @@
 """Examples, their order, and their augmentation."""
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
-from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
+from openvima.data.object_cache import open_object_cache  # noqa: E402
 from openvima.data.subsets.merging import MergeConfig, merge  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
@@ -19,16 +19,13 @@ from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
 from openvima.tasks.registry import held_out_tasks, list_tasks  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.augmentation.false_positives import augmented  # noqa: E402
+from openvima.training.batches import ExampleSource  # noqa: E402
 from openvima.training.building import resolved  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
-from openvima.training.dataset import StoredEpisode  # noqa: E402
-from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.policy import scene_tasks  # noqa: E402
 from openvima.training.provenance import held_out_demonstrations  # noqa: E402
 from openvima.training.source import (  # noqa: E402
-    ExampleSource,
-    Parts,
-    by_length,
+    check_scenes,
     check_words,
     open_demonstrations,
     order_of,
@@ -102,6 +99,10 @@ def test_a_run_says_which_held_out_demonstrations_it_saw(tmp_path):
     assert held_out_data(tmp_path / "none") == []
 
 
+def test_scenes_are_known_where_demonstrations_are_generated(data):
+    check_scenes(Dataset(data))
+
+
 def test_excluded_tasks_identify_a_run_in_any_order(settings):
     configs = [
         TrainingConfig.of({**settings, "loader.exclude_tasks": names})
@@ -164,30 +165,6 @@ def test_an_unknown_word_is_found_before_training(data):
     check_words(open_object_cache(Dataset(data)), processor)
     with pytest.raises(PromptError, match="xylophone"):
         check_words(Cache(), processor)
-
-
-def test_groups_contain_examples_of_similar_length(examples):
-    groups = by_length(examples)
-    assert sum(len(group) for group in groups) == 24
-    assert {e.episode.num_steps for e in groups[0]} == {1}
-
-
-def test_the_parts_of_a_batch_contain_all_of_it(examples):
-    drawn = {}
-
-    def collate(part, rngs):
-        drawn.update({e.row: rng.random() for e, rng in zip(part, rngs, strict=True)})
-        return [example.row for example in part]
-
-    numbered = [replace(example, row=row) for row, example in enumerate(examples)]
-    parts = Parts(collate, seed=3, largest=5)(numbered, 7)
-    assert sorted(row for rows, _ in parts for row in rows) == list(range(24))
-    assert max(len(rows) for rows, _ in parts) <= 5
-    assert sum(steps for _, steps in parts) == sum(e.episode.num_steps for e in examples)
-    whole, drawn = dict(drawn), {}
-    Parts(collate, seed=3, largest=2)(numbered[10:], 7)
-    assert all(whole[row] == value for row, value in drawn.items())  # whoever shares the batch
-    assert len(set(whole.values())) == 24
 
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
@@ -305,31 +282,3 @@ def test_whole_frames_get_no_false_positives_and_stay_uint8(demonstrations_of_se
     assert images.shape[1:] == (3, 64, 128)
     batch = collate_examples(processor, examples)
     assert augmented(batch, "frames", probability=1.0, rngs=rngs_of(examples)) is batch
-
-
-def tensors_of(record) -> list[np.ndarray]:
-    values = [getattr(record, field.name) for field in fields(record)]
-    parts = [tensors_of(value) if is_dataclass(value) else [value] for value in values if value is not None]
-    return [np.asarray(value) for part in parts for value in part]
-
-
-@pytest.mark.parametrize("with_images", [False, True])
-@pytest.mark.parametrize("layout", ["objects", "views"])
-@pytest.mark.parametrize("probability", [None, 0.0, 0.5])
-def test_demonstrations_read_together_give_the_same_batch(data, with_images, layout, probability):
-    training, _ = split_examples(
-        open_object_cache(Dataset(data)), validation_fraction=0.3, validation_episodes=9
-    )
-    unread, read = ([training[index] for index in (5, 1, 1, 8)] for _ in range(2))
-    for example in read:
-        assert example.episode.num_steps == example.num_steps
-    collate = PolicyCollate(Processor(layout), probability or 0.0, with_images=with_images)
-    ours, theirs = (
-        tensors_of(collate(each, None if probability is None else rngs_of(each))) for each in (unread, read)
-    )
-    contents = [example.content for example in unread]
-    assert not any(isinstance(content, StoredEpisode) and content.is_read for content in contents)
-    assert len(ours) == len(theirs) > 20
-    for one, other in zip(ours, theirs, strict=True):
-        assert one.dtype == other.dtype
-        assert np.array_equal(one, other)

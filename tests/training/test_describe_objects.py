@@ -9,8 +9,8 @@ torch = pytest.importorskip("torch")
 
 from object_rows import rows_of  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
-from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
-from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.object_cache import open_object_cache  # noqa: E402
+from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.perception.preprocessing import split_prompt  # noqa: E402

@@ -14,9 +14,8 @@ from safetensors.torch import load_file  # noqa: E402
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
 from noisy_extractor import HOOK, NoisyExtractor  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
-from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
-from openvima.data.object_cache.cache_file import CACHE_VERSION  # noqa: E402
-from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.object_cache import CACHE_VERSION, open_object_cache  # noqa: E402
+from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.detector.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.detector.plugins import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
@@ -27,9 +26,10 @@ from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
 from openvima.training.augmentation.inverse_dynamics import motion_prompt  # noqa: E402
+from openvima.training.batches import BatchMaker, ExampleSource  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.source import ExampleSource, Parts, alternative_source, split_examples  # noqa: E402
+from openvima.training.source import alternative_source, split_examples  # noqa: E402
 from training_examples import train_until  # noqa: E402
 
 
@@ -160,8 +160,7 @@ def detected_rows(sources, share: float, number: int, rows: slice = slice(None))
             if example.base >= first_detected:
                 found.append(example.row)
 
-    examples = [true[index] for index in range(len(true))][rows]
-    Parts(collate, 3, 5, alternatives=((detected, share),))(examples, number)
+    BatchMaker(true, collate, 3, 5, alternatives=((detected, share),))(np.arange(len(true))[rows], number)
     return sorted(found), sorted(draws)
 
 
@@ -194,9 +193,8 @@ def test_each_cache_is_drawn_with_its_probability(sources) -> None:
         for example in part:
             counts[np.searchsorted(first_images, example.base, side="right") - 1] += 1
 
-    examples = [true[index] for index in range(len(true))]
     for number in range(40):
-        Parts(collate, 3, 5, alternatives=alternatives)(examples, number)
+        BatchMaker(true, collate, 3, 5, alternatives=alternatives)(np.arange(len(true)), number)
     np.testing.assert_allclose(counts / counts.sum(), [0.2, 0.5, 0.3], atol=0.08)
 
 

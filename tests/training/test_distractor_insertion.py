@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from object_rows import rows_of  # noqa: E402
-from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
@@ -19,10 +19,9 @@ from openvima.training.augmentation.distractor_insertion import (  # noqa: E402
     allows_distractors,
     with_distractors,
 )
-from openvima.training.dataset import Example  # noqa: E402
+from openvima.training.batches import BatchMaker  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.source import Parts  # noqa: E402
-from training_examples import rngs_of, stack_images  # noqa: E402
+from training_examples import rngs_of, source_of_episodes, stack_images  # noqa: E402
 
 TASKS = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "same_shape", "rearrange")
 
@@ -98,12 +97,11 @@ def test_few_tasks_receive_distractors(episodes):
 
 
 def test_distractors_are_inserted_in_training_only_with_their_probability(episodes):
-    examples = [Example(episode, row=row) for row, episode in enumerate(episodes)]
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
 
     def counts(share: float) -> torch.Tensor:
-        parts = Parts(collate, 0, 99, count=1, distractors=examples, distractor_prob=share)
-        ((batch, _),) = parts(examples, 4)
+        make = BatchMaker(source_of_episodes(episodes), collate, 0, 99, count=1, distractor_prob=share)
+        ((batch, _),) = make(np.arange(len(episodes)), 4)
         return (batch.history.num_slots_BT * batch.history.steps_BT).sum(dim=1)
 
     order = np.argsort([episode.num_steps for episode in episodes], kind="stable")

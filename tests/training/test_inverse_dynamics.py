@@ -12,7 +12,7 @@ from safetensors.torch import load_file  # noqa: E402
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.data import Demonstration  # noqa: E402
-from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.perception.objects import observe, whole_frames  # noqa: E402
 from openvima.policies import preset  # noqa: E402

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from object_rows import rows_of  # noqa: E402
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
-from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402

@@ -6,9 +6,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset  # noqa: E402
-from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
+from openvima.data.object_cache import open_object_cache  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
-from openvima.perception.preprocessing import PreprocessedPrompts  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn import decoder  # noqa: E402
@@ -28,7 +27,7 @@ def case(request, data):
 
 
 def num_places(tokens, processor) -> int:
-    return processor.batch_prompts(PreprocessedPrompts.of([tokens.prompt])).word_ids_BL.shape[1]
+    return processor.batch_prompts([tokens.prompt]).word_ids_BL.shape[1]
 
 
 def test_widths_are_those_of_the_episodes(case) -> None:

@@ -1,31 +1,64 @@
-"""Rendering the images of demonstrations that were stored without them.
+"""Rendering the images of demonstrations again: as they were, or with random shapes and textures.
 
-The prompt's images follow from the seed, those of the cameras from the stored scenes. Both depend on the code
-that samples and draws, so the result is compared with the content hash of the demonstration as it was seen.
+Demonstrations may be stored without images. Those of the prompt follow from the seed, those of the cameras
+from the stored scenes; both depend on the code that samples and draws, so the result is compared with the
+content hash of the demonstration as it was seen.
+
+With a random appearance, poses and actions stay. Each shape and texture of a demonstration gets a random one
+in its place, the same in all its images, and what the prompt says stays true:
+
+- Names that the prompt has in words stay what they are; so does the neutral gray of images of shapes.
+- Shapes whose heading is visible get such shapes, and movable objects keep their heights.
+- A dark texture becomes the dark variant of what replaces its light one.
+- Where the prompt asks for a profile, movable objects keep their shapes, and containers their profile.
+
+Only movable objects and containers of the training partition get other shapes. Random shapes know nothing of
+the catalogue's; gratings were added after containers with gaps had failed at L3.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
 
 from openvima.catalog.geometry import Assets
+from openvima.catalog.objects import OBJECTS, ObjectSpec, object_spec
 from openvima.catalog.packs import load_assets
+from openvima.catalog.partitions import OBJECT_SETS
+from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, random_name
+from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
 from openvima.catalog.user_assets import recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.schema import VIEWS
 from openvima.errors import (
     AssetError,
+    DatasetError,
     OpenVimaError,
     ShardError,
     UnknownObjectError,
     UnknownTextureError,
 )
 from openvima.render.rasteriser import Rasteriser
-from openvima.scene import Prompt, RenderedPrompt, Scene
+from openvima.scene import ObjectImage, Placement, Pose, Prompt, RenderedPrompt, Scene, SceneImage
+from openvima.scene.prompt import PLACEHOLDER, PromptFill
 from openvima.tasks import sample_episode
+from openvima.tasks.prompts import MULTIMODAL
+
+RERENDERING_VERSION = 1  # grows whenever the same demonstration gets another appearance
+_MOVABLE = {*OBJECT_SETS["D_shape"], *OBJECT_SETS["D_train"]}
+_CONTAINERS = OBJECT_SETS["B_train"]
+_CONTAINER_KINDS = ("container", "container", "grating", "eared container")
+_PROFILE_KINDS = {"square": "square container", "circle": "round container"}
+# Seeds of the appearances of a variant, few enough to cache: drawing new ones doubles the time.
+_POOL_SIZE, _NUM_CACHED = 1024, 4096
+UNKNOWN_SCENES = (
+    "{} has no scenes, as imported data, so it cannot be rendered with another appearance; leave out "
+    "loader.rerendered_prob."
+)
+_PROFILE = re.compile(r"\b(profiles?|outlines?|shapes?)\b", re.IGNORECASE)
 
 
 def rerendered(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonstration:
@@ -136,3 +169,139 @@ def _changed(demo: Demonstration, info: ShardInfo, details: str = "") -> ShardEr
         f"{demo.task} of seed {demo.seed} is stored without images and cannot be rerendered identically"
         f"{details}. It was written with {versions}."
     )
+
+
+def with_random_appearance(demo: Demonstration, info: ShardInfo, variant: int) -> Demonstration:
+    """Render a demonstration with random shapes and textures.
+
+    Args:
+        demo: The demonstration; its images are not used.
+        info: Of the shard that stores it.
+        variant: Number that draws the appearance, together with task and seed.
+
+    Raises:
+        DatasetError: Its scenes are unknown.
+    """
+    if not demo.scenes:
+        raise DatasetError(UNKNOWN_SCENES.format(f"the demonstration of {demo.task} with seed {demo.seed}"))
+    rasteriser = _random_rasteriser(info.assets)
+    prompt = sampled_prompt(demo, info, rasteriser.assets)
+    placements = [*demo.scenes[0].placements, *_shown(prompt)]
+    rng = np.random.default_rng([variant, demo.seed, *demo.task.encode()])
+    in_words = info.prompts != MULTIMODAL
+    appearance = RandomAppearance(
+        placements, prompt.text, in_words=in_words, variant=variant, assets=rasteriser.assets, rng=rng
+    )
+    rgb, segm = draw_with(rasteriser, [appearance.of_scene(scene) for scene in demo.scenes])
+    images = tuple((name, appearance.of_image(fill)) for name, fill in prompt.images)
+    rendered = rasteriser.prompt(dataclasses.replace(prompt, images=images))
+    return dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=rendered)
+
+
+class RandomAppearance:
+    """Which random shape and texture replaces which.
+
+    Args:
+        placements: All objects of a demonstration.
+        text: Its prompt; textures that it names stay.
+        in_words: Whether it describes objects in words; shapes that it names stay, too. Else "container" is
+            but a word.
+        variant: Number of the pool of appearances.
+        assets: The pack.
+        rng: Source of all draws.
+    """
+
+    def __init__(
+        self,
+        placements: Iterable[Placement],
+        text: str,
+        *,
+        in_words: bool,
+        variant: int,
+        assets: Assets,
+        rng: np.random.Generator,
+    ) -> None:
+        self._assets, self._rng = assets, rng
+        self._pool = range(variant * _POOL_SIZE, (variant + 1) * _POOL_SIZE)
+        self._shapes: dict[str, str] = {}
+        self._textures: dict[str, str] = {}
+        keeps_profiles = _PROFILE.search(text) is not None
+        for placement in placements:
+            name, light = placement.object, texture_spec(placement.texture).light_variant
+            if name not in self._shapes:
+                is_kept = in_words and _occurs(name, text)
+                self._shapes[name] = name if is_kept else self._other_shape(object_spec(name), keeps_profiles)
+            if light not in self._textures:
+                is_kept = light == NEUTRAL_TEXTURE or _occurs(light, text)
+                self._textures[light] = light if is_kept else self._draw("texture")
+
+    def of(self, placement: Placement) -> Placement:
+        """Return an object with its new appearance, as high above the table."""
+        name, spec = self._shapes[placement.object], texture_spec(placement.texture)
+        texture = f"{'dark ' if spec.is_dark else ''}{self._textures[spec.light_variant]}"
+        new = dataclasses.replace(placement, object=name, texture=texture)
+        if name == placement.object:
+            return new
+        old = self._assets.geometry(placement.object, placement.size, placement.scale)
+        if placement.object in _MOVABLE:
+            plain = self._assets.geometry(name, placement.size, placement.scale)
+            factor = _height_m(old.visual.vertices) / _height_m(plain.visual.vertices)
+            x, y, z = placement.scale
+            new = dataclasses.replace(new, scale=(x, y, z * factor))
+        rest_z_m = self._assets.geometry(name, new.size, new.scale).rest_z_m
+        position = (new.pose.x, new.pose.y, new.pose.z - old.rest_z_m + rest_z_m)
+        return new.at(Pose(position, new.pose.quaternion))
+
+    def of_scene(self, scene: Scene) -> Scene:
+        """Return a scene with the new appearance."""
+        return dataclasses.replace(scene, placements=tuple(map(self.of, scene.placements)))
+
+    def of_image(self, image: PromptFill) -> PromptFill:
+        """Return a prompt image with the new appearance; a photo stays."""
+        if isinstance(image, ObjectImage):
+            return dataclasses.replace(image, placement=self.of(image.placement))
+        return SceneImage(self.of_scene(image.scene)) if isinstance(image, SceneImage) else image
+
+    def _draw(self, kind: str) -> str:
+        """Draw an appearance that nothing has yet."""
+        used = {*self._shapes.values(), *self._textures.values()}
+        while (name := random_name(kind, self._rng, self._pool)) in used:
+            pass
+        return name
+
+    def _other_shape(self, spec: ObjectSpec, keeps_profiles: bool) -> str:
+        if spec.name in _CONTAINERS:
+            if keeps_profiles and spec.profile is not None:
+                return self._draw(_PROFILE_KINDS[spec.profile])
+            return self._draw(_CONTAINER_KINDS[int(self._rng.integers(len(_CONTAINER_KINDS)))])
+        if spec.name not in _MOVABLE or keeps_profiles:
+            return spec.name
+        while True:
+            name = self._draw("shape")
+            if has_visible_heading(name) or not has_visible_heading(spec.name):
+                return name
+
+
+def _occurs(name: str, text: str) -> bool:
+    """Whether a text has a name, or another name of that object, outside of its placeholders."""
+    spec = OBJECTS.get(name)
+    names = "|".join(map(re.escape, (name, *(spec.aliases if spec else ()))))
+    return re.search(rf"\b({names})(s|es)?\b", PLACEHOLDER.sub("", text), re.IGNORECASE) is not None
+
+
+def _shown(prompt: Prompt) -> Iterator[Placement]:
+    """Yield the objects of all prompt images."""
+    for _, image in prompt.images:
+        if isinstance(image, ObjectImage):
+            yield image.placement
+        elif isinstance(image, SceneImage):
+            yield from image.scene.placements
+
+
+def _height_m(vertices: np.ndarray) -> float:
+    return float(np.ptp(vertices[..., 2]))
+
+
+@lru_cache(maxsize=2)
+def _random_rasteriser(assets: str) -> Rasteriser:
+    return Rasteriser(RandomAppearanceAssets(load_assets(recorded_assets(assets)), _NUM_CACHED))

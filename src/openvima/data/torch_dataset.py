@@ -1,27 +1,30 @@
-"""Demonstrations for PyTorch: by number, or as a stream of batches that can go on where it stopped."""
+"""Demonstrations for PyTorch: whole, with their images, by number.
 
-from collections.abc import Callable, Iterator, Sequence
+Loader workers hand batches over in shared memory, or else through a pipe. PyTorch moves tensors to shared
+memory when a thread of the worker sends them; if there is no room, as in a container with Docker's 64 MB
+of `/dev/shm`, that thread drops the batch and the main process waits for ever.
+"""
+
+import io
+import math
+import os
+import pickle
+from collections.abc import Callable, Sequence
 from copy import copy
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch.nn.utils.rnn import pad_sequence
-from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
+from torch.utils.data import Dataset, get_worker_info
 from torch.utils.data._utils.collate import default_collate_fn_map  # documented with `default_collate`
 
-from openvima.data.batching import BatchOrder
 from openvima.data.reader import Dataset as Demonstrations
 from openvima.data.records import Demonstration
-from openvima.data.torch_batches import sent
-from openvima.errors import ConfigError, ShapeError
+from openvima.errors import ShapeError
 from openvima.scene import ACTION_SHAPES
 from openvima.scene.scene import BACKGROUND_ID
-
-Episode = TypeVar("Episode")
-# Episodes of a batch and its number to whatever the user's training step takes (Any).
-Transform = Callable[[list[Episode], int], Any]
 
 
 class DemonstrationDataset(Dataset):
@@ -135,7 +138,7 @@ def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:  # Any: te
             blank = items[0][name][:0]
             shown = [torch.stack([image[name] for image in found]) if found else blank for found in images]
             batch[f"prompt_{name}"] = _padded(shown, _padding(name))
-    return sent(batch)
+    return send(batch)
 
 
 def _padding(name: str) -> int:
@@ -160,142 +163,71 @@ def _images(rgb: dict[str, np.ndarray], segm: dict[str, np.ndarray]) -> dict[str
     return {name: torch.from_numpy(np.array(images)) for name, images in named.items()}
 
 
-class BatchStream(IterableDataset, Generic[Episode]):
-    """Batches of episodes in a given order; loader workers share them out.
-
-    Worker w of W takes every W-th batch. A `DataLoader` asks its workers in turn, so the batches come in the
-    same order whatever their number.
+def send(batch: Any) -> Any:  # Any: whatever the user's training step takes
+    """Return a batch that the main process gets, whether or not there is room in shared memory.
 
     Args:
-        source: Episodes by number: a `ObjectCache`, or a `Dataset` for those with images.
-        order: Which of them each batch takes.
-        first: Number of the first batch.
-        stop: Number of the batch before which to stop; None goes on for ever.
-        transform: Turns a list of episodes into a batch; by default the list itself is the batch. It is also
-            given the number of the batch, for what it may draw at random. It is sent to the workers, so that
-            it must be a function of a module or an object that can be pickled.
+        batch: What a worker has made; in any other process it is returned as it is.
     """
-
-    def __init__(
-        self,
-        source: Sequence[Episode],
-        order: BatchOrder,
-        *,
-        first: int = 0,
-        stop: int | None = None,
-        transform: Transform[Episode] | None = None,
-    ) -> None:
-        self.source, self.order, self.transform = source, order, transform
-        self.first, self.stop = first, stop
-
-    def __iter__(self) -> Iterator[Any]:  # Any: see `Transform`
-        worker = get_worker_info()
-        number, stride = (self.first, 1) if worker is None else (self.first + worker.id, worker.num_workers)
-        while self.stop is None or number < self.stop:
-            episodes = [self.source[int(row)] for row in self.order.rows(number)]
-            yield episodes if self.transform is None else self.transform(episodes, number)
-            number += stride
+    if get_worker_info() is None:
+        return batch
+    finder = _TensorFinder(_Nowhere(), pickle.HIGHEST_PROTOCOL, buffer_callback=lambda buffer: None)
+    finder.dump(batch)
+    tensors = [tensor for tensor in finder.found if not tensor.is_shared()]
+    if 2 * sum(tensor.untyped_storage().nbytes() for tensor in tensors) > _room():  # others fill it, too
+        return _Inline(batch)
+    try:
+        for tensor in tensors:
+            tensor.share_memory_()
+    except RuntimeError as error:
+        if "shared memory" not in str(error):
+            raise
+        return _Inline(batch)
+    return batch
 
 
-class BatchLoader(Generic[Episode]):
-    """Iterates over batches, and knows where it is.
+def _room() -> float:
+    """Return the free bytes of shared memory, where they are known: a failed attempt leaves an empty file."""
+    try:
+        status = os.statvfs("/dev/shm")
+    except (AttributeError, OSError):
+        return math.inf
+    return status.f_bavail * status.f_frsize
 
-    `for batch in loader` goes to the end of the epoch, and the next such loop through the next one;
-    `loader.forever()` goes on without an end and without starting workers anew.
+
+class _Inline:
+    """A batch that is sent with its numbers; the main process gets the batch itself.
 
     Args:
-        source: Episodes by number: a `ObjectCache`, or a `Dataset` for those with images.
-        order: Which of them each batch takes.
-        transform: Turns a list of episodes into a batch; see `BatchStream`.
-        num_workers: Processes that read ahead; 0 reads when asked.
-        context: How they start: "fork", "spawn" or "forkserver"; by default as the system does.
-        pin_memory: Put tensors into memory from which a GPU copies faster.
-
-    Raises:
-        ConfigError: The order is for another number of episodes.
-
-    Example:
-        >>> cache = open_object_cache(Dataset("demos"))
-        >>> order = BatchOrder(len(cache), batch_size=64, seed=0, lengths=cache.lengths())
-        >>> loader = BatchLoader(cache, order, num_workers=2)
-        >>> for episodes in loader: ...
-        >>> torch.save(loader.state_dict(), "position.pt")
+        batch: The batch.
     """
 
-    def __init__(
-        self,
-        source: Sequence[Episode],
-        order: BatchOrder,
-        *,
-        transform: Transform[Episode] | None = None,
-        num_workers: int = 0,
-        context: str | None = None,
-        pin_memory: bool = False,
-    ) -> None:
-        if len(source) != order.num_episodes:
-            raise ConfigError(f"the order is for {order.num_episodes} episodes; there are {len(source)}.")
-        self.source, self.order, self.transform = source, order, transform
-        self._options = {
-            "num_workers": num_workers,
-            "multiprocessing_context": context if num_workers else None,
-            "pin_memory": pin_memory,
-        }
-        self._num_done = 0
+    def __init__(self, batch: Any) -> None:  # Any: see `send`
+        self._content = pickle.dumps(batch, pickle.HIGHEST_PROTOCOL)
 
-    def __len__(self) -> int:
-        return self.order.batches_per_epoch
-
-    @property
-    def epoch(self) -> int:
-        """Number of whole epochs that were shown."""
-        return self._num_done // len(self)
-
-    def __iter__(self) -> Iterator[Any]:  # Any: see `Transform`
-        return self._batches((self.epoch + 1) * len(self))
-
-    def forever(self) -> Iterator[Any]:  # Any: see `Transform`
-        """Yield batches of epoch after epoch."""
-        return self._batches(None)
-
-    def state_dict(self) -> dict[str, Any]:  # Any: numbers and settings
-        """Return the position: batches that were shown, not those that were read ahead."""
-        return {"batches": self._num_done, "order": self.order.settings()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:  # Any: as above
-        """Go on from a position; the number of workers and of ranks may have changed.
-
-        Raises:
-            ConfigError: It belongs to another order.
-        """
-        ours = self.order.settings()
-        differences = [
-            f"{name} was {state['order'].get(name)}, is {value}"
-            for name, value in ours.items()
-            if state["order"].get(name) != value
-        ]
-        if differences:
-            raise ConfigError(f"the position belongs to another order: {'; '.join(differences)}.")
-        self._num_done = int(state["batches"])
-
-    def _batches(self, stop: int | None) -> Iterator[Any]:  # Any: see `Transform`
-        stream = BatchStream(
-            self.source, self.order, first=self._num_done, stop=stop, transform=self.transform
-        )
-        for batch in batches_of(stream, **self._options):
-            self._num_done += 1
-            yield batch
+    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
+        return pickle.loads, (self._content,)
 
 
-def batches_of(stream: BatchStream, **options: Any) -> DataLoader:  # Any: of several kinds
-    """Return what reads the batches of a stream, perhaps ahead.
+class _TensorFinder(pickle.Pickler):
+    """Finds the tensors in what it writes."""
 
-    Args:
-        stream: The batches; they come as they are, untouched by PyTorch's ways of collating.
-        **options: Of `DataLoader`, such as `num_workers`.
-    """
-    # Without a generator it would draw from the global one.
-    return DataLoader(stream, batch_size=None, collate_fn=_unchanged, generator=torch.Generator(), **options)
+    def __init__(self, *args: Any, **options: Any) -> None:  # Any: as for `Pickler`
+        super().__init__(*args, **options)
+        self.found: list[torch.Tensor] = []
+
+    def persistent_id(self, obj: Any) -> Any:  # Any: as in pickle
+        """Note a tensor, and write nothing of it."""
+        if not isinstance(obj, torch.Tensor):
+            return None
+        if obj.device.type == "cpu" and obj.layout == torch.strided:
+            self.found.append(obj)
+        return "tensor"
 
 
-def _unchanged(batch: Any) -> Any:  # Any: see `Transform`; PyTorch's default would turn tuples into lists
-    return sent(batch)
+class _Nowhere(io.RawIOBase):
+    """Takes what is written, and keeps nothing."""
+
+    def write(self, content: Any, /) -> int:  # Any: a buffer
+        """Return its length."""
+        return len(content)

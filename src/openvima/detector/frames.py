@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from openvima.data.object_cache.random_appearance import with_random_appearance
 from openvima.data.reader import Dataset
+from openvima.data.rerender import with_random_appearance
 from openvima.data.schema import VIEWS
 from openvima.errors import DatasetError
 from openvima.perception.objects import MIN_PIXELS

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
-from openvima.data.object_cache.cache import Boxes, ObjectCache, Report, open_object_cache
+from openvima.data.object_cache import Boxes, ObjectCache, Report, open_object_cache
 from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.detector.detection import MATCHING_VERSION, DetectedObjects

@@ -130,36 +130,6 @@ class PreprocessedPrompt:
         return image_names(self.text)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PreprocessedPrompts:
-    """The prompts of a batch, their tables joined.
-
-    Args:
-        texts: Their sentences.
-        num_images: Number of images of each, shape (B,), integers.
-        objects: Objects of all images, prompt after prompt.
-        objects_per_image: Number of objects of each image, integers.
-        is_scene: Whether each image shows the table, bool.
-    """
-
-    texts: Sequence[str]
-    num_images: np.ndarray
-    objects: ObjectTable
-    objects_per_image: np.ndarray
-    is_scene: np.ndarray
-
-    @staticmethod
-    def of(prompts: Sequence[PreprocessedPrompt]) -> "PreprocessedPrompts":
-        """Join prompts."""
-        return PreprocessedPrompts(
-            [prompt.text for prompt in prompts],
-            np.array([len(prompt.is_scene) for prompt in prompts], np.int64),
-            ObjectTable.concatenate([prompt.objects for prompt in prompts]),
-            np.concatenate([prompt.objects_per_image for prompt in prompts]),
-            np.concatenate([prompt.is_scene for prompt in prompts]),
-        )
-
-
 def preprocess_prompt(
     prompt: RenderedPrompt, kind: InputKind, extractor: ObjectExtractor | None, stack: ImageStack
 ) -> PreprocessedPrompt:

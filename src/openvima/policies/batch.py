@@ -7,9 +7,9 @@ Shape suffixes: B batch, T steps, L prompt positions, S objects in all prompts, 
 observation.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,30 +17,6 @@ import torch
 from openvima.perception.kernels import CROP_SIZE
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.tensor_record import TensorRecord
-
-
-@runtime_checkable
-class StoredImages(Protocol):
-    """Images of several demonstrations in files, which can be read straight into a stack."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of an image."""
-        ...
-
-    def read_first(self, counts: Sequence[int], starts: Sequence[int], stack: np.ndarray) -> None:
-        """Copy the first images of demonstrations.
-
-        Args:
-            counts: How many of each demonstration.
-            starts: Their places in the stack.
-            stack: Where to, (K, 3, height, width), uint8, contiguous.
-        """
-
-    def read(self, number: int) -> np.ndarray:
-        """Return all images of one demonstration."""
-        ...
-
 
 WORD = -1  # object index at a position that holds a word
 
@@ -134,45 +110,25 @@ class Batch(TensorRecord):
     false_positives: FalsePositiveBatch
     images: torch.Tensor | None = None
 
-    def with_images(self, images: Iterable[np.ndarray], counts: np.ndarray) -> "Batch":
+    def with_images(self, images: Sequence[np.ndarray]) -> "Batch":
         """Add the images in use, each once after a blank one, and renumber them.
 
         Args:
             images: Images of each demonstration, (K, 3, height, width), uint8, as they are numbered now.
-            counts: Number of them, shape (B,), integers.
         """
-        prompt_index, history_index = self.prompts.crop_index_VS, self.history.crop_index_BTVN
-        is_used = np.zeros(1 + counts.sum(), np.bool_)
-        is_used[0] = is_used[prompt_index.numpy()] = is_used[history_index.numpy()] = True
-        numbers = np.cumsum(is_used) - 1
-        ends = np.cumsum(counts)
-        starts = ends - counts
-        first, last = numbers[starts], numbers[ends]  # of the new numbers, the first excluded
-        # Those in use come first, unless augmentation left some out: then a copy of contiguous bytes will do.
-        is_prefix = numbers[starts + last - first] == last
-        if isinstance(images, StoredImages):
-            stack = _empty_stack(numbers[-1] + 1, images.shape)
-            stack[0] = 0
-            images.read_first(np.where(is_prefix, last - first, 0).tolist(), (first + 1).tolist(), stack)
-            for b in np.flatnonzero(~is_prefix).tolist():
-                used = is_used[starts[b] + 1 : ends[b] + 1]
-                stack[first[b] + 1 : last[b] + 1] = images.read(b)[used]
-            return self._renumbered(numbers, stack)
-        columns = (starts, ends, first, last, is_prefix)
-        stack = np.zeros((0, 0, 0, 0), np.uint8)
-        for each, (start, end, before, after, prefix) in zip(
-            images, zip(*(column.tolist() for column in columns), strict=True), strict=True
-        ):
-            if not stack.size:
-                stack = _empty_stack(numbers[-1] + 1, each.shape[1:])
-                stack[0] = 0
-            used = each[: after - before] if prefix else each[is_used[start + 1 : end + 1]]
-            stack[before + 1 : after + 1] = used
-        return self._renumbered(numbers, stack)
-
-    def _renumbered(self, numbers: np.ndarray, stack: np.ndarray) -> "Batch":
-        """Return the batch with an image stack; `numbers` are the new numbers of all images."""
         prompts, history = self.prompts, self.history
+        ends = np.cumsum([0, *map(len, images)])
+        is_used = np.zeros(1 + ends[-1], np.bool_)
+        is_used[0] = is_used[prompts.crop_index_VS.numpy()] = is_used[history.crop_index_BTVN.numpy()] = True
+        numbers = np.cumsum(is_used) - 1
+        stack = _empty_stack(numbers[-1] + 1, images[0].shape[1:])
+        stack[0] = 0
+        for own, start, end in zip(images, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+            first, last = numbers[start] + 1, numbers[end] + 1
+            used = is_used[start + 1 : end + 1]
+            # Those in use mostly come first: then contiguous bytes are copied, which is faster.
+            is_prefix = used[: last - first].all()
+            stack[first:last] = own[: last - first] if is_prefix else own[used]
         return replace(
             self,
             prompts=replace(prompts, crop_index_VS=torch.from_numpy(numbers[prompts.crop_index_VS.numpy()])),

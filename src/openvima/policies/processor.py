@@ -9,7 +9,6 @@ Shape suffixes: see `openvima.policies.batch`.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,37 +21,29 @@ from openvima.perception.objects import FRONT, TOP, ObjectExtractor, ObjectViews
 from openvima.perception.preprocessing import (
     InputKind,
     ObjectTable,
-    PreprocessedPrompts,
+    PreprocessedPrompt,
     extract_ahead,
     extract_observation,
+    offset_index,
     preprocess_prompt,
     split_prompt,
 )
 from openvima.policies.base import PromptLimits
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, InputLayout, PromptBatch
-from openvima.policies.kernels import (
-    find_slots,
-    int64,
-    pad_false_positives,
-    pad_history,
-    pad_prompts,
-    stack_prompt_objects,
-)
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
 from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
-from openvima.render.camera import CAMERAS, VIEWS
+from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import RenderedPrompt
 
 if TYPE_CHECKING:  # inference needs no demonstrations
-    from openvima.data.object_cache.episode import FalsePositives
-    from openvima.data.object_cache.episode_batch import EpisodeBatch
+    from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode
 
 MAX_LAYOUTS = 2**16  # token layouts of prompts to keep
 # A token takes a character at least, and 16 are more than any word of the vocabularies has on average.
 PROMPT_LIMITS = PromptLimits(16 * MAX_PROMPT_POSITIONS, objects=MAX_PROMPT_POSITIONS)
 
-_LayoutKey = tuple[str, bytes, tuple[int, ...]]
+_LayoutKey = tuple[str, tuple[int, ...], tuple[int, ...]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +108,7 @@ class Processor:
         stack = ImageStack(self.image_size)
         extract_ahead(self.input_kind, self.extractor, prompts=prompts)
         preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
-        return self.batch_prompts(PreprocessedPrompts.of(preprocessed)), stack
+        return self.batch_prompts(preprocessed), stack
 
     def encode_observations(
         self,
@@ -163,98 +154,99 @@ class Processor:
         counts = np.array([len(objects) for objects in found], np.int64)
         objects = ObjectTable.from_views(ObjectViews.concatenated(found), stack)
         slots_BT = self._num_slots(steps, counts, np.array(num_slots))
-        offsets = np.zeros_like(counts)
-        return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors), offsets), stack
+        return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors)), stack
 
     def batch_prompts(
-        self, prompts: PreprocessedPrompts, image_offsets: np.ndarray | None = None
+        self, prompts: Sequence[PreprocessedPrompt], first_images: np.ndarray | None = None
     ) -> PromptBatch:
         """Pad prompts to equal length and number objects across the batch.
 
         Args:
             prompts: The prompts.
-            image_offsets: Images of the stack before those of each prompt; None where there is one stack.
+            first_images: Images of the stack before those of each prompt; None where there is one stack.
         """
-        sequences = self._token_sequences(prompts)
-        layouts = sequences.layouts
+        layouts, tables, masks = zip(*map(self._token_sequence, prompts), strict=True)
+        # All tokens, and where they stand in the padded arrays.
+        word, row, part = np.concatenate([layout.tokens for layout in layouts]).T
         lengths = np.array([len(layout.tokens) for layout in layouts])
-        tokens = np.concatenate([layout.tokens for layout in layouts])
+        place = _rows_and_slots(lengths)
+        shape = (len(prompts), int(lengths.max(initial=0)))
+        # All objects that they stand for; an image that is named twice has its objects twice.
         counts = np.array([len(layout.rows) for layout in layouts])
-        image_index, shown, order = np.concatenate([layout.rows for layout in layouts]).T
-        first = np.cumsum(counts) - counts
-        prompt = np.repeat(np.arange(len(layouts)), counts)
-        first_image = np.cumsum(prompts.num_images) - prompts.num_images
-        shape = (len(layouts), int(lengths.max(initial=0)))
+        image_index, image, own_row = np.concatenate([layout.rows for layout in layouts]).T
+        b = np.repeat(np.arange(len(prompts)), counts)
+        objects = ObjectTable.concatenate(tables).select(own_row + _starts(list(map(len, tables)))[b])
+        if first_images is not None:
+            objects = objects.with_image_offset(first_images[b][:, None])
+        in_scene = np.concatenate([prompt.is_scene for prompt in prompts])
+        first_of = _starts([len(prompt.is_scene) for prompt in prompts])
         word_ids_BL, object_index_BL = np.full(shape, PADDING_ID), np.full(shape, WORD)
         mask_BL = np.zeros(shape, np.bool_)
-        is_valid = np.ones(len(tokens), np.bool_) if sequences.mask is None else sequences.mask
-        pad_prompts(lengths, first, len(order), tokens, is_valid, word_ids_BL, object_index_BL, mask_BL)
-        objects = sequences.objects
-        shape = (len(VIEWS), len(order))
-        crop_index_VS, masks_VS = np.empty(shape, np.int64), np.empty(shape, np.bool_)
-        boxes_VS4, positions_S2 = np.empty((*shape, 4), np.int64), np.empty((len(order), 2))
-        stack_prompt_objects(
-            _cameras(),
-            np.zeros(len(order), np.int64) if image_offsets is None else image_offsets[prompt],
-            order + (np.cumsum(sequences.num_objects) - sequences.num_objects)[prompt],
-            int64(objects.crop_index),
-            int64(objects.boxes),
-            crop_index_VS,
-            boxes_VS4,
-            masks_VS,
-            positions_S2,
-        )
+        word_ids_BL[place] = word
+        object_index_BL[place] = np.where(row == WORD, WORD, row + part * len(b) + _starts(counts)[place[0]])
+        mask_BL[place] = np.concatenate(masks)
         arrays = (
             word_ids_BL,
             object_index_BL,
             mask_BL,
             np.isin(word_ids_BL, self.tokenizer.texture_ids),
-            crop_index_VS,
-            boxes_VS4,
-            masks_VS,
-            positions_S2,
-            np.ascontiguousarray(image_index),
-            prompts.is_scene[first_image[prompt] + shown],
+            objects.crop_index.T.astype(np.int64),
+            objects.boxes.swapaxes(0, 1).astype(np.int64),
+            objects.masks.T,
+            _table_points(objects, objects.boxes[..., :2]),
+            image_index,
+            in_scene[first_of[b] + image],
         )
-        return PromptBatch(*(torch.from_numpy(array) for array in arrays))
+        return PromptBatch(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
-    def collate(self, episodes: "EpisodeBatch") -> Batch:
+    def collate(
+        self, episodes: "Sequence[PreprocessedEpisode]", first_images: Sequence[int] | None = None
+    ) -> Batch:
         """Pad demonstrations to equal lengths.
 
         Args:
             episodes: The demonstrations.
+            first_images: Images before those of each demonstration, in one stack of all after a blank image;
+                None stacks those of the batch.
 
         Raises:
             DatasetError: A demonstration has a step without visible objects.
             PromptError: A prompt has a word that T5 lacks.
         """
-        steps = _Steps.of(episodes.num_steps)
-        counts, objects = episodes.objects_per_step.astype(np.int64), episodes.objects
-        slots_BT = self._num_slots(steps, counts, np.zeros(len(episodes.num_steps), np.int64))
+        if first_images is None:
+            first_images = _starts([len(episode.images) for episode in episodes])
+        offsets_B = np.array(first_images, np.int64)
+        steps = _Steps.of([episode.num_steps for episode in episodes])
+        counts = np.concatenate([episode.objects_per_step for episode in episodes]).astype(np.int64)
+        slots_BT = self._num_slots(steps, counts, np.zeros(len(episodes), np.int64))
         for b, t in () if counts.all() else np.argwhere(steps.exist() & (slots_BT == 0))[:1]:
             raise DatasetError(
-                f"episode {episodes.seeds[b]} of {episodes.tasks[b]} shows no object before action {t}, so "
+                f"episode {episodes[b].seed} of {episodes[b].task} shows no object before action {t}, so "
                 "it cannot be trained on; exclude it."
             )
-        pick, place = np.full((2, len(counts)), -1)
-        if self.layout == "objects":  # elsewhere slots of two views need not be one object
-            ids = int64(objects.ids)
-            find_slots(counts, ids, int64(episodes.pick_ids), pick)
-            find_slots(counts, ids, int64(episodes.place_ids), place)
-        offsets = episodes.image_offsets[steps.b]
-        end_effectors = episodes.end_effectors[steps.b]
-        history = self._batch_history(objects, counts, steps, slots_BT, end_effectors, offsets)
+        objects = ObjectTable.concatenate([episode.objects for episode in episodes])
+        history = self._batch_history(
+            objects.with_image_offset(np.repeat(offsets_B[steps.b], counts)[:, None]),
+            counts,
+            steps,
+            slots_BT,
+            np.array([episode.end_effector for episode in episodes])[steps.b],
+        )
+        pick, place = (
+            self._slots_of(np.concatenate([getattr(episode, name) for episode in episodes]), objects, counts)
+            for name in ("pick_ids", "place_ids")
+        )
         targets = ActionTargets(
-            torch.from_numpy(steps.pad(episodes.actions)),
+            torch.from_numpy(steps.pad(np.concatenate([episode.actions for episode in episodes]))),
             torch.from_numpy(steps.pad(pick, fill=-1)),
             torch.from_numpy(steps.pad(place, fill=-1)),
             history.steps_BT,
         )
         return Batch(
-            self.batch_prompts(episodes.prompts, episodes.image_offsets),
+            self.batch_prompts([episode.prompt for episode in episodes], offsets_B),
             history,
             targets,
-            self._batch_false_positives(episodes.false_positives, steps, offsets),
+            self._batch_false_positives([e.false_positives for e in episodes], steps, offsets_B[steps.b]),
         )
 
     def _batch_history(
@@ -264,39 +256,42 @@ class Processor:
         steps: "_Steps",
         slots_BT: np.ndarray,
         end_effectors: np.ndarray,
-        offsets: np.ndarray,
     ) -> HistoryBatch:
-        """Pad the objects of all steps to slots; counts, end effectors, offsets are those of steps."""
+        """Pad the objects of all steps to slots; counts and end effectors are those of steps."""
+        step, slot = _rows_and_slots(counts)
         if self.layout == "views":
-            objects = _visible_first(objects, _steps_and_slots(counts)[0])
+            objects = _visible_first(objects, step)
         (count, length), num_slots = steps.shape, max(1, int(slots_BT.max(initial=0)))
-        shape = (count, length, len(VIEWS), num_slots)
-        crop_index_BTVN, masks_BTVN = np.zeros(shape, np.int64), np.zeros(shape, np.bool_)
-        boxes_BTVN4 = np.zeros((*shape, 4), np.int64)
-        positions_BTN2, grasps_BTN2 = np.zeros((2, count, length, num_slots, 2))
-        padded = (crop_index_BTVN, boxes_BTVN4, masks_BTVN, positions_BTN2, grasps_BTN2)
-        pad_history(
-            _cameras(),
-            steps.place,
-            counts,
-            slots_BT.reshape(-1)[steps.place],
-            offsets,
-            int64(objects.crop_index),
-            int64(objects.boxes),
-            int64(objects.grasps),
-            *(array.reshape(-1, *array.shape[2:]) for array in padded),
+        place = steps.place[step]
+        crop_index, masks = np.zeros((2, count * length, len(VIEWS), num_slots), np.int64)
+        boxes = np.zeros((count * length, len(VIEWS), num_slots, 4), np.int64)
+        crop_index[place, :, slot], masks[place, :, slot] = objects.crop_index, objects.masks
+        boxes[place, :, slot] = objects.boxes
+        # A slot that has lost its object is at the corner of the front view.
+        is_slot = np.arange(num_slots) < slots_BT.reshape(-1, 1)
+        positions = is_slot[..., None] * unproject(np.zeros(2), CAMERAS["front"])
+        grasps = positions.copy()
+        positions[place, slot] = _table_points(objects, objects.boxes[..., :2])
+        grasps[place, slot] = _table_points(objects, objects.grasps)
+        return HistoryBatch(
+            *(
+                torch.from_numpy(array.reshape(*steps.shape, *array.shape[1:]))
+                for array in (crop_index, boxes, masks.astype(np.bool_))
+            ),
+            torch.from_numpy(slots_BT),
+            *(torch.from_numpy(array.reshape(*steps.shape, num_slots, 2)) for array in (positions, grasps)),
+            torch.from_numpy(steps.pad(end_effectors)),
+            torch.from_numpy(steps.exist()),
         )
-        arrays = (
-            crop_index_BTVN,
-            boxes_BTVN4,
-            masks_BTVN,
-            slots_BT,
-            positions_BTN2,
-            grasps_BTN2,
-            steps.pad(end_effectors),
-            steps.exist(),
-        )
-        return HistoryBatch(*(torch.from_numpy(array) for array in arrays))
+
+    def _slots_of(self, ids: np.ndarray, objects: ObjectTable, counts: np.ndarray) -> np.ndarray:
+        """Return the slot of the object that has the id of its step, shape (T,), -1 where there is none."""
+        slots = np.full(len(counts), -1)
+        if self.layout == "objects":  # elsewhere slots of two views need not be one object
+            step, slot = _rows_and_slots(counts)
+            found = objects.ids == ids[step]
+            slots[step[found]] = slot[found]
+        return slots
 
     def _num_slots(self, steps: "_Steps", counts: np.ndarray, before_B: np.ndarray) -> np.ndarray:
         """Slots at each step, shape (B, T), int64; never decreasing with layout "views"."""
@@ -320,74 +315,47 @@ class Processor:
             )
 
     def _batch_false_positives(
-        self, found: "FalsePositives", steps: "_Steps", offsets: np.ndarray
+        self, found: "Sequence[FalsePositives]", steps: "_Steps", offsets: np.ndarray
     ) -> FalsePositiveBatch:
-        padded = (
-            np.zeros((*steps.shape, len(VIEWS)), np.int64),
-            np.zeros((*steps.shape, len(VIEWS), 4), np.int64),
-            np.zeros((*steps.shape, len(VIEWS), 2)),
-        )
-        pad_false_positives(
-            _cameras(),
-            self.layout != "frames",
-            steps.place,
-            offsets,
-            int64(found.crop_index),
-            int64(found.boxes),
-            *(array.reshape(-1, *array.shape[2:]) for array in padded),
-        )
-        return FalsePositiveBatch(*padded)
+        crop_index = np.concatenate([each.crop_index for each in found])
+        boxes = np.concatenate([each.boxes for each in found]).astype(np.int64)
+        points = np.zeros((*crop_index.shape, 2))
+        if self.layout != "frames":
+            for v, view in enumerate(VIEWS):
+                points[:, v] = unproject(boxes[:, v, :2], CAMERAS[view])
+        crop_index = offset_index(crop_index, offsets[:, None])
+        return FalsePositiveBatch(*(steps.pad(column) for column in (crop_index, boxes, points)))
 
-    def _token_sequences(self, prompts: PreprocessedPrompts) -> "_TokenSequences":
-        """Build the token sequences of prompts: words, and one or more tokens per object of an image.
+    def _token_sequence(self, prompt: PreprocessedPrompt) -> tuple["_Layout", ObjectTable, np.ndarray]:
+        """Return the tokens of a prompt, its objects, and which tokens are valid.
 
-        With layout "views" every image is padded to the slots of the prompt's largest one, as in the
+        Tokens are words, and one or more for each object of an image. With layout "views" the visible objects
+        of each view come first, and every image is padded to the slots of the prompt's largest one, as in the
         published evaluation, where this affects T5's relative positions.
         """
-        stored, ends = int64(prompts.objects_per_image), np.cumsum(prompts.num_images)
-        bounds = zip((ends - prompts.num_images).tolist(), ends.tolist(), strict=True)
-        content, size = stored.tobytes(), stored.itemsize
-        counts = [content[size * start : size * end] for start, end in bounds]
-        if self.layout == "views":
-            return self._in_views(prompts, counts)
-        layouts = self._layouts
-        found = [
-            layouts.get((text, each, ())) or self._layout_of(text, each, ())
-            for text, each in zip(prompts.texts, counts, strict=True)
-        ]
-        objects_before = np.concatenate([[0], np.cumsum(stored)])
-        num_objects = objects_before[ends] - objects_before[ends - prompts.num_images]
-        return _TokenSequences(found, prompts.objects, num_objects, None)
+        counts = prompt.objects_per_image
+        if self.layout != "views":
+            layout = self._layout_of(prompt.text, tuple(counts.tolist()), ())
+            return layout, prompt.objects, np.ones(len(layout.tokens), np.bool_)
+        in_text = [piece for piece in split_prompt(prompt.text) if isinstance(piece, int)]
+        ends = np.cumsum(counts)
+        rows = [np.arange(ends[number] - counts[number], ends[number]) for number in in_text]
+        image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
+        ordered = prompt.objects.select(np.concatenate([np.zeros(0, np.int64), *rows]))
+        objects, slots = _compact(ordered, image, len(rows))
+        layout = self._layout_of(prompt.text, tuple(counts.tolist()), slots)
+        _, entries, parts = layout.tokens.T
+        mask = (entries == WORD) | bool(self.tokens_per_image)
+        mask[~mask] = objects.masks[entries[~mask], parts[~mask]]
+        return layout, objects, mask
 
-    def _in_views(self, prompts: PreprocessedPrompts, images: Sequence[bytes]) -> "_TokenSequences":
-        """Move the visible objects of each view to the front; slots differ from prompt to prompt."""
-        layouts, tables, masks = [], [], []
-        counts_of = [np.frombuffer(each, np.int64) for each in images]
-        tables_of = prompts.objects.split(np.array([counts.sum() for counts in counts_of]))
-        for text, counts, table in zip(prompts.texts, counts_of, tables_of, strict=True):
-            in_text = [piece for piece in split_prompt(text) if isinstance(piece, int)]
-            ends = np.cumsum(counts)
-            rows = [np.arange(ends[number] - counts[number], ends[number]) for number in in_text]
-            image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
-            ordered = table.select(np.concatenate([np.zeros(0, np.int64), *rows]))
-            objects, slots = _compact(ordered, image, len(rows))
-            layout = self._layout_of(text, counts.tobytes(), slots)
-            _, entries, parts = layout.tokens.T
-            mask = (entries == WORD) | bool(self.tokens_per_image)
-            mask[~mask] = objects.masks[entries[~mask], parts[~mask]]
-            layouts.append(layout)
-            tables.append(objects)
-            masks.append(mask)
-        num_objects = np.array([len(table) for table in tables])
-        return _TokenSequences(layouts, ObjectTable.concatenate(tables), num_objects, np.concatenate(masks))
-
-    def _layout_of(self, text: str, counts: bytes, slots: tuple[int, ...]) -> "_Layout":
-        """Return the cached layout of a text, given the number of objects per image, int64."""
+    def _layout_of(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
+        """Return the cached layout of a text, given the number of objects per image."""
         key = (text, counts, slots)
         if key not in self._layouts:
             if len(self._layouts) >= MAX_LAYOUTS:
                 self._layouts.clear()
-            self._layouts[key] = self._lay_out(text, np.frombuffer(counts, np.int64).tolist(), slots)
+            self._layouts[key] = self._lay_out(text, counts, slots)
         return self._layouts[key]
 
     def _lay_out(self, text: str, counts: Sequence[int], slots: tuple[int, ...]) -> "_Layout":
@@ -437,16 +405,6 @@ class _Layout:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _TokenSequences:
-    """Prompts: layout of each, objects of all, number in each, and mask of all tokens (None: all valid)."""
-
-    layouts: list[_Layout]
-    objects: ObjectTable
-    num_objects: np.ndarray
-    mask: np.ndarray | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Steps:
     """Episode `b` of each step, its place in a padded array, and the shape (B, T) of that."""
 
@@ -458,7 +416,7 @@ class _Steps:
     def of(lengths: Sequence[int] | np.ndarray) -> "_Steps":
         """Number the steps of episodes of these lengths."""
         lengths = np.asarray(lengths, np.int64)
-        b, t = _steps_and_slots(lengths)
+        b, t = _rows_and_slots(lengths)
         shape = (len(lengths), int(lengths.max(initial=0)))
         return _Steps(b, b * shape[1] + t, shape)
 
@@ -476,10 +434,21 @@ class _Steps:
         return result.reshape(*self.shape, *column.shape[1:])
 
 
-def _steps_and_slots(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Step and slot of each object, from the number of objects of each step."""
-    step = np.repeat(np.arange(len(counts)), counts)
-    return step, np.arange(len(step)) - np.repeat(np.cumsum(counts) - counts, counts)
+def _rows_and_slots(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row and place in it of each element, from the number of elements of each row."""
+    row = np.repeat(np.arange(len(counts)), counts)
+    return row, np.arange(len(row)) - _starts(counts)[row]
+
+
+def _starts(counts: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Where each of several consecutive parts begins, from their lengths."""
+    return np.cumsum(counts, dtype=np.int64) - counts
+
+
+def _table_points(objects: ObjectTable, pixels: np.ndarray) -> np.ndarray:
+    """Points on the table under pixels (N, 2 views, 2): those of the top view, or else the front view."""
+    front, top = (unproject(pixels[:, v], CAMERAS[view]) for v, view in enumerate(VIEWS))
+    return np.where(objects.masks[:, TOP, None], top, front)
 
 
 def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
@@ -518,9 +487,3 @@ def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:
         objects.boxes[order, views],
         objects.grasps[order, views],
     )
-
-
-@cache
-def _cameras() -> np.ndarray:
-    """The cameras of the views as matrices, shape (2, 4, 4)."""
-    return np.stack([CAMERAS[view].matrix() for view in VIEWS])

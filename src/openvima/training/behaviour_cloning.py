@@ -8,17 +8,17 @@ import numpy as np
 import torch
 from torch import nn
 
-from openvima.data.object_cache.cache import ObjectCache
-from openvima.data.torch_dataset import BatchStream, batches_of
+from openvima.data.object_cache import ObjectCache
 from openvima.errors import ConfigError
 from openvima.multiprocess import num_cpus
 from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.training.batches import BatchMaker, ExampleSource, read_batches
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Metrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.stage import crop_parameters
-from openvima.training.source import ExampleSource, Parts, by_length, order_of
+from openvima.training.source import order_of
 
 CHUNK = 64  # demonstrations per batch of precomputed features
 MAX_FEATURES = 4_000_000  # images, about 1 kB each; above, features are computed in every step
@@ -95,13 +95,13 @@ class BehaviourCloning:
         # Sorted by length, to reduce padding; processes take parts in turn.
         rows = np.lexsort(source.lengths.T[::-1])
         for number, start in enumerate(range(0, len(rows), size)):
-            examples = [source[int(row)] for row in rows[start : start + size]]
             mine = number % ranks == self._parallel.rank
             if not (mine or self._parallel.is_sharded):  # a sharded network needs all processes
                 continue
-            for group in by_length(examples):
-                loss, metrics = self._call(collate(group, None), self._validated)
-                weight = sum(e.num_steps for e in group) / total
+            for group in source.by_length(rows[start : start + size]):
+                batch = collate([source[index] for index in group.tolist()], None)
+                loss, metrics = self._call(batch, self._validated)
+                weight = source.num_steps(group) / total
                 _add(sums, {"loss": loss, **metrics}, weight * mine * ranks)
         sums = self._parallel.mean(sums)
         score = sums[self._learner.score]
@@ -110,22 +110,18 @@ class BehaviourCloning:
     def _from(self, step: int) -> Iterator[list[tuple[Any, int]]]:
         config, parts = self._config, self._config.optimizer.grad_accum_steps
         ours = self._order.batch_size // self._parallel.num_ranks
-        stream = BatchStream(
+        make = BatchMaker(
             self._training,
-            self._order,
-            first=step,
-            transform=Parts(
-                self._learner.collator(),
-                config.seed,
-                largest=-(-ours // parts),
-                # Sharded weights are gathered at every pass, so all processes make equally many passes.
-                count=min(parts, ours) if self._parallel.is_sharded else None,
-                alternatives=self._alternatives,
-                distractors=self._training if config.augmentation.distractor_prob else None,
-                distractor_prob=config.augmentation.distractor_prob,
-            ),
+            self._learner.collator(),
+            config.seed,
+            largest=-(-ours // parts),
+            # Sharded weights are gathered at every pass, so all processes make equally many passes.
+            count=min(parts, ours) if self._parallel.is_sharded else None,
+            alternatives=self._alternatives,
+            distractor_prob=config.augmentation.distractor_prob,
         )
-        return iter(batches_of(stream, num_workers=min(config.loader.num_workers, num_cpus())))
+        workers = min(config.loader.num_workers, num_cpus())
+        return iter(read_batches(self._order, make, first=step, num_workers=workers))
 
     def _call(
         self, batch: Any, module: nn.Module

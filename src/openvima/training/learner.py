@@ -1,6 +1,6 @@
 """`Learner`, the trained module: it makes batches of demonstrations, and computes a loss."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,6 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.data.object_cache.cache import ObjectCache
-from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import Policy
@@ -26,11 +24,9 @@ from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
 from openvima.training.augmentation.false_positives import augmented
-from openvima.training.dataset import Example, StoredEpisode
+from openvima.training.batches import Collate
+from openvima.training.dataset import Example
 from openvima.user_code import call_function
-
-# From examples and, in training, one generator for each, to a batch.
-Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
 
 
 class Learner(nn.Module):
@@ -199,30 +195,15 @@ class PolicyCollate:
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
     ) -> Batch:
         """Make a batch; see `Learner.collator`."""
-        stored = _read_together(examples) if self._augmentation.is_certain_to_change_nothing else None
-        if stored is not None:
-            if not self._with_images:
-                stored = replace(stored, image_offsets=np.array([example.base for example in examples]))
-            return self._batch(stored, stored.images, stored.num_images, rngs)
         images: list[np.ndarray] = []
         if self._with_images:
             examples, images = _stacked(examples)
         drawn = [None] * len(examples) if rngs is None else rngs
         examples = [self._augmentation(example, rng) for example, rng in zip(examples, drawn, strict=True)]
-        episodes = EpisodeBatch.of([e.episode for e in examples], [e.base for e in examples])
-        return self._batch(episodes, images, np.array(list(map(len, images))), rngs)
-
-    def _batch(
-        self,
-        episodes: EpisodeBatch,
-        images: Iterable[np.ndarray],
-        num_images: np.ndarray,
-        rngs: Sequence[np.random.Generator] | None,
-    ) -> Batch:
-        batch = self._processor.collate(episodes)
+        batch = self._processor.collate([e.episode for e in examples], [e.base for e in examples])
         if rngs is not None:
             batch = augmented(batch, self._processor.layout, probability=self._probability, rngs=rngs)
-        return batch.with_images(images, num_images) if self._with_images else batch
+        return batch.with_images(images) if self._with_images else batch
 
 
 def make_learner(name: str) -> Learner:
@@ -238,17 +219,6 @@ def make_learner(name: str) -> Learner:
     if not isinstance(learner, Learner):
         raise ConfigError(f"{name} returned a {type(learner).__name__}; it must return a Learner.")
     return learner
-
-
-def _read_together(examples: Sequence[Example]) -> EpisodeBatch | None:
-    """Read demonstrations that none has read yet, of one cache, together; None if they are others."""
-    contents = [example.content for example in examples if example.other is None]
-    unread = [each for each in contents if isinstance(each, StoredEpisode) and not each.is_read]
-    caches = {id(each.cache): each.cache for each in unread}
-    if len(unread) < len(examples) or len(caches) != 1:
-        return None
-    (cache,) = caches.values()
-    return cache.batch([each.row for each in unread]) if isinstance(cache, ObjectCache) else None
 
 
 def _stacked(examples: Sequence[Example]) -> tuple[list[Example], list[np.ndarray]]:

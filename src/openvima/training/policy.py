@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from openvima.catalog.packs import load_assets
-from openvima.data.object_cache.cache import (
+from openvima.data.object_cache import (
     Boxes,
     ObjectCache,
     Variant,
     check_object_cache,
     open_object_cache,
 )
-from openvima.data.object_cache.random_appearance import check_scenes
 from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
@@ -21,6 +20,7 @@ from openvima.policies.base import torch_threads
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
+from openvima.training.batches import ExampleSource
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
@@ -34,8 +34,8 @@ from openvima.training.recipes import command_going_on
 from openvima.training.run_folder import run_lock
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import (
-    ExampleSource,
     alternative_source,
+    check_scenes,
     check_words,
     demonstrated_actions,
     open_demonstrations,

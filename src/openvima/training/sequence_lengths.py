@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from openvima.data.object_cache.cache import ObjectCache
-from openvima.data.object_cache.episode import PreprocessedEpisode
-from openvima.data.object_cache.episode_batch import EpisodeBatch
+from openvima.data.object_cache import ObjectCache
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.errors import DatasetError, PolicyError
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.nn.actions import ACTION_WIDTH
@@ -91,7 +90,7 @@ def _forward(
 ) -> None:
     """Run the network on one demonstration, with black images."""
     device = next(network.parameters()).device
-    batch = processor.collate(EpisodeBatch.of([episode])).to(device)
+    batch = processor.collate([episode]).to(device)
     height, width = processor.image_size
     black = network.encode_images(torch.zeros(1, 3, height, width, dtype=torch.uint8, device=device))
     features = black.expand(1 + len(episode.images), *black.shape[1:])

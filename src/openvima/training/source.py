@@ -1,129 +1,25 @@
 """The demonstrations of a run, from the object cache: training split, validation split, and batches."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from openvima.data.batching import BatchOrder
 from openvima.data.hash_split import split_hashes
 from openvima.data.hub import data_folder
-from openvima.data.object_cache.cache import ObjectCache
+from openvima.data.object_cache import ObjectCache
 from openvima.data.reader import Dataset, read_manifest
+from openvima.data.rerender import UNKNOWN_SCENES
 from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.processor import Processor
 from openvima.tasks.registry import list_tasks
 from openvima.training.augmentation.describe_objects import text_of
-from openvima.training.augmentation.distractor_insertion import allows_distractors
-from openvima.training.dataset import Example, StoredEpisode
-from openvima.training.learner import Collate
+from openvima.training.batches import BatchOrder, ExampleSource
 from openvima.training.provenance import held_out_demonstrations
 
 _PRIOR_DEMONSTRATIONS = 10_000  # enough for the marginals of 100 bins
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ExampleSource(Sequence[Example]):
-    """A subset of the demonstrations of a cache.
-
-    Args:
-        cache: All demonstrations.
-        rows: Their indices, ascending, shape (N,), int64.
-        bases: Index of the first image of each demonstration of the cache, shape (all,), int64.
-        lengths: Steps of each, and objects in view in all of them, shape (N, 2), int64.
-    """
-
-    cache: ObjectCache
-    rows: np.ndarray
-    bases: np.ndarray
-    lengths: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __getitem__(self, index: int) -> Example:  # type: ignore[override]  # nobody slices
-        row = int(self.rows[index])
-        content = StoredEpisode(self.cache, row, int(self.lengths[index, 0]))
-        return Example(content, int(self.bases[row]), row)
-
-    def example(self, row: int) -> Example:
-        """Return a demonstration by its index in the cache."""
-        return Example(self.cache[row], int(self.bases[row]), row)
-
-    def has(self, row: int) -> bool:
-        """Whether a demonstration of the cache, by its index there, is one of these."""
-        place = int(np.searchsorted(self.rows, row))
-        return place < len(self.rows) and int(self.rows[place]) == row
-
-    def num_steps(self, indices: np.ndarray) -> int:
-        """Return the total steps of some demonstrations."""
-        return int(self.lengths[indices, 0].sum())
-
-
-@dataclass(frozen=True, slots=True)
-class Parts:
-    """Collates the batch of a process in parts of similar length.
-
-    Args:
-        collate: Makes a batch of each part.
-        seed: Of the run; every example of every batch has its own generator.
-        largest: Maximum size of a part.
-        count: Number of parts, whatever the lengths; None is as many as needed.
-        alternatives: Other caches of the same demonstrations, each with the probability of using it instead
-            where it has the demonstration; see `alternative_source`.
-        distractors: Demonstrations from which distractors are inserted; see `with_distractors`.
-        distractor_prob: Probability of that, for demonstrations that allow it.
-    """
-
-    collate: Collate
-    seed: int
-    largest: int
-    count: int | None = None
-    alternatives: tuple[tuple[ExampleSource, float], ...] = ()
-    distractors: ExampleSource | None = None
-    distractor_prob: float = 0.0
-
-    def __call__(self, examples: Sequence[Example], number: int) -> list[tuple[object, int]]:
-        """Return the parts of one batch, each with its number of demonstration steps."""
-        parts = []
-        for part in self._divided(examples):
-            rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
-            drawn = [self._drawn(example, rng) for example, rng in zip(part, rngs, strict=True)]
-            parts.append((self.collate(drawn, rngs), sum(e.num_steps for e in part)))
-        return parts
-
-    def _drawn(self, example: Example, rng: np.random.Generator) -> Example:
-        """Draw which cache an example is from, and the source of its distractors."""
-        if self.alternatives:
-            drawn, sources = rng.random(), [source for source, _ in self.alternatives]
-            ends = np.cumsum([prob for _, prob in self.alternatives])
-            if drawn < ends[-1]:
-                source = sources[int(np.searchsorted(ends, drawn, side="right"))]
-                example = source.example(example.row) if source.has(example.row) else example
-        others = self.distractors
-        if (
-            others is None
-            or not allows_distractors(example.episode.task)
-            or rng.random() >= self.distractor_prob
-        ):
-            return example
-        return replace(example, other=others[int(rng.integers(len(others)))])
-
-    def _divided(self, examples: Sequence[Example]) -> list[Sequence[Example]]:
-        if self.count is not None:
-            ordered = sorted(examples, key=lambda example: example.num_steps)
-            ends = [len(ordered) * part // self.count for part in range(self.count + 1)]
-            return [ordered[start:end] for start, end in pairwise(ends)]
-        size = self.largest
-        return [
-            group[start : start + size]
-            for group in by_length(examples)
-            for start in range(0, len(group), size)
-        ]
 
 
 def open_demonstrations(
@@ -168,6 +64,17 @@ def _without_tasks(folder: Path, excluded: Sequence[str]) -> Dataset:
             f"{', '.join(present)}."
         )
     return Dataset(folder, tasks=kept)
+
+
+def check_scenes(dataset: Dataset) -> None:
+    """Check that the scenes of demonstrations are known, by the first one of each shard.
+
+    Raises:
+        DatasetError: They are not, as in imported data.
+    """
+    for name in dataset.shard_names():
+        if not len(dataset.shard(name).read(0, ["poses"])["poses"]):
+            raise DatasetError(UNKNOWN_SCENES.format(f"shard {name}"))
 
 
 def split_examples(
@@ -264,11 +171,3 @@ def order_of(
         rank=rank,
         num_ranks=num_ranks,
     )
-
-
-def by_length(examples: Sequence[Example]) -> list[list[Example]]:
-    """Group examples of 1, of 2 or 3, and of more steps, to reduce padding."""
-    groups: dict[int, list[Example]] = {}
-    for example in examples:
-        groups.setdefault(min(2, example.num_steps // 2), []).append(example)
-    return [groups[key] for key in sorted(groups)]

@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, ObjectViews  # noqa: E402

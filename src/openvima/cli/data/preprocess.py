@@ -43,7 +43,7 @@ def preprocess(
     Returns:
         Exit status.
     """
-    from openvima.data.object_cache.cache import open_object_cache
+    from openvima.data.object_cache import open_object_cache
     from openvima.data.reader import Dataset
     from openvima.detector.plugins import detected_object_cache, plugged_boxes
     from openvima.errors import ConfigError

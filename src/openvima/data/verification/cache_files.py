@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from openvima.data.manifest import CACHE_FOLDER
-from openvima.data.object_cache.cache_file import CacheFile, file_name
-from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
+from openvima.data.object_cache import CacheFile
+from openvima.data.preprocessed import PreprocessedEpisode, preprocess
 from openvima.data.shard import Shard
 from openvima.data.verification.findings import Problem, Report, by_cause
 from openvima.errors import OpenVimaError, ShardError
@@ -53,7 +53,7 @@ def check_cache(
     tasks = [
         CacheTask(path, folder / shard, content_hash)
         for shard, content_hash in sorted(content_hashes.items())
-        for path in sorted((folder / CACHE_FOLDER).glob(f"*/{file_name(shard)}"))
+        for path in sorted((folder / CACHE_FOLDER).glob(f"*/{shard}"))
     ]
     total = sum(len(Shard(task.shard)) for task in tasks)
     watch = None if report is None else (lambda done: report(done, total, "comparing the object cache"))

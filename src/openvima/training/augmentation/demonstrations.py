@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.training.augmentation.describe_objects import DescribeObjects
 from openvima.training.augmentation.distractor_insertion import with_distractors
 from openvima.training.augmentation.drop_unused_objects import DropUnusedObjects
@@ -54,15 +54,6 @@ class DemonstrationAugmentation:
     inverse_dynamics_prob: float = 0.0
     of_inverse_dynamics: tuple[Transform, ...] = ()
     of_tasks: tuple[Transform, ...] = (with_distractors,)
-
-    @property
-    def is_certain_to_change_nothing(self) -> bool:
-        """Whether demonstrations stay as they are, those without a source of distractors."""
-        transforms = [each for each in self.of_tasks if each is not with_distractors]
-        return not self.inverse_dynamics_prob and all(
-            isinstance(each, Randomly | DescribeObjects | UnknownWords) and not each.prob
-            for each in transforms
-        )
 
     def __call__(self, example: Example, rng: np.random.Generator | None) -> Example:
         """Augment a demonstration; without a generator, as in validation, only what is certain happens."""

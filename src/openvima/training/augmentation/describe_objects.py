@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.tasks.prompts import synonyms, with_phrases
 from openvima.training.augmentation.prompt_images import images_by_name, with_prompt
 from openvima.training.dataset import Example

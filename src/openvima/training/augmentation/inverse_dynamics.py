@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.errors import UnknownTaskError
 from openvima.tasks.paraphrasing import rephrased, training_paraphrases
 from openvima.tasks.registry import task_spec

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, image_names
 
 DEFINITION = "This is a {noun} {image}."  # as in `novel_noun`

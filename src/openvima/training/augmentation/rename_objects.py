@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.perception.preprocessing import ObjectTable
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 from openvima.tasks.sweep_table import NUMBER_WORDS

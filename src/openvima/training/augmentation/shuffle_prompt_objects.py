@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 
 
 def with_shuffled_prompt_objects(

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.training.augmentation.prompt_images import DEFINITION, images_by_name, with_prompt
 
 _SENTENCE_END = re.compile(r"(?<=\.) ")

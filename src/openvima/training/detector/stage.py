@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from openvima.data.batching import BatchOrder
-from openvima.data.object_cache.random_appearance import check_scenes
 from openvima.detector.augmentation import augment_frame
 from openvima.detector.checkpoint import load_network
 from openvima.detector.config import detector_config
@@ -16,6 +14,7 @@ from openvima.detector.frames import Frame, FrameSampler, held_out_frames
 from openvima.detector.network import MaskRCNN
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.base import torch_threads
+from openvima.training.batches import BatchOrder
 from openvima.training.detector.config import DetectorTrainingConfig
 from openvima.training.detector.learner import DetectorLearner, FrameBatch
 from openvima.training.detector.split import split_episodes
@@ -24,7 +23,7 @@ from openvima.training.parallel import Parallel, compile_layers, joined
 from openvima.training.provenance import held_out_demonstrations
 from openvima.training.run_folder import run_lock
 from openvima.training.schedule import step_generator, step_seed
-from openvima.training.source import open_demonstrations
+from openvima.training.source import check_scenes, open_demonstrations
 
 VALIDATION_BATCH = 8  # frames
 

@@ -12,10 +12,9 @@ from openvima.catalog.partitions import OBJECT_SETS
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random
 from openvima.cli.main import main
 from openvima.data import Dataset
-from openvima.data.object_cache.cache import ObjectCache, open_object_cache
-from openvima.data.object_cache.random_appearance import (
+from openvima.data.object_cache import ObjectCache, open_object_cache
+from openvima.data.rerender import (
     RandomAppearance,
-    check_scenes,
     with_random_appearance,
 )
 from openvima.data.verification import verify
@@ -173,9 +172,9 @@ def test_each_appearance_has_a_folder_of_its_own(copy: Path):
     dataset = Dataset(copy, tasks=["rotate"])
     caches = [open_object_cache(dataset, appearance=number) for number in (None, 0, 1)]
     assert [cache.folder.name for cache in caches] == [
-        "objects-v6",
-        "objects-v6-rerendered-v1-0",
-        "objects-v6-rerendered-v1-1",
+        "objects-v7",
+        "objects-v7-rerendered-v1-0",
+        "objects-v7-rerendered-v1-1",
     ]
     stored, *others = caches
     for plain, *rows in zip(stored, *others, strict=True):
@@ -186,16 +185,15 @@ def test_each_appearance_has_a_folder_of_its_own(copy: Path):
             np.testing.assert_array_equal(np.sort(episode.pick_ids), np.sort(plain.pick_ids))
         assert len({each.images.tobytes() for each in (plain, *rows)}) == 3
     assert len(ObjectCache(dataset, variant="rerendered-v1-1")) == len(dataset)
-    check_scenes(dataset)
 
 
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["data", "preprocess", str(copy), "--rerendered", "0"]) == 0
-    folder = copy / "object_cache" / "objects-v6-rerendered-v1-0"
+    folder = copy / "object_cache" / "objects-v7-rerendered-v1-0"
     assert capsys.readouterr().out.strip() == str(folder)
-    times = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.cache")}
+    times = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
     open_object_cache(Dataset(copy), appearance=0)
-    assert times == {path.name: path.stat().st_mtime_ns for path in folder.glob("*.cache")}
+    assert times == {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
     assert not verify(copy).problems
     for wrong in (["--rerendered", "-1"], ["--rerendered", "0", "--boxes", "detector"]):
         assert main(["data", "preprocess", str(copy), *wrong]) == 2

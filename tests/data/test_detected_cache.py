@@ -12,9 +12,14 @@ from noisy_extractor import HOOK, NoisyExtractor
 from object_rows import rows_of
 from openvima.cli.main import main
 from openvima.data import Dataset
-from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
-from openvima.data.object_cache.cache_file import CacheFile, write_cache_file
-from openvima.data.object_cache.episode import preprocess
+from openvima.data.object_cache import (
+    Boxes,
+    CacheFile,
+    ObjectCache,
+    open_object_cache,
+    write_cache_file,
+)
+from openvima.data.preprocessed import preprocess
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, WorkerError
 from openvima.perception.iou import object_iou
@@ -76,9 +81,9 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
     one, two = Boxes("clumsy-1", partial(make, 1)), Boxes("clumsy-2", partial(make, 2))
     caches = [open_object_cache(dataset, boxes=boxes) for boxes in (None, one, two)]
     assert [cache.folder.name for cache in caches] == [
-        "objects-v6",
-        "objects-v6-clumsy-1",
-        "objects-v6-clumsy-2",
+        "objects-v7",
+        "objects-v7-clumsy-1",
+        "objects-v7-clumsy-2",
     ]
     assert made == [1, 2]  # once, for all shards
     reopened = open_object_cache(dataset, boxes=two)
@@ -114,8 +119,8 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
 
     with pytest.raises(WorkerError, match="enough"):
         open_object_cache(dataset, boxes=Boxes("clumsy-1", Tiring))
-    folder = copy / "object_cache" / "objects-v6-clumsy-1"
-    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.cache")}
+    folder = copy / "object_cache" / "objects-v7-clumsy-1"
+    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
     assert 1 <= len(before) <= 5
     cache = open_object_cache(dataset, boxes=CLUMSY)
     assert all((folder / name).stat().st_mtime_ns == time for name, time in before.items())
@@ -127,7 +132,7 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
 def test_a_cache_may_hold_a_fraction_of_the_demonstrations(copy: Path) -> None:
     dataset = Dataset(copy)
     whole, part = (open_object_cache(dataset, boxes=replace(CLUMSY, fraction=f)) for f in (1.0, 0.5))
-    assert part.folder.name == "objects-v6-clumsy-1-0.5"
+    assert part.folder.name == "objects-v7-clumsy-1-0.5"
     held = np.flatnonzero(part.lengths()[:, 0])
     assert 0 < len(held) < len(dataset)
     assert held.tolist() == np.flatnonzero(part.image_counts()).tolist()
@@ -148,7 +153,7 @@ def test_a_cache_may_hold_a_fraction_of_the_demonstrations(copy: Path) -> None:
 def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
     dataset = Dataset(copy, tasks=["rotate"])
     cache = open_object_cache(dataset, boxes=CLUMSY)
-    path = cache.folder / "rotate-train-00000.cache"
+    path = cache.folder / "rotate-train-00000.arrow"
     whole = path.read_bytes()
     write_cache_file(path, cache[:2], "objects", CacheFile(path).source, "clumsy-2")
     with pytest.raises(DatasetError, match="lacks 1 shards"):
@@ -165,13 +170,13 @@ def test_whole_frames_have_no_boxes(demos: Path) -> None:
 def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> None:
     cache = open_object_cache(Dataset(copy), boxes=CLUMSY)
     assert not verify(copy).problems
-    path = cache.folder / "rotate-train-00000.cache"
+    path = cache.folder / "rotate-train-00000.arrow"
     rows = [row for row, episode in enumerate(cache) if episode.task == "rotate"][:2]
     changed = [replace(cache[row], actions=cache[row].actions + 0.1) for row in rows]
     write_cache_file(path, changed, "objects", CacheFile(path).source, "clumsy-1")
     (problem,) = verify(copy).problems
     assert "it differs from the demonstration" in problem.cause
-    assert problem.file.endswith("objects-v6-clumsy-1/rotate-train-00000.cache")
+    assert problem.file.endswith("objects-v7-clumsy-1/rotate-train-00000.arrow")
 
 
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -179,6 +184,6 @@ def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFi
     assert main(words) == 0
     (folder,) = (copy / "object_cache").iterdir()
     assert capsys.readouterr().out.strip() == str(folder)
-    assert len(ObjectCache(Dataset(copy), variant=folder.name.removeprefix("objects-v6-"))) == 10
+    assert len(ObjectCache(Dataset(copy), variant=folder.name.removeprefix("objects-v7-"))) == 10
     assert main([*words, "--kind", "frames"]) == 2
     assert "whole frames have none" in capsys.readouterr().err

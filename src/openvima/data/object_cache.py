@@ -1,41 +1,76 @@
-"""The object cache of a data set: a derived folder, written when first needed and safe to delete."""
+"""The object cache: crops and boxes of all demonstrations, cut once for all trainings.
+
+A derived folder, written when first needed and safe to delete. It has an Arrow file for each shard, with one
+row per demonstration, uncompressed and memory-mapped: a demonstration that is read is a set of views into it.
+"""
 
 import shlex
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import pairwise
+from math import prod
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 import pyarrow as pa
+from xxhash import xxh3_64
 
-from openvima.atomic_io import NO_SPACE, folder_lock
-from openvima.data.checksums import Envelope, spans_of
+from openvima.atomic_io import NO_SPACE, atomic_write, folder_lock
+from openvima.data.checksums import Envelope, mapped, spans_of
 from openvima.data.hash_split import split_hashes
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
-from openvima.data.object_cache.cache_file import (
-    CACHE_VERSION,
-    CacheFile,
-    file_name,
-    write_cache_file,
-)
-from openvima.data.object_cache.episode import PreprocessedEpisode, left_out_episode, preprocess
-from openvima.data.object_cache.episode_batch import EpisodeBatch
-from openvima.data.object_cache.joined_records import read_records
-from openvima.data.object_cache.random_appearance import RERENDERING_VERSION, with_random_appearance
+from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, left_out_episode, preprocess
 from openvima.data.reader import Dataset
-from openvima.data.shard import Shard
+from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
+from openvima.data.shard import ODD_ERRORS, Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.input_files import as_path
 from openvima.multiprocess import imap_unordered
 from openvima.perception.objects import ObjectExtractor
-from openvima.perception.preprocessing import KINDS, InputKind
+from openvima.perception.preprocessing import (
+    IMAGE_SIZES,
+    KINDS,
+    InputKind,
+    ObjectTable,
+    PreprocessedPrompt,
+    image_names,
+)
 from openvima.scene import COMPOSED
 
 Report = Callable[[int, int, str], None]
+CACHE_VERSION = 7  # grows whenever the same demonstration gives another row
 _RERENDERED = "rerendered-v"  # in front of version and number of a random appearance
+_OBJECT_TABLES = ("prompt.objects", "objects", "final")
+_OBJECT_COLUMNS = {
+    "ids": (pa.int16(), ()),
+    "crop_index": (pa.int32(), (2,)),
+    "boxes": (pa.int16(), (2, 4)),
+    "grasps": (pa.int16(), (2, 2)),
+}
+# Arrays of a demonstration: Arrow type of a number, and shape of a row. Names are those of the fields.
+_ARRAYS = {
+    **{f"{table}.{name}": type_ for table in _OBJECT_TABLES for name, type_ in _OBJECT_COLUMNS.items()},
+    "prompt.objects_per_image": (pa.int16(), ()),
+    "prompt.is_scene": (pa.bool_(), ()),
+    "objects_per_step": (pa.int16(), ()),
+    "pick_ids": (pa.int16(), ()),
+    "place_ids": (pa.int16(), ()),
+    "false_positives.crop_index": (pa.int32(), (2,)),
+    "false_positives.boxes": (pa.int16(), (2, 4)),
+    "actions": (pa.float32(), (12,)),
+}
+_SCALARS = {
+    "task": pa.string(),
+    "seed": pa.int64(),
+    "end_effector": pa.int8(),
+    "text": pa.string(),
+    "descriptions": pa.list_(pa.string()),  # one for each prompt image; "" where there is none
+}
+_CHECKSUM = "checksum"  # of a row, compared at every read
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +111,163 @@ class Variant:
         if self.appearance is not None:
             names.append(f"{_RERENDERED}{RERENDERING_VERSION}-{self.appearance}")
         return "-".join(names)
+
+
+class CacheFile:
+    """One file of the object cache, memory-mapped.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ShardError: It is missing, truncated, or no file of this version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            reader = pa.ipc.open_file(pa.py_buffer(mapped(path)))
+            about = _read_about(reader.schema)
+            self._rows = reader.get_batch(0)
+            self._rows.validate(full=True)  # no list reaches beyond its numbers
+            self._arrays = {
+                name: _unpack(self._rows.column(name), shape)
+                for name, (_, shape) in _arrays(about["kind"]).items()
+            }
+        except ODD_ERRORS as error:
+            raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
+        self.kind: InputKind = about["kind"]
+        self.source, self.variant = about["source"], about["variant"]
+
+    def __len__(self) -> int:
+        return self._rows.num_rows
+
+    def __getitem__(self, row: int) -> PreprocessedEpisode:
+        arrays = {name: flat[ends[row] : ends[row + 1]] for name, (ends, flat) in self._arrays.items()}
+        scalars = tuple(self._rows.column(name)[row].as_py() for name in _SCALARS)
+        if _checksum(scalars, arrays.values()) != self._rows.column(_CHECKSUM)[row].as_py():
+            raise ShardError(_unfit(self.path, f"the checksum of row {row} of {len(self)} is wrong"))
+        task, seed, end_effector, text, descriptions = scalars
+        in_prompt, objects, final = (
+            ObjectTable(*(arrays[f"{table}.{name}"] for name in _OBJECT_COLUMNS)) for table in _OBJECT_TABLES
+        )
+        return PreprocessedEpisode(
+            task=task,
+            seed=seed,
+            end_effector=end_effector,
+            prompt=PreprocessedPrompt(
+                text, in_prompt, arrays["prompt.objects_per_image"], arrays["prompt.is_scene"]
+            ),
+            objects=objects,
+            objects_per_step=arrays["objects_per_step"],
+            pick_ids=arrays["pick_ids"],
+            place_ids=arrays["place_ids"],
+            false_positives=FalsePositives(
+                arrays["false_positives.crop_index"], arrays["false_positives.boxes"]
+            ),
+            final=final,
+            actions=arrays["actions"],
+            images=arrays["images"],
+            descriptions={
+                name: texts for name, texts in zip(image_names(text), descriptions, strict=True) if texts
+            },
+        )
+
+    def counts(self, name: str) -> np.ndarray:
+        """Return the length of an array in each row, shape (N,), int64."""
+        return np.diff(self._arrays[name][0])
+
+    def largest(self, name: str) -> np.ndarray:
+        """Return the largest number of an array in each row, 0 where it is empty, shape (N,), int64."""
+        ends, flat = self._arrays[name]
+        return np.array([flat[start:end].max(initial=0) for start, end in pairwise(ends)], np.int64)
+
+    def texts(self, name: str) -> set[str]:
+        """Return the different texts of a column."""
+        column = self._rows.column(name)
+        return set((column if pa.types.is_string(column.type) else column.flatten()).unique().to_pylist())
+
+
+def write_cache_file(
+    path: Path, episodes: Sequence[PreprocessedEpisode], kind: InputKind, source: str, variant: str = ""
+) -> None:
+    """Write one file of the object cache, under its name only when it is complete.
+
+    Args:
+        path: The file.
+        episodes: What to write.
+        kind: What their images show.
+        source: Content hash of the demonstrations that they were made of.
+        variant: How the episodes differ from these, as in `Variant`; empty if they do not.
+    """
+    schema = _schema(
+        kind, {"version": str(CACHE_VERSION), "kind": kind, "source": source, "variant": variant}
+    )
+    arrays = [[attrgetter(name)(episode) for episode in episodes] for name in _arrays(kind)]
+    scalars = [_scalars(episode) for episode in episodes]
+    checksums = [_checksum(*row) for row in zip(scalars, zip(*arrays, strict=True), strict=True)]
+    columns = [_pack(column) for column in arrays]
+    columns += map(pa.array, zip(*scalars, strict=True), _SCALARS.values())
+    columns.append(pa.array(checksums, pa.uint64()))
+    with atomic_write(path) as file, pa.ipc.new_file(file, schema) as writer:
+        writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+
+
+def _arrays(kind: InputKind) -> dict[str, tuple[pa.DataType, tuple[int, ...]]]:
+    return {**_ARRAYS, "images": (pa.uint8(), (3, *IMAGE_SIZES[kind]))}
+
+
+def _schema(kind: InputKind, about: dict[str, str] | None = None) -> pa.Schema:
+    lists = {
+        name: pa.list_(pa.list_(number, prod(shape)) if shape else number)
+        for name, (number, shape) in _arrays(kind).items()
+    }
+    return pa.schema({**lists, **_SCALARS, _CHECKSUM: pa.uint64()}, about)
+
+
+def _read_about(schema: pa.Schema) -> dict[str, Any]:  # Any: the kind is an `InputKind`
+    """Read version, kind, source and variant of a file, and check its columns."""
+    about = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
+    if about.get("version") != str(CACHE_VERSION):
+        raise ValueError(f"it is of version {about.get('version')!r:.20}, not {CACHE_VERSION}")
+    if about.get("kind") not in KINDS or not schema.equals(_schema(about["kind"])):
+        raise ValueError("it has other columns")
+    return about
+
+
+def _pack(arrays: Sequence[np.ndarray]) -> pa.Array:
+    """Put arrays of one shape but for the first axis into a column of lists."""
+    joined = np.concatenate(arrays)
+    numbers = pa.array(joined.reshape(-1))
+    if joined.ndim > 1:
+        numbers = pa.FixedSizeListArray.from_arrays(numbers, prod(joined.shape[1:]))
+    return pa.ListArray.from_arrays(pa.array(np.cumsum([0, *map(len, arrays)]), pa.int32()), numbers)
+
+
+def _unpack(column: pa.Array, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the rows of a column begin and end, and all of them as one array, without a copy."""
+    numbers = column.values.values if shape else column.values
+    return column.offsets.to_numpy(), numbers.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+
+
+def _scalars(episode: PreprocessedEpisode) -> tuple[object, ...]:
+    """Return what a row has besides its arrays, in the order of `_SCALARS`."""
+    prompt = episode.prompt
+    descriptions = [episode.descriptions.get(name, "") for name in prompt.image_names]
+    return episode.task, episode.seed, episode.end_effector, prompt.text, descriptions
+
+
+def _checksum(scalars: tuple[object, ...], arrays: Iterable[np.ndarray]) -> int:
+    """Return the xxh3 of a row, 64 bits."""
+    digest = xxh3_64(repr(scalars).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array))
+    return digest.intdigest()
+
+
+def _unfit(path: Path, reason: str) -> str:
+    remedy = "Delete it; `openvima data preprocess` makes it anew"
+    return f"{path} is no readable file of the object cache ({reason}). {remedy}."
 
 
 class ObjectCache(Sequence[PreprocessedEpisode]):
@@ -136,49 +328,41 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     def __iter__(self) -> Iterator[PreprocessedEpisode]:
         return (self[index] for index in range(len(self)))
 
-    def batch(self, indices: Sequence[int] | np.ndarray) -> EpisodeBatch:
-        """Read several episodes together, their images when these are iterated over.
-
-        Raises:
-            ShardError: One is damaged; raised when its tables or its images are read.
-
-        Example:
-            >>> episodes = cache.batch(order.rows(0))
-            >>> Processor("objects").collate(episodes).with_images(episodes.images, episodes.num_images)
-        """
-        return read_records([(self._files[name], row) for name, row in self.dataset.locations(indices)])
-
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
         return ObjectCache, (self.dataset, self.kind, self._root, self.variant)
 
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the visible objects of all of them, shape (N, 2), int64."""
-        return self._gathered("num_steps", "num_objects")
+        return self._gather(
+            lambda file: np.stack([file.counts("actions"), file.counts("objects.ids")], axis=1)
+        )
 
     def widths(self) -> np.ndarray:
         """Return the most objects in a prompt image and in an observation, shape (N, 2), int64."""
-        return self._gathered("most_in_prompt", "most_in_view")
+
+        def most(file: CacheFile) -> np.ndarray:
+            in_view = np.maximum(file.largest("objects_per_step"), file.counts("final.ids"))
+            return np.stack([file.largest("prompt.objects_per_image"), in_view], axis=1)
+
+        return self._gather(most)
 
     def image_counts(self) -> np.ndarray:
         """Return the number of images of each episode, shape (N,), int64."""
-        return self._gathered("num_images")[:, 0]
+        return self._gather(lambda file: file.counts("images"))
 
     def texts(self) -> set[str]:
         """Return the different prompts, with their placeholders; "" stands for those that are left out."""
-        return {text for file in self._files.values() for text in file.texts()}
+        return {text for file in self._files.values() for text in file.texts("text")}
 
     def descriptions(self) -> set[str]:
         """Return the different descriptions of object images."""
-        return {text for file in self._files.values() for text in file.descriptions} - {""}
+        return {text for file in self._files.values() for text in file.texts("descriptions")} - {""}
 
-    def _gathered(self, *names: str) -> np.ndarray:
-        """Read columns of the indices of all files, and put them into the order of the episodes."""
-        of_file = {
-            name: np.stack([file.index[column] for column in names], axis=1)
-            for name, file in self._files.items()
-        }
+    def _gather(self, read: Callable[[CacheFile], np.ndarray]) -> np.ndarray:
+        """Read numbers of all rows of all files, and put them into the order of the episodes."""
+        of_file = {name: read(file) for name, file in self._files.items()}
         places = self.dataset.locations(np.arange(len(self)))
-        return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, len(names))
+        return np.array([of_file[name][row] for name, row in places], np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,7 +425,9 @@ def open_object_cache(
     target = _cache_folder(dataset, kind, folder, variant.name)
     if check_object_cache(dataset, kind, variant, folder=folder):
         with folder_lock(target, timeout_s=timeout_s):
-            _write_missing(_missing(dataset, kind, target, variant), workers, report)
+            _write_missing(
+                _missing(dataset, kind, target, variant), workers, report, _note_on_older(target, kind)
+            )
     return ObjectCache(dataset, kind, folder, variant.name)
 
 
@@ -281,7 +467,7 @@ def _missing(dataset: Dataset, kind: InputKind, target: Path, variant: Variant) 
             dataset.path / source.name,
             Envelope.from_entry(dataset.manifest["shards"][source.name]),
             source,
-            target / file_name(source.name),
+            target / source.name,
             kind,
             variant,
         )
@@ -290,13 +476,22 @@ def _missing(dataset: Dataset, kind: InputKind, target: Path, variant: Variant) 
     ]
 
 
-def _write_missing(work: list[_Work], workers: int, report: Report | None) -> None:
+def _note_on_older(folder: Path, kind: InputKind) -> str:
+    """Say which folders of older versions a new one replaces."""
+    current = f"{kind}-v{CACHE_VERSION}"
+    older = sorted(
+        path.name for path in folder.parent.glob(f"{kind}-v[0-9]*") if not path.name.startswith(current)
+    )
+    return f"extracting objects anew; delete {', '.join(older)} of older versions" if older else ""
+
+
+def _write_missing(work: list[_Work], workers: int, report: Report | None, note: str) -> None:
     total = sum(item.source.index.num_rows for item in work)
     work.sort(key=lambda item: -item.source.index.num_rows)
 
     def say(done: int) -> None:
         if report is not None:
-            report(done, total, "")
+            report(done, total, note)
 
     try:
         for _ in imap_unordered(_write, work, workers, report=say):
@@ -330,7 +525,7 @@ def _cache_folder(dataset: Dataset, kind: InputKind, folder: str | Path | None, 
 def _made(folder: Path, source: Source, kind: InputKind, variant: str) -> CacheFile | None:
     """Open the file of a shard; None if it is missing, damaged, or of another version or content."""
     try:
-        file = CacheFile(folder / file_name(source.name))
+        file = CacheFile(folder / source.name)
     except ShardError:
         return None
     asked = (source.content_hash, kind, variant)
