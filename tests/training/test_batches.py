@@ -136,7 +136,7 @@ def tensors(rows: np.ndarray, number: int) -> dict[str, object]:
 @pytest.mark.parametrize("has_room", [True, False])
 def test_batches_of_any_kind_reach_the_main_process(monkeypatch: pytest.MonkeyPatch, has_room: bool) -> None:
     if not has_room:
-        monkeypatch.setattr(torch_dataset, "_room", lambda: 1000)
+        monkeypatch.setattr(torch_dataset, "_room", lambda: 100)
     options = {"num_workers": 2, "multiprocessing_context": "fork", "timeout": 60}
     batches = read_batches(BatchOrder(8, batch_size=2, seed=0), tensors, **options)
     for number, batch in enumerate(islice(batches, 4)):

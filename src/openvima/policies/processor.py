@@ -269,7 +269,7 @@ class Processor:
         boxes[place, :, slot] = objects.boxes
         # A slot that has lost its object is at the corner of the front view.
         is_slot = np.arange(num_slots) < slots_BT.reshape(-1, 1)
-        positions = is_slot[..., None] * unproject(np.zeros(2), CAMERAS["front"])
+        positions = np.where(is_slot[..., None], unproject(np.zeros(2), CAMERAS["front"]), 0.0)
         grasps = positions.copy()
         positions[place, slot] = _table_points(objects, objects.boxes[..., :2])
         grasps[place, slot] = _table_points(objects, objects.grasps)
