@@ -152,3 +152,16 @@ def test_an_unknown_preset_is_wrong_usage_and_leaves_no_run_folder(data, tmp_pat
     assert run_train(data, tmp_path / "run", "gato-nanno") != 0
     assert "Did you mean 'gato-nano'?" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("finetune", ["False", "True"])
+def test_crops_of_initial_weights_are_frozen_where_it_is_asked_for(finetune, data, tmp_path):
+    option = ("--pretraining.finetune-crop-encoder", finetune)
+    assert run_train(data, tmp_path / "on", "vima-nano", "--init-from", "openvima-vima", *option) == 0
+    last = next((tmp_path / "on" / "checkpoints").glob(f"*-{STEPS:06}"))
+    before = load_policy("openvima-vima").network.state_dict()
+    after = load_file(last / "model.safetensors")
+    names = [name for name in before if name.startswith("images.crop_encoder")]
+    same = [torch.equal(before[name], after[name]) for name in names]
+    assert names and (all(same) if finetune == "False" else not any(same))
+    assert not torch.equal(before["head.classifiers.0.0.weight"], after["head.classifiers.0.0.weight"])

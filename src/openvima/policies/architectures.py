@@ -6,13 +6,17 @@ Shape suffixes as in `nn/policy_network.py`; V views, N objects (1 with frames),
 objects and J images in all prompts, I image tokens of all prompts, M latents.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from openvima.errors import ConfigError
+from openvima.perception.objects import TOP
 from openvima.policies.batch import HistoryBatch, InputLayout, PromptBatch
 from openvima.policies.nn.action_head import BinsConfig, BinsHead, ObservationTokens
 from openvima.policies.nn.decoder import AnyDecoderConfig, Decoder, DecoderConfig, build_decoder
@@ -35,6 +39,7 @@ from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoder, Object
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig
 from openvima.policies.sizes import Size, size
+from openvima.render.camera import CAMERAS, unproject
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +132,15 @@ class TokenPolicy(PolicyNetwork):
     def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
         """Make the image tokens of each step, and the query behind them if there is one."""
         features_BTVNF = features_KF[history.crop_index_BTVN]
-        steps_BT, mask_BTQ = history.steps_BT, None
+        steps_BT, mask_BTQ, points_BTQ2 = history.steps_BT, None, None
         if isinstance(self.images, ObjectEncoder):
             tokens_BTQE = self.images(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
             fused = self.images.config.fuse_views
             mask_BTQ = history.masks_BTVN.any(dim=2) if fused else history.masks_BTVN.flatten(2)
             if self.resampler is not None:
                 tokens_BTQE, mask_BTQ = self.resampler(tokens_BTQE, mask_BTQ), None
+            else:
+                points_BTQ2 = _points_from_above(history, tokens_BTQE.shape[2])
         else:
             tokens_BTQE = self._frame_tokens(features_BTVNF)
         tokens_BTQD = self.add_end_effector(tokens_BTQE, history.end_effector_BT)
@@ -148,7 +155,8 @@ class TokenPolicy(PolicyNetwork):
             query_BT1D = self.query.expand(*tokens_BTQD.shape[:2], 1, -1)
             tokens_BTQD = torch.cat([tokens_BTQD, query_BT1D], dim=2)
             mask_BTQ = torch.cat([mask_BTQ, steps_BT[..., None]], dim=2)
-        return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, steps_BT)
+            points_BTQ2 = None if points_BTQ2 is None else F.pad(points_BTQ2, (0, 0, 0, 1), value=math.inf)
+        return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, steps_BT, points_BTQ2)
 
     def _frame_tokens(self, features: torch.Tensor) -> torch.Tensor:
         """Make tokens of pairs of frames, (..., tokens · N, E): the first token of all pairs first.
@@ -185,6 +193,18 @@ class TokenPolicy(PolicyNetwork):
         mask_JNQ = mask_QS.new_zeros(shape).index_put((image_S, slot_S), mask_QS.T)
         latents_JME = resampler(tokens_JNQE.flatten(1, 2), mask_JNQ.flatten(1))
         return latents_JME[image_S].transpose(0, 1).flatten(0, 1)
+
+
+def _points_from_above(history: HistoryBatch, num_tokens: int) -> torch.Tensor:
+    """Return the table points under the boxes of the top view, (B, T, Q, 2), for the last N of Q tokens."""
+    boxes_BTN4, mask_BTN = history.boxes_BTVN4[:, :, TOP], history.masks_BTVN[:, :, TOP]
+    origin, right, down = unproject(
+        np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"]
+    )  # it looks straight down
+    axes = torch.from_numpy(np.stack([right - origin, down - origin])).to(boxes_BTN4.device)
+    points_BTN2 = torch.from_numpy(origin).to(axes) + boxes_BTN4[..., :2].to(axes) @ axes
+    points_BTN2 = points_BTN2.masked_fill(~mask_BTN[..., None], math.inf)
+    return F.pad(points_BTN2, (0, 0, num_tokens - mask_BTN.shape[-1], 0), value=math.inf)
 
 
 @dataclass(frozen=True, slots=True)

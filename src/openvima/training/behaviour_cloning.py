@@ -143,8 +143,10 @@ def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
     Initial weights tell of it by their appearance embedding, which nothing else trains.
     """
     encoder, pretraining = network.object_encoder, config.pretraining
-    if encoder is None or pretraining.finetune_crop_encoder:
+    if encoder is None:
         return False
+    if pretraining.finetune_crop_encoder is not None:
+        return not pretraining.finetune_crop_encoder
     return bool(pretraining.steps or (config.init_from and encoder.config.appearance_width))
 
 

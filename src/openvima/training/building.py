@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from openvima.errors import ConfigError, differences
+from openvima.policies.architectures import TokenPolicyConfig
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
 from openvima.policies.config import PolicyConfig, appearance_width, config_to_dict
@@ -81,6 +82,11 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
                 f"augmentation.{name} is {getattr(augmentation, name):g}, but preset {config.preset!r} takes "
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
+    if (weight := config.optimizer.pointing_loss_weight) and not _points(sizes):
+        raise ConfigError(
+            f"optimizer.pointing_loss_weight is {weight:g}, but preset {config.preset!r} has no token for "
+            "each object, or picks among objects by itself; leave it out."
+        )
     has_appearance = appearance_width(sizes) > 0
     if config.pretraining.steps and sizes.inputs.tokens == "frames":
         raise ConfigError(
@@ -102,6 +108,13 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
             "weight such as 0.5, or set model.attributes to False."
         )
     return config
+
+
+def _points(sizes: PolicyConfig) -> bool:
+    """Whether a policy has a token for each object and a head that decodes positions."""
+    return (
+        isinstance(sizes, TokenPolicyConfig) and sizes.resampler is None and sizes.inputs.tokens != "frames"
+    )
 
 
 def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
@@ -159,6 +172,8 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         size = tokenizer.vocabulary.size_for(sizes.prompt.vocabulary_size)
         sizes = replace(sizes, prompt=replace(sizes.prompt, vocabulary_size=size))
     network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
+    if weight := config.optimizer.pointing_loss_weight:
+        network.head.pointing_weight = weight
     if initial is not None:
         _copy_weights(initial, network)
     elif config.t5:

@@ -120,12 +120,15 @@ class OptimizerConfig:
         weight_decay: Decay of weight matrices.
         max_grad_norm: Gradients are clipped to this norm.
         grad_accum_steps: Parts into which each process splits its batch, to save memory.
+        pointing_loss_weight: Weight of a loss on which object is picked and at which one it is placed, for
+            policies of the papers with a token for each object.
     """
 
     learning_rate: Probability = 1e-3
     weight_decay: Annotated[float, Range(0)] = 0.01
     max_grad_norm: Annotated[float, Range(1e-6)] = 1.0
     grad_accum_steps: Count = 1
+    pointing_loss_weight: Annotated[float, Range(0, 100)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,8 +198,9 @@ class PretrainingConfig:
             containers are.
         attribute_loss_weight: Weight of the loss of attributes ("the same texture") on labelled pairs. Above
             0 it needs `model.attributes`, and captions of the pairs teach the words.
-        finetune_crop_encoder: Also train the crop encoder in behaviour cloning. Slower: each step encodes its
-            crops anew.
+        finetune_crop_encoder: Whether behaviour cloning trains the crop encoder, which is slower: each step
+            encodes its crops anew. None trains it unless this run, or that of the initial weights, has
+            pretrained it.
     """
 
     steps: Steps | None = None
@@ -213,7 +217,7 @@ class PretrainingConfig:
     eared_prob: Probability = 0.0
     ring_and_block_prob: Probability = 0.0
     attribute_loss_weight: Annotated[float, Range(0, 100)] = 0.0
-    finetune_crop_encoder: bool = False
+    finetune_crop_encoder: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@
 Shape suffixes: B batch, T steps, Q tokens of a step, D width, C components of an action.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from torch.nn import functional as F
 
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
+    PLACE_NEAR_M,
     ActionEncoder,
     ActionTargets,
     DecodingStrategy,
@@ -36,12 +38,15 @@ class ObservationTokens:
         mask_BTQ: Which of them exist.
         query_BT: Index of the token from whose output the action is decoded; it may be padding.
         steps_BT: Which steps exist.
+        points_BTQ2: Table points of the objects in the top view that tokens stand for, metres; infinite for
+            other tokens. None if no tokens are objects.
     """
 
     tokens_BTQD: torch.Tensor
     mask_BTQ: torch.Tensor
     query_BT: torch.Tensor
     steps_BT: torch.Tensor
+    points_BTQ2: torch.Tensor | None = None
 
     def segment(self) -> TokenSegment:
         """Return them as a segment of the sequence."""
@@ -88,7 +93,12 @@ class ActionHead(nn.Module):
     """Decodes each step's action from its query; a past action is one token of the history.
 
     A head defines `action_loss`, `action` and `fit_prior`.
+
+    Attributes:
+        pointing_weight: Weight of `pointing_loss` in training.
     """
+
+    pointing_weight = 0.0
 
     def __init__(self, actions: ActionEncoder) -> None:
         super().__init__()
@@ -118,7 +128,11 @@ class ActionHead(nn.Module):
         outputs_BTQD, _ = decode_observations(decoder, cache, observations, previous)
         query_BTD = observations.query(outputs_BTQD)
         loss, metrics, actions_BTC = self.action_loss(query_BTD, targets)
-        return loss, {**metrics, "query_spread": spread(query_BTD, targets.steps_BT)}, actions_BTC
+        metrics["query_spread"] = spread(query_BTD, targets.steps_BT)
+        if self.pointing_weight:
+            pointing, metrics["loss/pointing"] = pointing_loss(query_BTD, query_BTD, observations, targets)
+            loss = loss + self.pointing_weight * pointing
+        return loss, metrics, actions_BTC
 
     def decode_step(
         self,
@@ -138,6 +152,40 @@ class ActionHead(nn.Module):
         self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
     ) -> TokenSegment:
         return action_segment(self.actions(self.past_actions(actions_BTC).to(dtype))[:, :, None], exists_BT)
+
+
+def pointing_loss(
+    pick_BTD: torch.Tensor, place_BTD: torch.Tensor, observations: ObservationTokens, targets: ActionTargets
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the cross-entropy of which objects are picked and placed at, and the same without gradient.
+
+    Demonstrated picks are random points of an object, which costs bins two nats a coordinate and hides the
+    choice of the object in noise; here it is the target itself. The dot product with the first half of each
+    object's token scores picks, that with the second half places: no weights are added.
+
+    Args:
+        pick_BTD: The output from which the pick is decoded.
+        place_BTD: That from which the place is decoded.
+        observations: The objects' tokens, as they enter the decoder.
+        targets: Demonstrated actions; a place counts where an object is near.
+    """
+    tokens_BTQD, points_BTQ2 = observations.tokens_BTQD, observations.points_BTQ2
+    assert points_BTQ2 is not None  # the settings of a training are checked
+    is_object_BTQ = points_BTQ2[..., 0].isfinite() & targets.steps_BT[..., None]
+    parts = zip(
+        ("pose0_position", "pose1_position"), (pick_BTD, place_BTD), (math.inf, PLACE_NEAR_M), strict=True
+    )
+    loss = tokens_BTQD.new_zeros(())
+    for half, (part, query_BTD, limit_m) in enumerate(parts):
+        query_BTE, keys_BTQE = query_BTD.chunk(2, -1)[half], tokens_BTQD.chunk(2, -1)[half]
+        scores_BTQ = torch.einsum("btqe,bte->btq", keys_BTQE, query_BTE) * query_BTE.shape[-1] ** -0.5
+        target_BT12 = targets.actions_BTC[..., None, ACTION_PARTS[part]].to(points_BTQ2)
+        distance_BT, slot_BT = (points_BTQ2 - target_BT12).norm(dim=-1).min(dim=-1)
+        counts_BT = is_object_BTQ.any(-1) & (distance_BT < limit_m)
+        scores_MQ = scores_BTQ.masked_fill(~is_object_BTQ, -math.inf)[counts_BT]
+        losses = F.cross_entropy(scores_MQ, slot_BT[counts_BT], reduction="sum")
+        loss = loss + losses / targets.steps_BT.sum().clamp(min=1)
+    return loss, loss.detach()
 
 
 @torch.no_grad()

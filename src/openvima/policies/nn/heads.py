@@ -29,6 +29,7 @@ from openvima.policies.nn.action_head import (
     decode_observations,
     encode_bins,
     fit_bins,
+    pointing_loss,
     spread,
 )
 from openvima.policies.nn.actions import (
@@ -74,6 +75,8 @@ class AutoregressiveHead(nn.Module):
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
 
+    pointing_weight = 0.0  # see `ActionHead`
+
     def __init__(self, hidden_width: int, width: int, actions: "ComponentTokens") -> None:
         super().__init__()
         self.actions = actions
@@ -98,6 +101,10 @@ class AutoregressiveHead(nn.Module):
         logits = [classifier(output) for classifier, output in pairs]
         loss, metrics, bins_BTC = bins_loss(logits, targets)
         metrics["query_spread"] = spread(query_BT1D.squeeze(2), targets.steps_BT)
+        if self.pointing_weight:
+            pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
+            pointing, metrics["loss/pointing"] = pointing_loss(pick_BTD, place_BTD, observations, targets)
+            loss = loss + self.pointing_weight * pointing
         return loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
 
     def decode_step(
