@@ -24,8 +24,8 @@ from openvima.catalog.partitions import TEXTURE_SETS, tasks_at
 from openvima.policies.checkpoint import load_network
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
-from openvima.training.augmentation.rearranged_view import rearranged
-from openvima.training.pretraining.contrastive import retrieval_accuracy
+from openvima.training.augmentation.scenes import rearranged
+from openvima.training.pretraining.losses import retrieval_accuracy, rotation_accuracy
 from openvima.training.pretraining.pairs import (
     Pairs,
     SceneAugmentation,
@@ -33,7 +33,6 @@ from openvima.training.pretraining.pairs import (
     render_pairs,
     stacked,
 )
-from openvima.training.pretraining.rotation import rotation_accuracy
 from sim import circumstances
 
 SEED = 7_000_000  # no run is likely to have it

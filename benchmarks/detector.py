@@ -27,17 +27,15 @@ import torch
 
 from openvima.data.records import rollout_oracle
 from openvima.detector import BUNDLED, detector_config, load_detector
-from openvima.detector.augmentation import augment_frame
 from openvima.detector.detection import JOINT_PAIRS, DetectedObjects
-from openvima.detector.detector import FrameDetector
-from openvima.detector.frames import Frame, frame_of
-from openvima.detector.network import MaskRCNN
+from openvima.detector.frames import Frame, augment_frame, frame_of
+from openvima.detector.network import FrameDetector, MaskRCNN
 from openvima.env import TabletopEnv
 from openvima.render.camera import VIEWS
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
 from openvima.tasks import list_tasks, task_spec
 from openvima.training.detector import DetectorTrainingConfig
-from openvima.training.detector.learner import DetectorLearner, FrameBatch
+from openvima.training.detector.stage import DetectorLearner, FrameBatch
 from sim import circumstances
 
 FIRST_SEED = 3_000_000

@@ -150,7 +150,7 @@ def _small_detector() -> Iterator[None]:
     """A file of Detectron2 that holds a narrow network; the published one has 170 MB."""
     import torch
 
-    from openvima.detector import detectron2
+    from openvima.detector import checkpoint
     from openvima.detector.config import DETECTORS
     from openvima.detector.network import MaskRCNN
 
@@ -158,7 +158,7 @@ def _small_detector() -> Iterator[None]:
         torch.manual_seed(0)
         return MaskRCNN(DETECTORS["small"]())
 
-    with _tiny_networks(), patch.object(detectron2, "load_detectron2", load):
+    with _tiny_networks(), patch.object(checkpoint, "load_detectron2", load):
         yield
 
 

@@ -25,13 +25,10 @@ from openvima.policies.pointer.config import small
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import with_variant
 from openvima.training import TrainingConfig
-from openvima.training.augmentation.box_jitter import with_box_jitter
-from openvima.training.augmentation.horizontal_flip import with_horizontal_flips
-from openvima.training.augmentation.occlusion import with_occlusion
+from openvima.training.augmentation.crops import with_box_jitter, with_horizontal_flips, with_occlusion
 from openvima.training.parallel import ONE_PROCESS
-from openvima.training.pretraining.captions import caption_texts
 from openvima.training.pretraining.pairs import Pairs, SceneAugmentation, render_pairs
-from openvima.training.pretraining.stage import ContrastivePretraining
+from openvima.training.pretraining.stage import ContrastivePretraining, caption_texts
 from openvima.training.recipes import recipe_settings
 from sim import circumstances
 

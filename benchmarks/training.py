@@ -31,7 +31,7 @@ from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
 from openvima.training.parallel import ONE_PROCESS
 from openvima.training.source import split_examples
-from openvima.training.vocabulary import training_texts
+from openvima.training.building import training_texts
 data, preset, steps = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
 settings = {"data": data, "out": Path("run"), "preset": preset, "optimizer.learning_rate": 3e-4}
 if preset == "small":

@@ -10,13 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import openvima
-from openvima.detector.anchors import pyramid_anchors
+from openvima.detector.boxes import match, pyramid_anchors
 from openvima.detector.config import FIRST_STRIDE, small
 from openvima.detector.frames import Frame, frame_of
-from openvima.detector.masks import crop_masks, paste_masks
-from openvima.detector.matching import match
-from openvima.detector.roi_align import box_levels
-from openvima.detector.rpn import BACKGROUND_IOU
+from openvima.detector.layers import BACKGROUND_IOU
+from openvima.detector.roi_align import box_levels, crop_masks, paste_masks
 from openvima.render import channels_last
 from openvima.render.camera import FRONT
 from openvima.scene import FIRST_OBJECT_ID

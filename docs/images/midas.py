@@ -19,7 +19,7 @@ from openvima.policies.nn.action_head import encode_bins
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
 from openvima.policies.processor import Processor
 from openvima.scene import Action
-from openvima.training.augmentation.inverse_dynamics import motion_prompt
+from openvima.training.augmentation.prompts import motion_prompt
 from policy import (
     ACTION,
     FAINT,

@@ -36,8 +36,8 @@ from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import with_variant
 from openvima.report.typesetting import Estimate, Line, Table, markdown
 from openvima.training import TrainingConfig, train
-from openvima.training.costs import logged_costs
 from openvima.training.recipes import overridden, recipe_settings
+from openvima.training.run_folder import logged_costs
 
 _PRETRAINED = ("images.crop_encoder.", "images.appearance.", "images.rotation.", "attributes.")
 _SHORT_PRETRAINING = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000}

@@ -22,8 +22,7 @@ from openvima.data import Dataset
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
 from openvima.policies.naming import find_checkpoint
-from openvima.training.costs import logged_costs
-from openvima.training.run_folder import TIMINGS_FILE, whole_lines
+from openvima.training.run_folder import TIMINGS_FILE, logged_costs, whole_lines
 
 _TIMED_STEPS, _FIRST_STEPS = 100, 40  # the first ones load data and caches
 _COMMON = (

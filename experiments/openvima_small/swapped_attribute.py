@@ -15,7 +15,7 @@ from openvima.catalog.packs import load_assets
 from openvima.evaluation.results import Results
 from openvima.scene import Placement
 from openvima.tasks import sample_episode
-from openvima.training.pretraining.attribute_labels import profile
+from openvima.training.pretraining.pairs import profile
 
 # By whether the distractor and how many of the two targets are like the base.
 EXPECTED = {(1, 2): 1 / 3, (1, 1): 0.0, (1, 0): 0.0, (0, 2): 1.0, (0, 1): 1 / 2, (0, 0): 1 / 3}

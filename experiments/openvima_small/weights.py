@@ -18,8 +18,14 @@ from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import load_network, read_info, write_checkpoint
 from openvima.policies.naming import WEIGHTS_FILE
 from openvima.policies.t5 import tokenizer_for
-from openvima.training.costs import logged_costs
-from openvima.training.run_folder import CONFIG_FILE, METRICS_FILE, SESSIONS_FILE, TIMINGS_FILE, whole_lines
+from openvima.training.run_folder import (
+    CONFIG_FILE,
+    METRICS_FILE,
+    SESSIONS_FILE,
+    TIMINGS_FILE,
+    logged_costs,
+    whole_lines,
+)
 from openvima.training.validation import flattened
 
 RECORD = "training"  # folder beside the weights

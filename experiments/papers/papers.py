@@ -21,8 +21,7 @@ from openvima.evaluation.statistics.proportions import mean_of_rates
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
 from openvima.policies.naming import find_checkpoint
-from openvima.training.costs import logged_costs
-from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, whole_lines
+from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, logged_costs, whole_lines
 
 LEVELS = ("L1", "L2", "L3", "L4")
 RANDOM_APPEARANCE = ("--loader.rerendered-prob", "0.3")

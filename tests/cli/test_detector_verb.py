@@ -105,9 +105,9 @@ def test_scores_do_not_depend_on_the_number_of_threads(detector, data, capsys):
 
 
 def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):
-    from openvima.detector import detectron2
+    from openvima.detector import checkpoint
 
-    monkeypatch.setattr(detectron2, "load_detectron2", lambda file: MaskRCNN(tiny))
+    monkeypatch.setattr(checkpoint, "load_detectron2", lambda file: MaskRCNN(tiny))
     words = ["detector", "convert", "weights.pth", str(tmp_path / "converted")]
     assert main(words) == 0
     assert load_network(tmp_path / "converted").config == tiny

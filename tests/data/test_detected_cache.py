@@ -22,7 +22,7 @@ from openvima.data.object_cache import (
 from openvima.data.preprocessed import preprocess
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, WorkerError
-from openvima.perception.iou import object_iou
+from openvima.perception.boxes import object_iou
 from openvima.perception.objects import GROUND_TRUTH, observe
 
 CLUMSY = Boxes("clumsy-1", NoisyExtractor)

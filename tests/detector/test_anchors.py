@@ -6,7 +6,7 @@ import pytest
 import naive_detection as naive
 
 torch = pytest.importorskip("torch")
-from openvima.detector.anchors import cell_anchors, level_anchors, pyramid_anchors  # noqa: E402
+from openvima.detector.boxes import cell_anchors, level_anchors, pyramid_anchors  # noqa: E402
 
 
 def test_the_anchors_of_a_cell_have_one_area_and_three_shapes():

@@ -7,7 +7,7 @@ pytest.importorskip("torch")
 
 from openvima.detector import load_detector, load_extractor
 from openvima.env import TabletopEnv
-from openvima.perception.iou import match_ids_to_slots
+from openvima.perception.boxes import match_ids_to_slots
 from openvima.perception.objects import GROUND_TRUTH
 
 TASKS = ("visual_manipulation", "rearrange", "same_shape", "sweep_without_exceeding")

@@ -10,9 +10,14 @@ import yaml
 
 torch = pytest.importorskip("torch")
 from openvima.detector import detector_folder, load_detector  # noqa: E402
-from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
+from openvima.detector.checkpoint import (  # noqa: E402  # noqa: E402
+    detectron2_config,
+    from_detectron2,
+    load_detectron2,
+    load_network,
+    save_network,
+)
 from openvima.detector.config import BackboneConfig, DetectorConfig, detector_config, resnet50  # noqa: E402
-from openvima.detector.detectron2 import detectron2_config, from_detectron2, load_detectron2  # noqa: E402
 from openvima.detector.network import MaskRCNN  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 

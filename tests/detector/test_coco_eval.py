@@ -7,11 +7,11 @@ import pytest
 from PIL import Image
 
 from openvima.detector.detection import Detections
-from openvima.detector.visualize import draw_detections, save_grid
+from openvima.detector.evaluation import draw_detections, save_grid
 from openvima.errors import ConfigError, MissingExtraError
 
 coco = pytest.importorskip("pycocotools")
-from openvima.detector.coco_eval import evaluate_detector  # noqa: E402
+from openvima.detector.evaluation import evaluate_detector  # noqa: E402
 
 
 class Truthful:

@@ -9,14 +9,14 @@ torch = pytest.importorskip("torch")
 from torch.nn import functional as F  # noqa: E402
 
 from openvima.detector.config import small  # noqa: E402
-from openvima.detector.cpu_inference import (  # noqa: E402
+from openvima.detector.layers import MaskHead  # noqa: E402
+from openvima.detector.roi_align import (  # noqa: E402
     align_levels,
     is_cpu_inference,
     normalise,
+    pyramid_align,
     rectify_and_pool,
 )
-from openvima.detector.heads import MaskHead  # noqa: E402
-from openvima.detector.roi_align import pyramid_align  # noqa: E402
 
 LEVELS = {"canonical_size": 48, "canonical_level": 1}
 

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 from openvima.data import Dataset
-from openvima.detector.augmentation import augment_frame, flip_horizontally, mix_channels, paste_object
-from openvima.detector.frames import FrameSampler, frame_of, held_out_frames
+from openvima.detector.frames import (
+    FrameSampler,
+    augment_frame,
+    flip_horizontally,
+    frame_of,
+    held_out_frames,
+    mix_channels,
+    paste_object,
+)
 from openvima.perception.objects import observe, observe_prompt_image
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 torch = pytest.importorskip("torch")
-from openvima.detector.matching import match, subsample  # noqa: E402
+from openvima.detector.boxes import match, subsample  # noqa: E402
 
 OBJECTS = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60]])
 

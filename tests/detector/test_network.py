@@ -9,8 +9,14 @@ from PIL import Image
 torch = pytest.importorskip("torch")
 from openvima.detector.config import resnet50, small  # noqa: E402
 from openvima.detector.detection import DetectedObjects  # noqa: E402
-from openvima.detector.detector import FrameDetector, fuse_batch_norm, to_detections  # noqa: E402
-from openvima.detector.network import Instances, MaskRCNN, resized_shape  # noqa: E402
+from openvima.detector.network import (  # noqa: E402  # noqa: E402
+    FrameDetector,
+    Instances,
+    MaskRCNN,
+    fuse_batch_norm,
+    resized_shape,
+    to_detections,
+)
 from openvima.errors import ShapeError  # noqa: E402
 
 NUM_STEPS = 200  # masks of every seed tried are good by then, whatever the rounding

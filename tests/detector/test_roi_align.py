@@ -6,8 +6,7 @@ import pytest
 import naive_detection as naive
 
 torch = pytest.importorskip("torch")
-from openvima.detector.masks import crop_masks, paste_masks  # noqa: E402
-from openvima.detector.roi_align import box_levels, pyramid_align, roi_align  # noqa: E402
+from openvima.detector.roi_align import box_levels, crop_masks, paste_masks, pyramid_align, roi_align  # noqa: E402  # noqa: E402
 
 
 def ramp(height: int, width: int) -> torch.Tensor:

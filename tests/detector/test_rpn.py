@@ -8,7 +8,7 @@ import naive_detection as naive
 
 torch = pytest.importorskip("torch")
 from openvima.detector.boxes import decode_boxes  # noqa: E402
-from openvima.detector.rpn import WEIGHTS, AnchorPredictions, RegionProposalNetwork  # noqa: E402
+from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, RegionProposalNetwork  # noqa: E402
 
 HEIGHT, WIDTH = 64, 96
 
@@ -37,7 +37,9 @@ def test_proposals_agree_with_sequential_nms_per_level(tiny, seed):
         for level, anchors in enumerate(given.anchors):
             best, rows = given.objectness[level][image].topk(40)
             deltas = given.deltas[level][image, rows]
-            boxes += decode_boxes(deltas, anchors[rows], WEIGHTS, height=HEIGHT, width=WIDTH).tolist()
+            boxes += decode_boxes(
+                deltas, anchors[rows], PROPOSAL_WEIGHTS, height=HEIGHT, width=WIDTH
+            ).tolist()
             scores += best.tolist()
             levels += [level] * 40
         solid = [n for n, box in enumerate(boxes) if box[2] > box[0] and box[3] > box[1]]

@@ -23,7 +23,7 @@ from openvima.detector.network import MaskRCNN  # noqa: E402
 from openvima.training.config import RuntimeConfig, ScheduleConfig  # noqa: E402
 from openvima.training.detector import DetectorTrainingConfig, train_detector  # noqa: E402
 from openvima.training.detector.config import FrameLoaderConfig  # noqa: E402
-from openvima.training.detector.split import split_episodes  # noqa: E402
+from openvima.training.detector.stage import split_episodes  # noqa: E402
 from openvima.training.validation import flattened  # noqa: E402
 
 
@@ -86,11 +86,11 @@ import json, os, signal, sys
 from pathlib import Path
 from openvima.detector import config as sizes
 from openvima.detector.config import DetectorConfig
-from openvima.training.detector import DetectorTrainingConfig, learner, train_detector
+from openvima.training.detector import DetectorTrainingConfig, stage, train_detector
 
 tiny, settings = json.loads(sys.argv[1])
 sizes.DETECTORS["small"] = lambda: DetectorConfig.from_dict(tiny)
-write, calls = learner.write_network, []
+write, calls = stage.write_network, []
 
 def dying(*arguments):
     calls.append(arguments)
@@ -98,7 +98,7 @@ def dying(*arguments):
     if len(calls) == 2:  # metrics and weights are written, the optimizer's state is not
         os.kill(os.getpid(), signal.SIGKILL)
 
-learner.write_network = dying
+stage.write_network = dying
 settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
 train_detector(DetectorTrainingConfig.of(settings))
 """

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from openvima.perception.iou import match_ids_to_slots, object_iou
+from openvima.perception.boxes import match_ids_to_slots, object_iou
 from openvima.perception.objects import ObjectViews, see_nothing
 
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from openvima.env import TabletopEnv
-from openvima.perception.image_stack import ImageStack
-from openvima.perception.jitter import BoxJitter
+from openvima.perception.boxes import BoxJitter
 from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import ObjectViews, crop_box, observe
-from openvima.perception.preprocessing import FOUND, extract_observation, preprocess_prompt
+from openvima.perception.preprocessing import FOUND, ImageStack, extract_observation, preprocess_prompt
 from openvima.render.camera import VIEWS
 
 

@@ -29,8 +29,8 @@ from naive_inputs import (
     batch_histories,
     batch_prompts,
 )
-from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectViews, see_nothing
+from openvima.perception.preprocessing import ImageStack
 from openvima.policies.build import outline_network
 from openvima.policies.nn.action_head import BinsHead, decode_bins, shift_actions
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range

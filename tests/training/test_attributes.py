@@ -22,17 +22,26 @@ from openvima.tasks import list_tasks, task_spec  # noqa: E402
 from openvima.tasks.paraphrasing import training_paraphrases  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import resolved  # noqa: E402
-from openvima.training.pretraining.attribute_labels import AttributeLabeller, AttributeLabels  # noqa: E402
-from openvima.training.pretraining.attribute_loss import (  # noqa: E402
-    _compared,
+from openvima.training.pretraining.losses import (  # noqa: E402
+    _compare_attributes,
     _images,
     attribute_accuracy,
     attribute_loss,
-    caption_loss,
 )
-from openvima.training.pretraining.captions import WORDS, caption_texts, sample_captions  # noqa: E402
-from openvima.training.pretraining.pairs import Pairs, SceneAugmentation, render_pairs  # noqa: E402
-from openvima.training.pretraining.stage import crop_parameters  # noqa: E402
+from openvima.training.pretraining.pairs import (  # noqa: E402
+    AttributeLabeller,
+    AttributeLabels,
+    Pairs,
+    SceneAugmentation,
+    render_pairs,
+)
+from openvima.training.pretraining.stage import (  # noqa: E402
+    WORDS,
+    caption_loss,
+    caption_texts,
+    crop_parameters,
+    sample_captions,
+)
 from openvima.training.recipes import recipe_settings  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
@@ -84,7 +93,7 @@ def test_a_block_is_compared_by_each_attribute(labeller, other, same, different)
     images = _images(labels_of(labeller, placement("block"), other), (0,))
     is_same, is_different = (
         {name for name, flag in zip(ATTRIBUTES, flags[:, 0, 1].tolist(), strict=True) if flag}
-        for flags in _compared(images, images)
+        for flags in _compare_attributes(images, images)
     )
     assert is_same == set(same)
     assert is_different >= set(different)

@@ -10,8 +10,8 @@ torch = pytest.importorskip("torch")
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
 from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
-from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
+from openvima.perception.preprocessing import ImageStack  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402

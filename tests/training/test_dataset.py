@@ -18,12 +18,15 @@ from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
 from openvima.tasks.registry import held_out_tasks, list_tasks  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
-from openvima.training.augmentation.false_positives import augmented  # noqa: E402
+from openvima.training.augmentation.demonstrations import augmented  # noqa: E402
 from openvima.training.batches import ExampleSource  # noqa: E402
-from openvima.training.building import resolved  # noqa: E402
+from openvima.training.building import (  # noqa: E402
+    resolved,
+    training_texts,
+)
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.policy import scene_tasks  # noqa: E402
-from openvima.training.provenance import held_out_demonstrations  # noqa: E402
+from openvima.training.run_folder import held_out_demonstrations  # noqa: E402
 from openvima.training.source import (  # noqa: E402
     check_scenes,
     check_words,
@@ -31,7 +34,6 @@ from openvima.training.source import (  # noqa: E402
     order_of,
     split_examples,
 )
-from openvima.training.vocabulary import training_texts  # noqa: E402
 from training_examples import collate_examples, examples_of, rngs_of  # noqa: E402
 
 OBJECTS, VIEWS = Processor("objects"), Processor("views")

@@ -20,17 +20,17 @@ from openvima.scene import ObjectRecord  # noqa: E402
 from openvima.tasks.prompts import described, description_of, image_descriptions, synonyms  # noqa: E402
 from openvima.training import sequence_lengths  # noqa: E402
 from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
-from openvima.training.augmentation.describe_objects import (  # noqa: E402
+from openvima.training.augmentation.prompts import (  # noqa: E402
     DescribeObjects,
+    renamed,
     text_of,
     with_descriptions,
     with_synonyms,
 )
-from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
+from openvima.training.building import training_texts  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.vocabulary import training_texts  # noqa: E402
 
 TASKS = (
     "visual_manipulation",

@@ -19,13 +19,13 @@ from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.detector.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.detector.plugins import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import ObjectViews  # noqa: E402
+from openvima.perception.preprocessing import ImageStack  # noqa: E402
 from openvima.policies import load_policy  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
-from openvima.training.augmentation.inverse_dynamics import motion_prompt  # noqa: E402
+from openvima.training.augmentation.prompts import motion_prompt  # noqa: E402
 from openvima.training.batches import BatchMaker, ExampleSource  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402

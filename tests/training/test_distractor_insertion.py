@@ -14,7 +14,7 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.augmentation.distractor_insertion import (  # noqa: E402
+from openvima.training.augmentation.demonstrations import (  # noqa: E402
     MAX_DISTRACTORS,
     allows_distractors,
     with_distractors,

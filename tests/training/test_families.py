@@ -18,7 +18,7 @@ from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
-from openvima.training.schedule import step_seed  # noqa: E402
+from openvima.training.loop import step_seed  # noqa: E402
 
 STEPS = 3
 

@@ -15,9 +15,9 @@ from openvima.render.rasteriser import Rasteriser  # noqa: E402
 from openvima.scene import Placement, Pose, Prompt, Scene  # noqa: E402
 from openvima.tasks.novel_words import gray_image  # noqa: E402
 from openvima.training import TrainingConfig, policy, train  # noqa: E402
-from openvima.training.augmentation.appearance_randomization import with_random_appearance  # noqa: E402
-from openvima.training.pretraining import contrastive  # noqa: E402
-from openvima.training.pretraining.contrastive import info_nce, matches, retrieval_accuracy  # noqa: E402
+from openvima.training.augmentation.scenes import with_random_appearance  # noqa: E402
+from openvima.training.pretraining import losses  # noqa: E402
+from openvima.training.pretraining.losses import info_nce, matches, retrieval_accuracy  # noqa: E402
 from openvima.training.pretraining.pairs import (  # noqa: E402
     Pairs,
     SceneAugmentation,
@@ -126,7 +126,7 @@ def test_a_grayscale_prompt_image_retrieves_any_object_of_its_shape(monkeypatch)
     def embedded(encoder, crops, masks):
         return torch.nn.functional.one_hot(crops[:, 0, 0, 0, 0].long(), 3).float()
 
-    monkeypatch.setattr(contrastive, "embedded", embedded)
+    monkeypatch.setattr(losses, "embedded", embedded)
     assert retrieval_accuracy(None, pairs) == pytest.approx(1 / 3)  # the first; the last is no shape of 8
     assert retrieval_accuracy(None, replace(pairs, is_grayscale=~is_grayscale)) == pytest.approx(1 / 3)
     assert retrieval_accuracy(None, replace(pairs, is_grayscale=torch.zeros_like(is_grayscale))) == 0

@@ -4,9 +4,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.training.augmentation.occlusion import with_occlusion  # noqa: E402
+from openvima.training.augmentation.crops import with_occlusion  # noqa: E402
+from openvima.training.loop import step_generator  # noqa: E402
 from openvima.training.pretraining.pairs import NO_AUGMENTATION, SceneAugmentation, render_pairs  # noqa: E402
-from openvima.training.schedule import step_generator  # noqa: E402
 
 
 @pytest.fixture(scope="module")

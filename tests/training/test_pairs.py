@@ -11,13 +11,13 @@ from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
 from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.tasks import sample_episode  # noqa: E402
-from openvima.training.augmentation.appearance_randomization import ShapeKinds, with_random_appearance  # noqa: E402
-from openvima.training.augmentation.channel_mixing import channel_mixing  # noqa: E402
+from openvima.training.augmentation.crops import channel_mixing  # noqa: E402
+from openvima.training.augmentation.scenes import ShapeKinds, with_random_appearance  # noqa: E402
+from openvima.training.loop import step_generator  # noqa: E402
 from openvima.training.parallel import Parallel  # noqa: E402
 from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
-from openvima.training.pretraining.contrastive import contrastive_loss, retrieval_accuracy  # noqa: E402
+from openvima.training.pretraining.losses import contrastive_loss, retrieval_accuracy  # noqa: E402
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs  # noqa: E402
-from openvima.training.schedule import step_generator  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
 

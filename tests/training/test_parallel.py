@@ -18,8 +18,10 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.parallel import joined  # noqa: E402
-from openvima.training.processes import joined_by  # noqa: E402
+from openvima.training.parallel import (  # noqa: E402
+    joined,
+    joined_by,
+)
 
 pytestmark = pytest.mark.slow
 

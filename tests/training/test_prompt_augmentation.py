@@ -17,18 +17,23 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.tasks.novel_words import NOUNS  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.augmentation.demonstrations import DemonstrationAugmentation, Randomly  # noqa: E402
-from openvima.training.augmentation.drop_unused_objects import without_unused_objects  # noqa: E402
-from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
-from openvima.training.augmentation.paraphrase import paraphrased  # noqa: E402
-from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
-from openvima.training.augmentation.shuffle_prompt_objects import with_shuffled_prompt_objects  # noqa: E402
-from openvima.training.augmentation.shuffle_sentences import shuffled  # noqa: E402
-from openvima.training.augmentation.unknown_words import UnknownWords  # noqa: E402
+from openvima.training.augmentation.demonstrations import (  # noqa: E402
+    DemonstrationAugmentation,
+    Randomly,
+    without_unused_objects,
+)
+from openvima.training.augmentation.prompts import (  # noqa: E402
+    UnknownWords,
+    paraphrased,
+    renamed,
+    shuffled,
+    with_motion_prompt,
+    with_shuffled_prompt_objects,
+)
+from openvima.training.building import training_texts  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.vocabulary import training_texts  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 NAMED = (

@@ -9,7 +9,7 @@ pytest.importorskip("torch")
 
 from openvima.data import Dataset
 from openvima.training import TrainingConfig, train
-from openvima.training.provenance import git_state, provenance
+from openvima.training.run_folder import git_state, provenance
 
 
 @pytest.mark.slow

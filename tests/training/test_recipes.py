@@ -31,7 +31,7 @@ def trained(monkeypatch) -> list[TrainingConfig]:
         return config.out
 
     monkeypatch.setattr("openvima.training.train", train)
-    monkeypatch.setattr("openvima.training.processes.joined_by", lambda others, words: nullcontext())
+    monkeypatch.setattr("openvima.training.parallel.joined_by", lambda others, words: nullcontext())
     return configs
 
 

@@ -15,24 +15,28 @@ from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.render.rasteriser import Rasteriser  # noqa: E402
 from openvima.scene import Placement, Pose, Scene  # noqa: E402
-from openvima.training.augmentation.box_jitter import with_box_jitter  # noqa: E402
-from openvima.training.augmentation.hard_negatives import with_hard_negatives  # noqa: E402
-from openvima.training.augmentation.horizontal_flip import with_horizontal_flips  # noqa: E402
-from openvima.training.augmentation.rearranged_view import rearranged  # noqa: E402
+from openvima.training.augmentation.crops import (  # noqa: E402
+    with_box_jitter,
+    with_horizontal_flips,
+)
+from openvima.training.augmentation.scenes import (  # noqa: E402
+    rearranged,
+    with_hard_negatives,
+)
+from openvima.training.loop import step_generator  # noqa: E402
 from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
-from openvima.training.pretraining.contrastive import contrastive_loss  # noqa: E402
+from openvima.training.pretraining.losses import (  # noqa: E402
+    contrastive_loss,
+    is_rotation_correct,
+    rotation_accuracy,
+    rotation_loss,
+)
 from openvima.training.pretraining.pairs import (  # noqa: E402
     SceneAugmentation,
     pairs_of_scene,
     render_pairs,
     stacked,
 )
-from openvima.training.pretraining.rotation import (  # noqa: E402
-    is_rotation_correct,
-    rotation_accuracy,
-    rotation_loss,
-)
-from openvima.training.schedule import step_generator  # noqa: E402
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
 LOSSES = ("loss/contrastive", "loss/second_view")

@@ -5,7 +5,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.training.config import ScheduleConfig  # noqa: E402
-from openvima.training.schedule import learning_rate_at, step_generator, step_seed  # noqa: E402
+from openvima.training.loop import learning_rate_at, step_generator, step_seed  # noqa: E402
 
 
 def shares(steps: int, warmup_steps: int) -> list[float]:

@@ -13,7 +13,7 @@ from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn import decoder  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, sequence_lengths, train  # noqa: E402
-from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
+from openvima.training.augmentation.prompts import with_motion_prompt  # noqa: E402
 
 NAMES = ("nano", "midas-nano", "gato-nano")  # objects, views, frames
 

@@ -20,8 +20,11 @@ from openvima.policies.presets import PRESETS, PUBLISHED  # noqa: E402
 from openvima.policies.sizes import VOCABULARY_SIZE  # noqa: E402
 from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benchmark_vocabulary  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.building import build_learner, resolved  # noqa: E402
-from openvima.training.vocabulary import training_texts  # noqa: E402
+from openvima.training.building import (  # noqa: E402
+    build_learner,
+    resolved,
+    training_texts,
+)
 from small_networks import narrow_small  # noqa: E402
 
 WORDS = {

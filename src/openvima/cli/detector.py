@@ -16,7 +16,7 @@ from openvima.cli.terminal import Report, progress_bar
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
 if TYPE_CHECKING:
-    from openvima.detector.coco_eval import CocoEvaluation
+    from openvima.detector.evaluation import CocoEvaluation
     from openvima.detector.frames import Frame, FrameSampler
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
@@ -76,7 +76,7 @@ def evaluate(
         Exit status.
     """
     from openvima.detector import load_detector
-    from openvima.detector.coco_eval import evaluate_detector, require_pycocotools
+    from openvima.detector.evaluation import evaluate_detector, require_pycocotools
     from openvima.detector.frames import held_out_frames
 
     require_pycocotools()  # fail early
@@ -126,8 +126,8 @@ def show(
         Exit status.
     """
     from openvima.detector import load_detector
+    from openvima.detector.evaluation import draw_detections, save_grid
     from openvima.detector.frames import held_out_frames
-    from openvima.detector.visualize import draw_detections, save_grid
     from openvima.errors import ConfigError
 
     if out.suffix.lower() != ".png":
@@ -167,8 +167,7 @@ def convert(
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
     require_torch("reading a detector")
-    from openvima.detector.checkpoint import save_network
-    from openvima.detector.detectron2 import load_detectron2
+    from openvima.detector.checkpoint import load_detectron2, save_network
 
     save_network(load_detectron2(source), out)
     print(out)
@@ -204,7 +203,7 @@ def _frames(
     if problems:
         raise ConfigError(" ".join(problems))
     if data is not None:
-        from openvima.training.detector.split import split_episodes
+        from openvima.training.detector.stage import split_episodes
 
         dataset = Dataset(data)
         episodes = None if held_out is None else split_episodes(dataset, held_out)[1]

@@ -111,7 +111,7 @@ def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: st
         The run folder.
     """
     from openvima.training import train
-    from openvima.training.processes import joined_by
+    from openvima.training.parallel import joined_by
 
     log = logging.getLogger("openvima.training")
     log.setLevel(logging.INFO)

@@ -7,11 +7,11 @@ import numpy as np
 
 from openvima.data.records import Demonstration
 from openvima.data.schema import VIEWS
-from openvima.perception.image_stack import ImageStack
-from openvima.perception.iou import match_ids_to_slots
+from openvima.perception.boxes import match_ids_to_slots
 from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, observe, see_nothing
 from openvima.perception.preprocessing import (
     IMAGE_SIZES,
+    ImageStack,
     InputKind,
     ObjectTable,
     PreprocessedPrompt,

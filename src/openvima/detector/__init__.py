@@ -1,4 +1,8 @@
-"""Object detection in pixels: a Mask R-CNN in plain torch, its training data and its evaluation."""
+"""Object detection in pixels: a Mask R-CNN in plain torch, its training data and its evaluation.
+
+The network is own code because torchvision, which has one, cannot be installed everywhere beside torch: its
+wheels do not load with torch's CPU build.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +13,7 @@ from openvima.input_files import as_path
 
 if TYPE_CHECKING:
     from openvima.detector.detection import DetectedObjects
-    from openvima.detector.detector import FrameDetector
+    from openvima.detector.network import FrameDetector
 
 BUNDLED = Path(__file__).parent / "trained"  # the small detector for the default assets
 CACHE_SIZE = 1024  # of extractors, in pairs of images; 30 MB, and a larger one is hardly hit more often
@@ -47,7 +51,7 @@ def load_detector(
 
     require_torch("a detector")
     from openvima.detector.checkpoint import load_network
-    from openvima.detector.detector import FrameDetector
+    from openvima.detector.network import FrameDetector
 
     return FrameDetector(load_network(detector_folder(folder)), **options)
 

@@ -1,9 +1,11 @@
-"""Box operations: intersection over union, box regression targets, non-maximum suppression.
+"""Boxes: intersection over union, regression, non-maximum suppression, anchors, and samples for a loss.
 
 A box is (left, upper, right, lower) in pixels; pixel 0 covers 0 to 1.
 """
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -96,3 +98,116 @@ def nms(
 def _centres_and_sizes(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     low, high = boxes[..., :2], boxes[..., 2:]
     return (low + high) / 2, high - low
+
+
+ASPECT_RATIOS = (0.5, 1.0, 2.0)  # height over width
+
+
+def cell_anchors(size: float) -> torch.Tensor:
+    """Return the anchors of one cell, centred on the origin.
+
+    Args:
+        size: Square root of their common area, in pixels.
+
+    Returns:
+        One anchor for each of `ASPECT_RATIOS`, shape (3, 4), float32.
+
+    Example:
+        >>> cell_anchors(8.0)[1]
+        tensor([-4., -4.,  4.,  4.])
+    """
+    ratios = torch.tensor(ASPECT_RATIOS)
+    widths = size / ratios.sqrt()
+    halves = torch.stack([widths, widths * ratios], dim=1) / 2
+    return torch.cat([-halves, halves], dim=1)
+
+
+@lru_cache(maxsize=64)
+def level_anchors(size: float, *, stride: int, height: int, width: int) -> torch.Tensor:
+    """Return all anchors of one pyramid level; the tensor is shared between calls.
+
+    Args:
+        size: As for `cell_anchors`.
+        stride: Of the level, in pixels; the first cell is centred on the image's upper left corner.
+        height: Rows of cells.
+        width: Columns of cells.
+
+    Returns:
+        Shape (height · width · 3, 4), float32, ordered by row, column and aspect ratio.
+    """
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    shifts = torch.stack([columns, rows, columns, rows], dim=-1).view(-1, 1, 4) * stride
+    return (shifts + cell_anchors(size)).view(-1, 4)
+
+
+def pyramid_anchors(
+    sizes: Sequence[float], shapes: Sequence[tuple[int, int]], *, first_stride: int
+) -> list[torch.Tensor]:
+    """Return the anchors of each level; strides double from level to level.
+
+    Args:
+        sizes: Anchor size of each level, as for `cell_anchors`.
+        shapes: Rows and columns of each level.
+        first_stride: Stride of the finest level.
+    """
+    return [
+        level_anchors(size, stride=first_stride * 2**level, height=height, width=width)
+        for level, (size, (height, width)) in enumerate(zip(sizes, shapes, strict=True))
+    ]
+
+
+FOREGROUND, BACKGROUND, IGNORED = 1, 0, -1  # labels of boxes
+
+
+def match(
+    boxes: torch.Tensor, objects: torch.Tensor, *, low: float, high: float, allow_low_quality: bool = False
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Assign a ground-truth object to each box.
+
+    Args:
+        boxes: Anchors or proposals, shape (R, 4).
+        objects: Ground-truth boxes, shape (N, 4); there may be none.
+        low: Boxes whose best IoU is below are background.
+        high: Boxes whose best IoU is at least that are foreground; those between are ignored.
+        allow_low_quality: Also label the best boxes of each object as foreground, whatever their IoU.
+
+    Returns:
+        Index of the object with the largest IoU, shape (R,), int64, 0 without objects; and labels,
+        shape (R,), int64: `FOREGROUND`, `BACKGROUND` or `IGNORED`.
+    """
+    if not len(objects):
+        none = torch.zeros(len(boxes), dtype=torch.int64, device=boxes.device)
+        return none, none.clone()
+    iou = box_iou(boxes, objects)
+    best, indices = iou.max(dim=1)
+    labels = torch.full_like(indices, IGNORED)
+    labels[best < low] = BACKGROUND
+    labels[best >= high] = FOREGROUND
+    if allow_low_quality:
+        most = iou.max(dim=0).values
+        labels[((iou == most) & (most > 0)).any(dim=1)] = FOREGROUND
+    return indices, labels
+
+
+def subsample(
+    labels: torch.Tensor, *, count: int, positive_fraction: float, generator: torch.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sample boxes for a loss.
+
+    Args:
+        labels: Shape (R,), as returned by `match`.
+        count: Number of boxes; fewer if there are not as many.
+        positive_fraction: Largest fraction of foreground boxes; the rest is background.
+        generator: On the CPU, whatever the device of the labels.
+
+    Returns:
+        Indices of foreground boxes and of background boxes.
+    """
+    positive, negative = ((labels == label).nonzero()[:, 0] for label in (FOREGROUND, BACKGROUND))
+    num_positive = min(len(positive), int(count * positive_fraction))
+    num_negative = min(len(negative), count - num_positive)
+    return _sample(positive, num_positive, generator), _sample(negative, num_negative, generator)
+
+
+def _sample(indices: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
+    return indices[torch.randperm(len(indices), generator=generator)[:count].to(indices.device)]

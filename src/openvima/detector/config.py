@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
-from openvima.policies.config import build_config
 
 FIRST_STRIDE = 4  # of the finest pyramid level, in pixels
 
@@ -136,6 +135,8 @@ class DetectorConfig:
         Raises:
             ConfigError: A field is missing or unknown, or the sizes contradict each other.
         """
+        from openvima.policies.config import build_config  # needs torch
+
         return build_config(DetectorConfig, values, "detector")
 
 

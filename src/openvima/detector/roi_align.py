@@ -1,15 +1,66 @@
-"""RoIAlign: features of a pyramid resampled on a fixed grid inside boxes.
+"""RoIAlign: features of a pyramid resampled on a fixed grid inside boxes; masks in and out of such grids.
+
+Inference on a CPU takes the Numba kernels.
 
 Source: Mask R-CNN (He et al. 2017), section 3; with the half-pixel shift of later versions.
 """
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch.nn import functional as F
 
 from openvima.detector.boxes import box_area
-from openvima.detector.cpu_inference import align_levels, is_cpu_inference
+from openvima.detector.kernels import align, look_up, paste, relu_and_pool
+
+
+def is_cpu_inference(tensor: torch.Tensor) -> bool:
+    """Return whether these layers compute with a tensor: it is in main memory, and needs no gradients."""
+    return tensor.device.type == "cpu" and not torch.is_grad_enabled()
+
+
+def normalise(
+    pixels: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, *, height: int, width: int
+) -> torch.Tensor:
+    """Normalise images (B, 3, H, W), uint8, and pad them with zeros to (B, 3, height, width)."""
+    table = (torch.arange(256) - mean.view(3, 1)) / std.view(3, 1)
+    normalised = torch.zeros(len(pixels), height, width, 3)
+    look_up(pixels.numpy(), table.numpy(), normalised.numpy())
+    return normalised.permute(0, 3, 1, 2)
+
+
+def rectify_and_pool(x: torch.Tensor) -> torch.Tensor:
+    """Apply ReLU and max pooling over 3 × 3 pixels with stride 2: (B, C, H, W) to (B, C, H / 2, W / 2)."""
+    rows = _channels_last(x)
+    count, height, width, channels = rows.shape
+    pooled = torch.empty(count, (height + 1) // 2, (width + 1) // 2, channels, dtype=x.dtype)
+    relu_and_pool(rows, pooled.numpy())
+    return pooled.permute(0, 3, 1, 2)
+
+
+def align_levels(
+    levels: Sequence[torch.Tensor],
+    boxes: torch.Tensor,
+    images: torch.Tensor,
+    indices: torch.Tensor,
+    *,
+    size: int,
+    sampling_ratio: int,
+    first_stride: int,
+) -> torch.Tensor:
+    """Apply RoIAlign as `pyramid_align` does; `indices` (R,) are the levels of the boxes."""
+    pooled = torch.empty(len(boxes), levels[0].shape[1], size, size, dtype=levels[0].dtype)
+    arrays = boxes.numpy(), images.numpy(), indices.numpy()
+    for level, features in enumerate(levels):
+        stride = first_stride * 2**level
+        align(_channels_last(features), *arrays, level, stride, sampling_ratio, pooled.numpy())
+    return pooled
+
+
+def _channels_last(x: torch.Tensor) -> np.ndarray:
+    """Map (B, C, H, W) to (B, H, W, C)."""
+    return x.permute(0, 2, 3, 1).contiguous().numpy()
 
 
 def roi_align(
@@ -144,3 +195,40 @@ def _pool(features: torch.Tensor, x: torch.Tensor, y: torch.Tensor, images: torc
         positions.reshape(cells, -1), table, per_sample_weights=weights.reshape(cells, -1), mode="sum"
     )
     return summed.view(num_boxes, size, size, channels).permute(0, 3, 1, 2)
+
+
+def crop_masks(masks: torch.Tensor, boxes: torch.Tensor, *, size: int) -> torch.Tensor:
+    """Sample masks on a grid inside their boxes.
+
+    Args:
+        masks: One for each box, shape (R, H, W), bool.
+        boxes: Shape (R, 4).
+        size: Cells of the grid in each direction.
+
+    Returns:
+        Cells that are at least half inside the mask, shape (R, size, size), bool.
+    """
+    indices = torch.arange(len(boxes), device=boxes.device)
+    coverage = roi_align(
+        masks[:, None].to(boxes.dtype), boxes, indices, size=size, stride=1, sampling_ratio=2
+    )
+    return coverage[:, 0] >= 0.5
+
+
+def paste_masks(probabilities: torch.Tensor, boxes: torch.Tensor, *, height: int, width: int) -> torch.Tensor:
+    """Resample mask probabilities at the pixels of an image and threshold them at 0.5.
+
+    Bilinear interpolation between the centres of cells; outside of the box everything is zero.
+
+    Args:
+        probabilities: Of the cells inside each box, shape (N, size, size).
+        boxes: Shape (N, 4).
+        height: Of the image, in pixels.
+        width: Of the image, in pixels.
+
+    Returns:
+        Shape (N, height, width), bool.
+    """
+    masks = np.zeros((len(boxes), height, width), np.bool_)
+    paste(probabilities.cpu().numpy(), boxes.cpu().double().numpy(), masks)
+    return torch.from_numpy(masks).to(boxes.device)

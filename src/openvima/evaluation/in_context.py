@@ -19,7 +19,7 @@ from types import MappingProxyType
 from openvima.errors import ConfigError, PromptError, echo, unknown_name
 from openvima.scene import RenderedPrompt
 from openvima.tasks import twist
-from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
+from openvima.training.augmentation.prompts import MOTION_TEXT
 
 _MAX_SHOWN = 100  # characters of a prompt in an error
 _TEXTURE = re.compile(

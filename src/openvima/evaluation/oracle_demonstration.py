@@ -8,7 +8,7 @@ the in-context evaluation of the papers is in `in_context.py`.
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import OracleError
 from openvima.scene import ObjectRecord, RenderedPrompt
-from openvima.training.augmentation.inverse_dynamics import motion_prompt
+from openvima.training.augmentation.prompts import motion_prompt
 
 
 def demonstrated(env: TabletopEnv) -> RenderedPrompt:

@@ -1,9 +1,6 @@
-"""Prompts and observations as tables of objects: the records that object cache, training and acting share.
+"""Images by index, each stored once."""
 
-Images (crops of objects, or whole frames at half the size) are named by their index in a stack. Index 0 is a
-blank image and stands for a hidden object, everywhere.
-"""
-
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -12,7 +9,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from openvima.errors import ShapeError
-from openvima.perception.image_stack import ImageStack
 from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import (
     GROUND_TRUTH,
@@ -25,6 +21,44 @@ from openvima.perception.objects import (
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
 from openvima.scene.prompt import PLACEHOLDER
+
+
+class ImageStack:
+    """Collects images; equal ones share an index, and index 0 is a blank image for what is hidden.
+
+    Many images are equal: an object that does not move has the same crop at the next step.
+
+    Args:
+        image_size: Height and width of every image.
+    """
+
+    def __init__(self, image_size: tuple[int, int]) -> None:
+        self.image_size = image_size
+        self._shape = (3, *image_size)
+        self._images = [np.zeros(self._shape, np.uint8)]
+        self._index: dict[bytes, int] = {b"": 0}  # by digest, which is shorter than the image
+
+    def add(self, images: np.ndarray) -> np.ndarray:
+        """Append images of shape (..., 3, height, width) and return their indices, shape (...), int64."""
+        shape = images.shape[:-3]
+        index = [self._add(image) for image in images.reshape(-1, *self._shape)]
+        return np.array(index, np.int64).reshape(shape)
+
+    def images(self) -> np.ndarray:
+        """Return all images, the blank one first, shape (K, 3, height, width), uint8."""
+        return np.stack(self._images)
+
+    def digests(self) -> list[bytes]:
+        """Return what identifies the content of each image, in the order of `images`."""
+        return list(self._index)
+
+    def _add(self, image: np.ndarray) -> int:
+        digest = hashlib.blake2b(image.tobytes(), digest_size=16).digest()
+        index = self._index.setdefault(digest, len(self._images))
+        if index == len(self._images):
+            self._images.append(image.copy())
+        return index
+
 
 FOUND = "found"  # key of an observation's objects where they were found beforehand
 InputKind = Literal["objects", "frames"]

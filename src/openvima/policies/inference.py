@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from openvima.errors import PolicyError
-from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectExtractor
+from openvima.perception.preprocessing import ImageStack
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash, usable_device
 from openvima.policies.batch import HistoryBatch
 from openvima.policies.checkpoint import load_network, save_checkpoint

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from openvima.errors import DatasetError, PolicyError, PromptError
-from openvima.perception.image_stack import ImageStack
 from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import FRONT, TOP, ObjectExtractor, ObjectViews, end_effector_of
 from openvima.perception.preprocessing import (
+    ImageStack,
     InputKind,
     ObjectTable,
     PreprocessedPrompt,

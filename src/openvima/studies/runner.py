@@ -262,7 +262,7 @@ def _train(training: Training, report: Report) -> None:
     """Train, and note the costs, which also says that it is done."""
     from openvima.policies.checkpoint import load_network
     from openvima.training import train
-    from openvima.training.costs import logged_costs
+    from openvima.training.run_folder import logged_costs
 
     config = training.config
     train(config, report)

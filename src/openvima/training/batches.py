@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 from openvima.data.object_cache import ObjectCache
 from openvima.data.torch_dataset import send
 from openvima.errors import ConfigError
-from openvima.training.augmentation.distractor_insertion import allows_distractors
+from openvima.training.augmentation.demonstrations import allows_distractors
 from openvima.training.dataset import Example
 
 # From examples and, in training, one generator for each, to a batch.

@@ -1,12 +1,16 @@
-"""Builds the learner of a run: the network of a preset, or a learner of your own."""
+"""Builds the learner of a run: the network of a preset with the vocabulary of the data, or your own one."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.compute as pc
 import torch
 
+from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, differences
+from openvima.perception.preprocessing import split_prompt
 from openvima.policies.architectures import TokenPolicyConfig
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
@@ -20,10 +24,16 @@ from openvima.policies.sizes import t5_name
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
 from openvima.policies.variants import image_tokens, with_variant
+from openvima.scene import ObjectRecord
+from openvima.tasks.novel_words import NOUNS
+from openvima.tasks.paraphrasing import training_paraphrases
+from openvima.tasks.prompts import description_of, synonyms
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
-from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig
+from openvima.training.augmentation.prompts import DEFINITION, motion_text, text_of
+from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, AugmentationConfig, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
-from openvima.training.schedule import step_seed
+from openvima.training.loop import step_seed
+from openvima.training.pretraining.stage import caption_texts
 from openvima.training.validation import flattened
 from openvima.user_code import with_absolute_path
 
@@ -227,3 +237,61 @@ def _copy_weights(initial: PolicyNetwork, network: PolicyNetwork) -> None:
             fresh[name][: len(weights[name])] = weights[name]
             weights[name] = fresh[name]
     network.load_state_dict(weights)
+
+
+def training_texts(
+    dataset: Dataset, augmentation: AugmentationConfig, *, with_captions: bool = False
+) -> Iterator[str]:
+    """Read the different texts between the placeholders of the prompts, and those of the augmentation.
+
+    Args:
+        dataset: The demonstrations; of these only the prompts are read.
+        augmentation: Settings; an inverse-dynamics prompt and novel nouns bring words of their own.
+        with_captions: Also yield the words of captions of attributes.
+
+    Raises:
+        ShardError: A shard is damaged.
+    """
+    prompts: set[str] = set()
+    for table in _tables(dataset, "prompt"):  # 0.1 ms per demonstration
+        prompts.update(table.column("prompt").unique().to_pylist())
+    if augmentation.inverse_dynamics_prob:
+        prompts.add(motion_text(1))
+    if augmentation.describes_objects:
+        descriptions = _descriptions(dataset)
+        prompts.update(map(text_of, descriptions))
+        if augmentation.synonym_prob:
+            prompts.update(text_of(other) for each in descriptions for other in synonyms(each))
+    if augmentation.paraphrase_prob:
+        tasks = set(dataset.index.column("task").to_pylist())
+        prompts.update(text for task in tasks for text in training_paraphrases().get(task, ()))
+    if augmentation.rename_objects_prob:
+        prompts.update(DEFINITION.format(noun=f"the {noun}", image="") for noun in NOUNS)
+    if with_captions:
+        yield from caption_texts()
+    for prompt in prompts:
+        yield from (piece for piece in split_prompt(prompt) if isinstance(piece, str))
+
+
+def _tables(dataset: Dataset, column: str) -> Iterator[pa.Table]:
+    """Read a column of all demonstrations, shard by shard."""
+    for name in dataset.shard_names():
+        table = dataset.shard(name).table(["task", column])
+        # A shard may also hold tasks that the data set leaves out.
+        yield table if dataset.tasks is None else table.filter(pc.field("task").isin(dataset.tasks))
+
+
+def _descriptions(dataset: Dataset) -> set[str]:
+    """Return the different descriptions of objects in object images."""
+    names = set()
+    for table in _tables(dataset, "prompt_images"):
+        images = pa.Table.from_struct_array(table.column("prompt_images").combine_chunks().flatten())
+        shown = images.filter(pc.field("kind") == "object").column("objects").combine_chunks().flatten()
+        records = pa.Table.from_struct_array(shown).select(["object", "texture"])
+        names.update((record["object"], record["texture"]) for record in _different(records))
+    return {description_of(ObjectRecord(0, *each)) for each in names} - {""}
+
+
+def _different(table: pa.Table) -> list[dict[str, str]]:
+    """Return the different rows of a table."""
+    return table.group_by(table.column_names).aggregate([]).to_pylist()

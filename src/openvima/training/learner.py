@@ -22,8 +22,11 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
-from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
-from openvima.training.augmentation.false_positives import augmented
+from openvima.training.augmentation.demonstrations import (
+    NO_AUGMENTATION,
+    DemonstrationAugmentation,
+    augmented,
+)
 from openvima.training.batches import Collate
 from openvima.training.dataset import Example
 from openvima.user_code import call_function

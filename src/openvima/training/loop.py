@@ -1,13 +1,17 @@
 """The training loop: stages in turn, metrics, checkpoints, and exact resuming.
 
 Contrastive pretraining, behaviour cloning and the training of detectors are stages of this one loop. A stage
-computes gradients; the loop does the rest.
+computes gradients; the loop does the rest. All random numbers are derived from the step.
 """
 
+import hashlib
 import logging
 import math
+import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,20 +23,69 @@ from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, Terminated
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
-from openvima.training.optimizer_state import load_named_state, named_state
-from openvima.training.parallel import Parallel, set_whole_state, whole_state
-from openvima.training.provenance import index_hash, provenance
+from openvima.training.parallel import Parallel, load_named_state, named_state, set_whole_state, whole_state
 from openvima.training.run_folder import (
     METRICS_FILE,
     SESSIONS_FILE,
     TIMINGS_FILE,
     RunFolder,
     TrainedState,
+    index_hash,
+    provenance,
 )
-from openvima.training.schedule import learning_rate_at, step_seed
-from openvima.training.termination import noted_sigterm
 from openvima.training.trackers import Tracker, open_trackers
 from openvima.video.animation import Animation
+
+
+def learning_rate_at(step: int, schedule: ScheduleConfig, *, peak: float, num_steps: int) -> float:
+    """Return the learning rate of a step: linear warm-up, cosine decay, then constant.
+
+    Args:
+        step: Steps done, from 0.
+        schedule: Its warm-up counts up to a third of the run, its decay up to the end of the run, its final
+            rate up to the peak.
+        peak: Learning rate after the warm-up.
+        num_steps: Steps of the whole run.
+    """
+    warmup_steps = min(schedule.warmup_steps, num_steps // 3)
+    if step < warmup_steps:
+        return peak * (step + 1) / (warmup_steps + 1)
+    left = max(1, num_steps - warmup_steps)
+    progress = min(1.0, (step - warmup_steps) / min(left, schedule.decay_steps or left))
+    final = min(schedule.final_learning_rate, peak)
+    return final + (peak - final) * 0.5 * (1 + math.cos(math.pi * progress))
+
+
+def step_seed(seed: int, purpose: str, step: int) -> int:
+    """Return the seed of one purpose at one step, so that a resumed run needs no saved generators."""
+    digest = hashlib.blake2b(f"{seed}/{purpose}/{step}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") >> 1
+
+
+def step_generator(seed: int, purpose: str, step: int) -> torch.Generator:
+    """Return a generator seeded by `step_seed`."""
+    return torch.Generator().manual_seed(step_seed(seed, purpose, step))
+
+
+@contextmanager
+def noted_sigterm() -> Iterator[Callable[[], bool]]:
+    """Let SIGTERM end nothing within the block.
+
+    Yields:
+        A function that tells whether the signal came. In another thread than the main one, and where the
+        caller's program handles the signal itself, it comes never, and acts as outside of the block.
+    """
+    came: list[int] = []
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield lambda: False
+        return
+    signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
+    try:
+        yield lambda: bool(came)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
 
 Metrics = dict[str, float]
 # Called with steps done, steps in all, and a note.

@@ -1,13 +1,19 @@
 """Distributed training: data parallel (DDP) or sharded (FSDP2), over the processes of `torchrun`.
 
-DDP replicates the network in every process. FSDP2 shards weights, gradients and optimizer state.
+DDP replicates the network in every process. FSDP2 shards weights, gradients and optimizer state. `joined_by`
+starts the processes of one machine, with the environment in which `torchrun` starts them.
 """
 
 import contextlib
 import datetime
 import os
+import socket
+import subprocess
+import sys
+import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,6 +23,62 @@ from torch import nn
 
 from openvima.errors import ConfigError, PolicyError
 from openvima.policies.base import usable_device
+
+_STOP_S = 120.0  # of a busy machine
+_NOTICE_S = 2.0
+_NUM_NOTED = 2000  # characters
+
+
+@contextmanager
+def joined_by(others: int, arguments: Sequence[str]) -> Iterator[None]:
+    """Start further processes, which are this one's peers within the block.
+
+    They write nothing, since this process, the first one, fails as they do; if one fails by itself, the error
+    here has a note with what it wrote last. However this one ends, they end, too: their connection is closed.
+
+    Args:
+        others: Number of further processes.
+        arguments: Of the Python interpreter.
+    """
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    shared = {"WORLD_SIZE": str(others + 1), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    before = dict(os.environ)
+    with ExitStack() as stack:
+        logs = [stack.enter_context(tempfile.TemporaryFile()) for _ in range(others)]
+        processes = [
+            subprocess.Popen(
+                [sys.executable, *arguments],
+                env={**before, **shared, "RANK": str(rank), "LOCAL_RANK": str(rank)},
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
+            )
+            for rank, log in enumerate(logs, start=1)
+        ]
+        os.environ.update(shared, RANK="0", LOCAL_RANK="0")
+        try:
+            yield
+            for process in processes:
+                process.wait(_STOP_S)
+        except Exception as error:
+            for rank, (process, log) in enumerate(zip(processes, logs, strict=True), start=1):
+                with suppress(subprocess.TimeoutExpired):
+                    if process.wait(_NOTICE_S):
+                        log.seek(0)
+                        written = log.read().decode(errors="replace")[-_NUM_NOTED:]
+                        error.add_note(
+                            f"process {rank} had ended with status {process.returncode}:\n{written}"
+                        )
+            raise
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+            for process in processes:
+                process.kill()
+                process.wait()
+
 
 Sharding = Literal["ddp", "fsdp"]
 FORWARD_METHODS = ("keys_values",)  # methods of layers that are called besides `forward`
@@ -263,3 +325,34 @@ def _layers(module: nn.Module) -> list[nn.Module]:
     """Return the layers of all stacks, without plain linear and sequential ones."""
     stacks = [part for part in module.modules() if isinstance(part, nn.ModuleList)]
     return [layer for stack in stacks for layer in stack if not isinstance(layer, nn.Linear | nn.Sequential)]
+
+
+def named_state(
+    module: nn.Module, optimizer: torch.optim.Optimizer
+) -> dict[str, Any]:  # Any: as torch has it
+    """Return the state of each parameter of a module, by its name."""
+    names = {id(parameter): name for name, parameter in module.named_parameters()}
+    return {names[id(parameter)]: values for parameter, values in optimizer.state.items()}
+
+
+def load_named_state(
+    module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Any]
+) -> None:  # Any: as above
+    """Load what `named_state` returned; the optimizer may have its parameters in another order.
+
+    Moments get the memory format of their parameters, as the fused optimizer requires.
+    """
+    names = {id(parameter): name for name, parameter in module.named_parameters()}
+    ordered = [p for group in optimizer.param_groups for p in group["params"]]
+    values = {
+        number: {key: _like(parameter, value) for key, value in state[names[id(parameter)]].items()}
+        for number, parameter in enumerate(ordered)
+        if names[id(parameter)] in state
+    }
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
+
+
+def _like(parameter: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    if value.shape != parameter.shape:
+        return value  # the step count
+    return torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)

@@ -19,19 +19,18 @@ from openvima.errors import ConfigError
 from openvima.policies.base import torch_threads
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
-from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
+from openvima.training.augmentation.prompts import MOTION_TEXT
 from openvima.training.batches import ExampleSource
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
-from openvima.training.building import build_learner, resolved
+from openvima.training.building import build_learner, resolved, training_texts
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Animate, PlannedStage, Report, Rollout, Stage, Trainer, num_steps
 from openvima.training.parallel import Parallel, compile_layers, joined
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
-from openvima.training.provenance import held_out_demonstrations
 from openvima.training.recipes import command_going_on
-from openvima.training.run_folder import run_lock
+from openvima.training.run_folder import held_out_demonstrations, run_lock
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import (
     alternative_source,
@@ -41,7 +40,6 @@ from openvima.training.source import (
     open_demonstrations,
     split_examples,
 )
-from openvima.training.vocabulary import training_texts
 
 # Their start takes as long as a worker needs for so many.
 _SCENES_PER_WORKER, _DEMONSTRATIONS_PER_WORKER = 200, 500

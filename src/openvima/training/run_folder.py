@@ -11,17 +11,22 @@
 Files and checkpoints are written under a temporary name and renamed when complete.
 """
 
+import hashlib
 import json
 import shutil
+import subprocess
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
 
+import openvima
 from openvima.atomic_io import (
     atomic_write_file,
     folder_lock,
@@ -32,6 +37,8 @@ from openvima.atomic_io import (
     sync_files,
     sync_folder,
 )
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
+from openvima.data.reader import Dataset
 from openvima.errors import CheckpointError, ConfigError, InputFileError, differences
 from openvima.input_files import read_json, read_yaml
 from openvima.policies.naming import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_order
@@ -295,3 +302,111 @@ def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
             yield line, json.loads(line)
         except json.JSONDecodeError:
             continue
+
+
+_PACKAGES = ("torch", "numpy", "pyarrow", "safetensors", "transformers")
+
+
+def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
+    """Return versions, the git commit of the package if it is in a checkout, and digests of the data."""
+    content = (dataset.path / MANIFEST_NAME).read_bytes()
+    return {
+        "versions": {"openvima": openvima.__version__, **_versions()},
+        "git": git_state(Path(openvima.__file__).parent),
+        "data": {
+            "content_hash": dataset.manifest["content_hash"],
+            "manifest_sha256": hashlib.sha256(content).hexdigest(),
+            "counts": dataset.manifest["counts"],
+            "tasks": dict(sorted(Counter(dataset.index.column("task").to_pylist()).items())),
+        },
+    }
+
+
+def held_out_demonstrations(dataset: Dataset) -> list[str]:
+    """Return the task and level of demonstrations of evaluation levels or seeds, such as "twist L3".
+
+    Each episode says its own level and domain, so merging or sampling folders hides nothing.
+    """
+    found = dataset.index.select(["task", "level", "domain"]).group_by(["task", "level", "domain"])
+    return sorted(
+        f"{row['task']} {row['level']}" + (" eval" if row["domain"] == "eval" else "")
+        for row in found.aggregate([]).to_pylist()
+        if row["level"] != "train" or row["domain"] == "eval"
+    )
+
+
+def index_hash(folder: Path) -> str:
+    """Return a hash of the index of a folder of demonstrations."""
+    return hashlib.blake2b((folder / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:  # Any: JSON
+    """Return the commit of the checkout that contains a folder, and whether it has changes.
+
+    Returns:
+        `commit` and `changed`; None without checkout or git.
+    """
+
+    def ask(*words: str) -> str | None:
+        try:
+            result = subprocess.run(
+                ["git", "-C", str(folder), *words],
+                capture_output=True,
+                encoding="utf-8",
+                check=True,
+                timeout=10,
+            )
+        except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
+            return None
+        return result.stdout.strip()
+
+    commit = ask("rev-parse", "HEAD")
+    if commit is None or ask("ls-files", "--error-unmatch", ".") is None:  # installed inside a checkout
+        return None
+    return {"commit": commit, "changed": bool(ask("status", "--porcelain", "--untracked-files=no"))}
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+_TIMES = ("seconds_since_start", "cpu_seconds_since_start")
+
+
+def logged_costs(run: Path) -> dict[str, Any]:  # Any: JSON
+    """Return steps, time and CPU time of a run.
+
+    Work that was repeated after an interruption counts twice; what was lost after the last line of the log
+    does not count.
+
+    Args:
+        run: The run folder.
+
+    Returns:
+        "steps" of each stage by name, "seconds" and "cpu_seconds" of all sessions together.
+    """
+    steps: dict[str, int] = {}
+    for record in _records(run / METRICS_FILE):
+        steps[record["name"]] = max(record["step"], steps.get(record["name"], 0))
+    totals, last = dict.fromkeys(_TIMES, 0.0), dict.fromkeys(_TIMES, 0.0)
+    for record in _records(run / TIMINGS_FILE):
+        is_new = record[_TIMES[0]] < last[_TIMES[0]]  # a session begins at 0
+        for name in _TIMES:
+            totals[name] += record[name] - (0.0 if is_new else last[name])
+            last[name] = record[name]
+    return {
+        "steps": steps,
+        "seconds": round(totals[_TIMES[0]], 1),
+        "cpu_seconds": round(totals[_TIMES[1]], 1),
+    }
+
+
+def _records(file: Path) -> list[dict[str, Any]]:  # Any: JSON
+    """Read a log; empty without one."""
+    return [values for _, values in whole_lines(file)] if file.is_file() else []

@@ -12,8 +12,7 @@ from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
-from openvima.training.augmentation.describe_objects import with_descriptions
-from openvima.training.augmentation.inverse_dynamics import motion_text, with_motion_prompt
+from openvima.training.augmentation.prompts import motion_text, with_descriptions, with_motion_prompt
 
 MAX_READ = 256  # of those that may be too long the longest are checked
 

@@ -15,9 +15,9 @@ from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.processor import Processor
 from openvima.tasks.registry import list_tasks
-from openvima.training.augmentation.describe_objects import text_of
+from openvima.training.augmentation.prompts import text_of
 from openvima.training.batches import BatchOrder, ExampleSource
-from openvima.training.provenance import held_out_demonstrations
+from openvima.training.run_folder import held_out_demonstrations
 
 _PRIOR_DEMONSTRATIONS = 10_000  # enough for the marginals of 100 bins
 

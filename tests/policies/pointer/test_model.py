@@ -22,7 +22,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import benchmark_vocabulary  # noqa: E402
-from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
+from openvima.training.augmentation.prompts import with_motion_prompt  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from openvima.perception.jitter import BoxJitter
+from openvima.perception.boxes import BoxJitter
 from openvima.scene import RenderedPrompt
 
 

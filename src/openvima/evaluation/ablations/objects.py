@@ -6,7 +6,7 @@ import numpy as np
 
 from openvima.env.tabletop import TabletopEnv
 from openvima.evaluation.ablations.inputs import AblatedInput, renumbered
-from openvima.perception.jitter import BoxJitter
+from openvima.perception.boxes import BoxJitter
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 
 

@@ -1,23 +1,130 @@
-"""Per-demonstration prompt and scene augmentation: the list of transforms, in the order of their draws."""
+"""Augmentation of demonstrations, listed in the order of the draws, and false positives in their batches.
 
-from collections.abc import Callable
+Shape suffixes: B batch, T steps, V views, N objects in view (slots of a view).
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from functools import cache
+from typing import Literal, TypeAlias
 
 import numpy as np
+import torch
 
 from openvima.data.preprocessed import PreprocessedEpisode
-from openvima.training.augmentation.describe_objects import DescribeObjects
-from openvima.training.augmentation.distractor_insertion import with_distractors
-from openvima.training.augmentation.drop_unused_objects import DropUnusedObjects
-from openvima.training.augmentation.inverse_dynamics import with_motion_prompt
-from openvima.training.augmentation.paraphrase import paraphrased
-from openvima.training.augmentation.rename_objects import renamed
-from openvima.training.augmentation.shuffle_prompt_objects import with_shuffled_prompt_objects
-from openvima.training.augmentation.shuffle_sentences import shuffled
-from openvima.training.augmentation.unknown_words import UnknownWords
+from openvima.errors import UnknownTaskError
+from openvima.perception.boxes import box_iou
+from openvima.perception.preprocessing import ObjectTable
+from openvima.policies.batch import Batch, HistoryBatch
+from openvima.render.camera import VIEWS
+from openvima.tasks.registry import task_spec
+from openvima.training.augmentation.prompts import (
+    DescribeObjects,
+    UnknownWords,
+    paraphrased,
+    renamed,
+    shuffled,
+    with_motion_prompt,
+    with_shuffled_prompt_objects,
+)
 from openvima.training.config import AugmentationConfig
 from openvima.training.dataset import Example
+
+
+@dataclass(frozen=True, slots=True)
+class DropUnusedObjects:
+    """Drops unused objects from the observations, and others from the prompt frames.
+
+    Args:
+        prob: Probability of the first for each unused object, and of the second for each that is left; it
+            needs the ids of the segmentation.
+    """
+
+    prob: float
+
+    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+        """Augment a demonstration."""
+        if not self.prob:
+            return example
+        return replace(example, content=without_unused_objects(example.episode, self.prob, rng))
+
+
+def without_unused_objects(
+    episode: PreprocessedEpisode, prob: float, rng: np.random.Generator
+) -> PreprocessedEpisode:
+    """Drop unused objects from the observations, and others from the prompt frames."""
+    ids = np.setdiff1d(episode.objects.ids, [episode.pick_ids, episode.place_ids])
+    is_unobserved, is_unprompted = rng.random((2, len(ids))) < prob
+    prompt = episode.prompt
+    observed = ~np.isin(episode.objects.ids, ids[is_unobserved])
+    prompted = ~np.isin(prompt.objects.ids, ids[is_unprompted & ~is_unobserved])
+    return replace(
+        episode,
+        objects=episode.objects.select(observed),
+        objects_per_step=_counted(episode.objects_per_step, observed),
+        prompt=replace(
+            prompt,
+            objects=prompt.objects.select(prompted),
+            objects_per_image=_counted(prompt.objects_per_image, prompted),
+        ),
+    )
+
+
+def _counted(counts: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Count the kept rows of each group."""
+    group = np.repeat(np.arange(len(counts)), counts)
+    return np.bincount(group[kept], minlength=len(counts)).astype(counts.dtype)
+
+
+MAX_DISTRACTORS = 3
+
+
+@cache
+def allows_distractors(task: str) -> bool:
+    """Whether demonstrations of a task stay correct with distractors, see `TaskSpec.distractors_allowed`."""
+    try:
+        return task_spec(task).distractors_allowed
+    except UnknownTaskError:  # demonstrations of a task that is not installed here
+        return False
+
+
+def with_distractors(example: Example, rng: np.random.Generator) -> Example:
+    """Insert up to three objects of another demonstration, where they are, at all steps.
+
+    Their boxes overlap no other box of any step. Only table rows are copied, no images. In few episodes a
+    distractor matches the prompt as well as the target does, which makes the prompt ambiguous.
+
+    Args:
+        example: The demonstration. Distractors come from the first step of `example.other`, if the loader
+            supplied one; its images are part of the same stack.
+        rng: Draws how many, and which.
+
+    Returns:
+        The demonstration with numbers of images that count through the whole stack.
+    """
+    other = example.other
+    if other is None:
+        return example
+    episode = example.episode.with_image_offset(example.base)
+    count = int(rng.integers(1, MAX_DISTRACTORS + 1))
+    there = other.episode.objects.select(slice(0, int(other.episode.objects_per_step[0])))
+    there = there.with_image_offset(other.base).select(rng.permutation(len(there)))
+    there = there.select(np.asarray(there.masks.all(axis=1)))
+    taken = box_iou(*_boxes_by_view(there), *_boxes_by_view(episode.objects)) > 0
+    there = there.select(np.flatnonzero(~taken.any(axis=1))[:count])
+    there = replace(there, ids=episode.objects.ids.max(initial=-1) + 1 + np.arange(len(there)))
+    steps = episode.objects.split(episode.objects_per_step)
+    objects = ObjectTable.concatenate([table for step in steps for table in (step, there)])
+    objects_per_step = episode.objects_per_step + len(there)
+    return replace(
+        example, content=replace(episode, objects=objects, objects_per_step=objects_per_step), base=0
+    )
+
+
+def _boxes_by_view(objects: ObjectTable) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes, (2, N, 4), and visibility, (2, N)."""
+    return objects.boxes.swapaxes(0, 1), objects.masks.T
+
 
 Transform: TypeAlias = Callable[[Example, np.random.Generator], Example]
 
@@ -87,3 +194,127 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
             shuffle_prompt_objects,
         ),
     )
+
+
+NUM_VIEWS = len(VIEWS)
+MOST_SLOTS = 256  # numbers drawn for a step; more than there are ids
+_LAST = 1e6  # sorts after every slot
+
+
+def augmented(
+    batch: Batch,
+    layout: Literal["objects", "views", "frames"],
+    *,
+    probability: float,
+    rngs: Sequence[np.random.Generator],
+) -> Batch:
+    """Add false positives, and shuffle objects where their order has no meaning.
+
+    Args:
+        batch: Demonstrations.
+        layout: Token layout of the `Processor`. Fused objects are shuffled, as the head points at them. With
+            a token for each view they keep their order, as in the published policies, and false positives
+            anywhere among them. Whole frames stay as they are.
+        probability: Probability that a view of a step contains a false positive.
+        rngs: One for each demonstration; draws depend neither on the rest of the batch nor on padding.
+
+    Returns:
+        The batch with two more slots for objects; targets follow their objects.
+    """
+    if layout == "frames":
+        return batch
+    drawn = _drawn(batch.history, rngs)
+    shows_BTV = drawn[..., :NUM_VIEWS] < probability
+    shows_BTV &= batch.history.steps_BT[..., None]
+    if layout == "views":
+        return _with_spurious_in_views(batch, shows_BTV, drawn[..., NUM_VIEWS : 2 * NUM_VIEWS])
+    history = batch.history
+    is_slot = torch.arange(history.positions_BTN2.shape[2]) < history.num_slots_BT[..., None]
+    keys_BTN = torch.cat(  # padding of the batch stays at the end
+        [torch.where(is_slot, drawn[..., 2 * NUM_VIEWS :], _LAST), drawn[..., NUM_VIEWS : 2 * NUM_VIEWS]], -1
+    )
+    return _shuffled(replace(batch, history=_with_spurious_objects(batch, shows_BTV)), keys_BTN)
+
+
+def _drawn(history: HistoryBatch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
+    """Numbers from 0 to 1 for all views and slots of each step, shape (B, T, 2 V + N), float32."""
+    num_steps, num_slots = history.steps_BT.shape[1], history.positions_BTN2.shape[2]
+    drawn = np.zeros((len(rngs), num_steps, 2 * NUM_VIEWS + num_slots), np.float32)
+    for b, (rng, count) in enumerate(zip(rngs, history.steps_BT.sum(dim=1).tolist(), strict=True)):
+        drawn[b, :count] = rng.random((count, MOST_SLOTS), np.float32)[:, : drawn.shape[2]]
+    return torch.from_numpy(drawn)
+
+
+def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatch:
+    """Append a slot for each view; slot N + v is the false positive of view v, or nothing."""
+    history, false_positives = batch.history, batch.false_positives
+    visible_BTVN = torch.diag_embed(shows_BTV)  # view v, slot v
+    crop_index_BTVN = torch.diag_embed(torch.from_numpy(false_positives.crop_index)) * visible_BTVN
+    boxes_BTV4 = torch.from_numpy(false_positives.boxes)
+    boxes_BTVN4 = boxes_BTV4[:, :, :, None] * visible_BTVN[..., None]
+    points_BTN2 = torch.from_numpy(false_positives.points)
+    return replace(
+        history,
+        crop_index_BTVN=torch.cat([history.crop_index_BTVN, crop_index_BTVN], dim=3),
+        boxes_BTVN4=torch.cat([history.boxes_BTVN4, boxes_BTVN4], dim=3),
+        masks_BTVN=torch.cat([history.masks_BTVN, visible_BTVN], dim=3),
+        num_slots_BT=history.num_slots_BT + NUM_VIEWS,
+        positions_BTN2=torch.cat([history.positions_BTN2, points_BTN2], dim=2),
+        grasps_BTN2=torch.cat([history.grasps_BTN2, points_BTN2], dim=2),
+    )
+
+
+def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, drawn_BTV: torch.Tensor) -> Batch:
+    """Put false positives anywhere among the visible slots of their view.
+
+    The numbers of slots become what `Processor` would make of such detections: each is an object that one
+    view shows, so that the other view gets an empty slot; and slots once there stay for the episode.
+    """
+    history = _with_spurious_objects(batch, shows_BTV)
+    num_visible_BTV = batch.history.masks_BTVN.sum(dim=3)
+    place_BTV = (drawn_BTV * (num_visible_BTV + 1)).floor() - 0.5
+    num_slots = history.masks_BTVN.shape[3]
+    rank_BTVN = torch.arange(num_slots).expand(history.masks_BTVN.shape).to(torch.float32)
+    rank_BTVN = torch.where(history.masks_BTVN, rank_BTVN, rank_BTVN + _LAST)
+    rank_BTVN[..., -NUM_VIEWS:] = torch.where(
+        torch.diag_embed(shows_BTV), place_BTV[..., None], rank_BTVN[..., -NUM_VIEWS:]
+    )
+    num_slots_BT = (batch.history.num_slots_BT + shows_BTV.sum(dim=2)).cummax(dim=1).values
+    num_slots_BT = torch.where(history.steps_BT, num_slots_BT, 0)
+    views = _in_order(history, rank_BTVN.argsort(dim=3))
+    return replace(batch, history=replace(views, num_slots_BT=num_slots_BT))
+
+
+def _shuffled(batch: Batch, keys_BTN: torch.Tensor) -> Batch:
+    """Put the objects of every step into the order of numbers drawn for them."""
+    history = batch.history
+    order_BTN = keys_BTN.argsort(dim=-1, stable=True)
+    place_BTN = order_BTN.argsort(dim=-1)  # where each old slot has gone
+    order_BTN2 = order_BTN[..., None].expand_as(history.positions_BTN2)
+    views = _in_order(history, order_BTN[:, :, None].expand_as(history.crop_index_BTVN))
+    moved = replace(
+        views,
+        positions_BTN2=history.positions_BTN2.gather(2, order_BTN2),
+        grasps_BTN2=history.grasps_BTN2.gather(2, order_BTN2),
+    )
+    targets = replace(
+        batch.targets,
+        pick_BT=_moved(batch.targets.pick_BT, place_BTN),
+        place_BT=_moved(batch.targets.place_BT, place_BTN),
+    )
+    return replace(batch, history=moved, targets=targets)
+
+
+def _in_order(history: HistoryBatch, order_BTVN: torch.Tensor) -> HistoryBatch:
+    """Reorder what views show of the objects."""
+    return replace(
+        history,
+        crop_index_BTVN=history.crop_index_BTVN.gather(3, order_BTVN),
+        boxes_BTVN4=history.boxes_BTVN4.gather(3, order_BTVN[..., None].expand_as(history.boxes_BTVN4)),
+        masks_BTVN=history.masks_BTVN.gather(3, order_BTVN),
+    )
+
+
+def _moved(slot_BT: torch.Tensor, place_BTN: torch.Tensor) -> torch.Tensor:
+    new_BT = place_BTN.gather(2, slot_BT.clamp(min=0)[..., None]).squeeze(2)
+    return torch.where(slot_BT >= 0, new_BT, slot_BT)

@@ -1,29 +1,123 @@
-"""Detector training as a stage of the training loop."""
+"""Detector training: the split of the demonstrations, the learner, and the stage of the training loop."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from openvima.detector.augmentation import augment_frame
-from openvima.detector.checkpoint import load_network
+from openvima.data.hash_split import split_hashes
+from openvima.data.reader import Dataset
+from openvima.detector.checkpoint import load_detectron2, load_network, load_weights, write_network
 from openvima.detector.config import detector_config
-from openvima.detector.detectron2 import load_detectron2
-from openvima.detector.frames import Frame, FrameSampler, held_out_frames
-from openvima.detector.network import MaskRCNN
+from openvima.detector.frames import Frame, FrameSampler, augment_frame, held_out_frames
+from openvima.detector.network import Instances, MaskRCNN
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.base import torch_threads
+from openvima.policies.naming import WEIGHTS_FILE
 from openvima.training.batches import BatchOrder
 from openvima.training.detector.config import DetectorTrainingConfig
-from openvima.training.detector.learner import DetectorLearner, FrameBatch
-from openvima.training.detector.split import split_episodes
-from openvima.training.loop import Metrics, PlannedStage, Report, Trainer, num_steps
+from openvima.training.learner import Learner
+from openvima.training.loop import (
+    Metrics,
+    PlannedStage,
+    Report,
+    Trainer,
+    num_steps,
+    step_generator,
+    step_seed,
+)
 from openvima.training.parallel import Parallel, compile_layers, joined
-from openvima.training.provenance import held_out_demonstrations
-from openvima.training.run_folder import run_lock
-from openvima.training.schedule import step_generator, step_seed
+from openvima.training.run_folder import held_out_demonstrations, run_lock
 from openvima.training.source import check_scenes, open_demonstrations
+
+
+def split_episodes(dataset: Dataset, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+    """Split demonstrations into training and validation.
+
+    The split follows from task and seed, so that it stays the same when data are added.
+
+    Args:
+        dataset: The demonstrations.
+        fraction: Fraction to hold out.
+
+    Returns:
+        Indices of both.
+    """
+    hashes = split_hashes(dataset.index, "detector/")
+    return np.flatnonzero(hashes >= fraction), np.flatnonzero(hashes < fraction)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameBatch:
+    """Frames of one size.
+
+    Args:
+        images: Shape (B, 3, H, W), uint8.
+        objects: Those of each image.
+        generator: Samples the anchors and proposals of the losses.
+    """
+
+    images: torch.Tensor
+    objects: Sequence[Instances]
+    generator: torch.Generator
+
+    @staticmethod
+    def of(frames: Sequence[Frame], generator: torch.Generator) -> "FrameBatch":
+        """Stack frames into tensors."""
+        images = torch.from_numpy(np.stack([frame.rgb for frame in frames]))
+        objects = [
+            Instances(
+                torch.from_numpy(frame.boxes), torch.from_numpy(frame.masks), torch.ones(len(frame.boxes))
+            )
+            for frame in frames
+        ]
+        return FrameBatch(images, objects, generator)
+
+    def to(self, device: torch.device) -> "FrameBatch":
+        """Return the batch on another device; random numbers come from the CPU."""
+        return FrameBatch(
+            self.images.to(device), [objects.to(device) for objects in self.objects], self.generator
+        )
+
+
+class DetectorLearner(Learner):
+    """A Mask R-CNN, trained on frames with known objects.
+
+    Args:
+        network: The network; it is trained in place.
+        sampled: Proposals of a frame that the heads are trained on.
+    """
+
+    def __init__(self, network: MaskRCNN, *, sampled: int) -> None:
+        super().__init__()
+        self.network = network
+        self._sampled = sampled
+
+    def forward(self, batch: FrameBatch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Return the sum of the losses, and each of them as "loss/NAME"."""
+        losses = self.network.losses(
+            batch.images, batch.objects, sampled=self._sampled, generator=batch.generator
+        )
+        parts = {f"loss/{name}": value.detach() for name, value in losses.items()}
+        return torch.stack(list(losses.values())).sum(), parts
+
+    def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
+        """Write a checkpoint that `load_detector` takes."""
+        prefix = "network."
+        own = {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
+        write_network(self.network, folder, own)
+
+    def read(self, folder: Path) -> None:
+        """Load the weights of a checkpoint."""
+        load_weights(self.network, folder / WEIGHTS_FILE)
+
+    def description(self) -> dict[str, Any]:  # Any: plain YAML values
+        """Return all sizes of the network."""
+        return self.network.config.to_dict()
+
 
 VALIDATION_BATCH = 8  # frames
 

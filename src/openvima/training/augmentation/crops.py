@@ -1,8 +1,4 @@
-"""Occlusion by bars of the background: white in a prompt image, the table in a scene.
-
-Few shapes of the training partition have gaps, so that the encoder would take what shows through those of
-pallets and crates for their texture. All images of one object get the same bars,
-each upright or level at random.
+"""Augmentation of the crops of contrastive pretraining.
 
 Shape suffixes: K objects, D draws, Y rows, X columns of a crop.
 """
@@ -11,9 +7,32 @@ import math
 from dataclasses import replace
 
 import torch
+from torch.nn import functional as F
 
 from openvima.render.rasteriser import FLOOR_RGB, SHEET_RGB
 from openvima.training.pretraining.pairs import Pairs, SecondView
+
+
+def with_horizontal_flips(pairs: Pairs, generator: torch.Generator) -> Pairs:
+    """Mirror all images of half of the objects, drawn at random, and reverse their rotations.
+
+    Both cameras look at the table from its middle, so that mirrored images are images of mirrored objects.
+    """
+    view = pairs.second_view
+    assert view is not None, "only pairs with a second view are flipped"
+    is_flipped = (torch.rand(len(pairs.scenes), generator=generator) < 0.5).to(pairs.scenes.device)
+
+    def flipped(crops: torch.Tensor) -> torch.Tensor:
+        return torch.where(is_flipped[:, None, None, None, None], crops.flip(-1), crops)
+
+    rotations = torch.where(is_flipped[:, None], -view.rotations, view.rotations)
+    return replace(
+        pairs,
+        prompt_crops=flipped(pairs.prompt_crops),
+        scene_crops=flipped(pairs.scene_crops),
+        second_view=SecondView(flipped(view.crops), view.masks, rotations),
+    )
+
 
 _PROMPT_BACKGROUND, _SCENE_BACKGROUND = FLOOR_RGB[0], SHEET_RGB[0]  # both are gray
 _NUM_BARS, _NUM_BRACES = (3, 8), (0, 3)  # bars across a crop, and visible strips that cross them
@@ -74,3 +93,48 @@ def _bars(drawn_KD: torch.Tensor, size: int, generator: torch.Generator) -> torc
 def _between(fraction: torch.Tensor, limits: tuple[float, float]) -> torch.Tensor:
     low, high = limits
     return low + (high - low) * fraction
+
+
+_CROP_PX = 32
+
+
+def with_box_jitter(pairs: Pairs, pixels: float, generator: torch.Generator) -> Pairs:
+    """Shift and scale each crop at random.
+
+    Args:
+        pairs: Their crops become float32.
+        pixels: Largest shift of a crop, and half of the largest change of its size, in its own pixels.
+        generator: Source of the draws.
+    """
+    view = pairs.second_view
+    return replace(
+        pairs,
+        prompt_crops=_jittered(pairs.prompt_crops, pixels, generator),
+        scene_crops=_jittered(pairs.scene_crops, pixels, generator),
+        second_view=replace(view, crops=_jittered(view.crops, pixels, generator)) if view else None,
+    )
+
+
+def _jittered(crops: torch.Tensor, pixels: float, generator: torch.Generator) -> torch.Tensor:
+    flat = crops.flatten(0, -4).float()
+    draws = (2 * torch.rand(len(flat), 3, generator=generator) - 1).to(flat.device)
+    draws *= 2 * pixels / _CROP_PX  # the borders are at −1 and 1
+    theta = flat.new_zeros(len(flat), 2, 3)
+    theta[:, 0, 0] = theta[:, 1, 1] = 1 + draws[:, 0]
+    theta[:, :, 2] = draws[:, 1:]
+    grid = F.affine_grid(theta, list(flat.shape), align_corners=False)
+    sampled = F.grid_sample(flat, grid, padding_mode="border", align_corners=False)
+    return sampled.unflatten(0, crops.shape[:-3])
+
+
+def channel_mixing(generator: torch.Generator) -> torch.Tensor:
+    """Draw a (3, 3) matrix that mixes R, G and B: half of the time the identity, else a blended permutation.
+
+    Rows sum to 1, so that white, grey and black stay what they are.
+    """
+    if torch.rand((), generator=generator) < 0.5:
+        return torch.eye(3)
+    permutation = torch.eye(3)[torch.randperm(3, generator=generator)]
+    blending = torch.rand(3, 3, generator=generator)
+    weight = 0.5 * torch.rand((), generator=generator)
+    return (1 - weight) * permutation + weight * blending / blending.sum(1, keepdim=True)

@@ -1,0 +1,307 @@
+"""Prompt augmentation: a function takes a demonstration and a generator, and returns another demonstration.
+
+What a prompt allows is read from its text and images; no task is named. `demonstrations.py` lists the
+functions, in the order of their draws.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openvima.data.preprocessed import PreprocessedEpisode
+from openvima.errors import UnknownTaskError
+from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, image_names
+from openvima.policies.tokenizer import UNKNOWN
+from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
+from openvima.tasks.novel_words import ADJECTIVES, NOUNS
+from openvima.tasks.paraphrasing import rephrased, training_paraphrases
+from openvima.tasks.prompts import synonyms, with_phrases
+from openvima.tasks.registry import task_spec
+from openvima.tasks.sweep_table import NUMBER_WORDS
+from openvima.training.dataset import Example
+
+DEFINITION = "This is a {noun} {image}."  # as in `novel_noun`
+
+NamedImages = dict[str, tuple[ObjectTable, bool]]
+
+
+def images_by_name(prompt: PreprocessedPrompt) -> NamedImages:
+    """Return the objects of each prompt image, and whether it is a scene, by its name."""
+    tables = prompt.objects.split(prompt.objects_per_image)
+    return dict(zip(prompt.image_names, zip(tables, prompt.is_scene.tolist(), strict=True), strict=True))
+
+
+def with_prompt(
+    episode: PreprocessedEpisode, text: str, images: Mapping[str, tuple[ObjectTable, bool]]
+) -> PreprocessedEpisode:
+    """Return the demonstration with another prompt, which contains some of these images."""
+    shown = [images[name] for name in image_names(text)]
+    prompt = PreprocessedPrompt(
+        text=text,
+        objects=ObjectTable.concatenate([table for table, _ in shown]),
+        objects_per_image=np.array([len(table) for table, _ in shown], np.int16),
+        is_scene=np.array([is_scene for _, is_scene in shown], np.bool_),
+    )
+    return replace(episode, prompt=prompt)
+
+
+MAX_NAMES = 2
+_NOVEL_WORD = re.compile(rf"\b({'|'.join(NOUNS + ADJECTIVES)})\b")
+_DETERMINERS = ("the", "same", "any", "all", *NUMBER_WORDS)  # words after which a noun needs no article
+
+
+def renamed(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
+    """Name one or two single objects of a prompt by novel nouns.
+
+    Half of these prompts also define nouns of unused objects in view, so that nouns have to be read. Only
+    table rows are copied, no images. Prompts with novel words of their own or without single objects are
+    unchanged.
+    """
+    images = images_by_name(episode.prompt)
+    named = [name for name, (objects, is_scene) in images.items() if len(objects) == 1 and not is_scene]
+    if not named or _NOVEL_WORD.search(episode.prompt.text):
+        return episode
+    count = int(rng.integers(1, min(MAX_NAMES, len(named)) + 1))
+    chosen = [named[int(number)] for number in rng.permutation(len(named))[:count]]
+    nouns = [NOUNS[int(number)] for number in rng.permutation(len(NOUNS))]
+    text = episode.prompt.text
+    for name, noun in zip(chosen, nouns, strict=False):
+        text = re.sub(rf"(\w+) \{{{name}\}}", lambda found, noun=noun: _noun_phrase(found[1], noun), text)
+    if rng.random() < 0.5:
+        others = _unused_in_view(episode, images[chosen[0]][0], rng)[: len(NOUNS) - count]
+        images |= {f"other_{number}": (objects, False) for number, objects in enumerate(others)}
+        chosen += [f"other_{number}" for number in range(len(others))]
+    defined = [
+        DEFINITION.format(noun=noun, image=f"{{{name}}}") for name, noun in zip(chosen, nouns, strict=False)
+    ]
+    text = " ".join([*(defined[int(number)] for number in rng.permutation(len(defined))), text])
+    return with_prompt(episode, text, images)
+
+
+def _unused_in_view(
+    episode: PreprocessedEpisode, single: ObjectTable, rng: np.random.Generator
+) -> list[ObjectTable]:
+    """Make prompt images of objects that the first step does not use, in random order.
+
+    They have the crops of the scene and the boxes of a single object in a prompt image.
+
+    Args:
+        episode: The demonstration.
+        single: The row of such a single object.
+        rng: Draws the order.
+    """
+    first = episode.objects.select(slice(0, int(episode.objects_per_step[0])))
+    first = first.select(~np.isin(first.ids, [episode.pick_ids[0], episode.place_ids[0]]))
+    rows = single.select(np.zeros(len(first), np.int64))
+    # A hidden object has no box.
+    rows = replace(rows, crop_index=first.crop_index, boxes=rows.boxes * first.masks[..., None])
+    return [rows.select(np.array([number])) for number in rng.permutation(len(rows))]
+
+
+def _noun_phrase(before: str, noun: str) -> str:
+    return f"{before} {noun}" if before.lower() in _DETERMINERS else f"{before} the {noun}"
+
+
+_SENTENCE_END = re.compile(r"(?<=\.) ")
+_IS_COMPARISON = re.compile(r"\} is \w+ than \{")
+
+
+def shuffled(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
+    """Shuffle definitions, comparisons ("{a} is kobar than {b}.") and the instruction.
+
+    At least one of several comparisons is kept. The purpose of an image then follows from the words around it
+    and not from its position. Other prompts are unchanged.
+    """
+    definitions, comparisons, instruction = [], [], []
+    for sentence in _SENTENCE_END.split(episode.prompt.text):
+        if _IS_COMPARISON.search(sentence):
+            comparisons.append(sentence)
+        elif sentence.startswith(DEFINITION.partition("{")[0]):
+            definitions.append(sentence)
+        else:
+            instruction.append(sentence)
+    if comparisons:
+        kept = rng.permutation(len(comparisons))[: int(rng.integers(1, len(comparisons) + 1))]
+        definitions += [comparisons[int(number)] for number in kept]
+    if not definitions:
+        return episode
+    blocks = [*definitions, " ".join(instruction)]
+    text = " ".join(blocks[int(number)] for number in rng.permutation(len(blocks)))
+    return with_prompt(episode, text, images_by_name(episode.prompt))
+
+
+def paraphrased(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
+    """Put a paraphrase in place of a prompt; tasks without any, and prompts of other forms, are unchanged.
+
+    Args:
+        episode: The demonstration.
+        rng: Draws the paraphrase.
+    """
+    phrasings = training_paraphrases().get(episode.task)
+    if not phrasings:
+        return episode
+    try:
+        template = task_spec(episode.task).template
+    except UnknownTaskError:  # demonstrations of a task that is not installed here
+        return episode
+    text = rephrased(episode.prompt.text, template, phrasings[int(rng.integers(len(phrasings)))])
+    return episode if text is None else with_prompt(episode, text, images_by_name(episode.prompt))
+
+
+_FORMS = "all {x}. {x}. is a zup {x}"  # plural, articles and colon, which descriptions bring with them
+
+
+@dataclass(frozen=True, slots=True)
+class DescribeObjects:
+    """Replaces object images of task prompts by texture and name of the object.
+
+    Args:
+        image_prob: Probability for each image.
+        synonym_prob: Probability that a description names the object by an alias of the catalogue.
+        prompt_prob: Probability for each demonstration that all its images are replaced.
+    """
+
+    image_prob: float
+    synonym_prob: float = 0.0
+    prompt_prob: float = 0.0
+
+    @property
+    def prob(self) -> float:
+        """A probability that is 0 if nothing is ever replaced."""
+        return max(self.image_prob, self.prompt_prob)
+
+    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+        """Augment a demonstration."""
+        if not self.prob:
+            return example
+        prob = 1.0 if self.prompt_prob and rng.random() < self.prompt_prob else self.image_prob
+        episode = example.episode
+        if self.synonym_prob:
+            episode = with_synonyms(episode, self.synonym_prob, rng)
+        return replace(example, content=with_descriptions(episode, prob, rng))
+
+
+def with_descriptions(
+    episode: PreprocessedEpisode, prob: float, rng: np.random.Generator
+) -> PreprocessedEpisode:
+    """Replace some object images by their descriptions; images without one stay.
+
+    Args:
+        episode: The demonstration.
+        prob: Probability for each image.
+        rng: Draws the images.
+    """
+    names = [name for name in episode.prompt.image_names if name in episode.descriptions]
+    chosen = [name for name, draw in zip(names, rng.random(len(names)), strict=True) if draw < prob]
+    if not chosen:
+        return episode
+    text = with_phrases(episode.prompt.text, {name: episode.descriptions[name] for name in chosen})
+    return with_prompt(episode, text, images_by_name(episode.prompt))
+
+
+def with_synonyms(episode: PreprocessedEpisode, prob: float, rng: np.random.Generator) -> PreprocessedEpisode:
+    """Replace the names in some descriptions by aliases; those of objects without any stay.
+
+    Args:
+        episode: The demonstration.
+        prob: Probability for each description.
+        rng: Draws descriptions and aliases.
+    """
+    said = dict(episode.descriptions)
+    for name, draw, choice in zip(said, rng.random(len(said)), rng.random(len(said)), strict=True):
+        if draw < prob and (others := synonyms(said[name])):
+            said[name] = others[int(choice * len(others))]
+    return replace(episode, descriptions=said)
+
+
+def text_of(description: str) -> str:
+    """Return a text with all words that a description brings into prompts: article and plural, too."""
+    return with_phrases(_FORMS, {"x": description})
+
+
+_SLOT_OR_WORD = re.compile(rf"\{{\w+\}}|{UNKNOWN}|[^\W\d_]+(?:-[^\W\d_]+)*")
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownWords:
+    """Replaces words of prompts by the unknown token; images, numbers and punctuation stay.
+
+    Args:
+        prob: Probability for each word.
+    """
+
+    prob: float
+
+    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+        """Augment a demonstration."""
+        if not self.prob:
+            return example
+
+        def masked(found: re.Match[str]) -> str:
+            is_word = found[0][0] != "{"
+            return UNKNOWN if is_word and rng.random() < self.prob else found[0]
+
+        prompt = example.episode.prompt
+        prompt = replace(prompt, text=_SLOT_OR_WORD.sub(masked, prompt.text))
+        return replace(example, content=replace(example.episode, prompt=prompt))
+
+
+def with_shuffled_prompt_objects(
+    episode: PreprocessedEpisode, rng: np.random.Generator
+) -> PreprocessedEpisode:
+    """Permute the objects of each prompt image, independently."""
+    counts = episode.prompt.objects_per_image.astype(np.int64)
+    firsts = np.cumsum(counts) - counts
+    rows = [first + rng.permutation(count) for first, count in zip(firsts, counts, strict=True)]
+    objects = episode.prompt.objects.select(np.concatenate([np.zeros(0, np.int64), *rows]))
+    return replace(episode, prompt=replace(episode.prompt, objects=objects))
+
+
+MOTION_TEXT = "Follow this motion: {frames}."
+
+
+def with_motion_prompt(episode: PreprocessedEpisode) -> PreprocessedEpisode:
+    """Replace the prompt by the frames of the demonstration.
+
+    Only table rows are copied: the prompt refers to the images of the history. Nothing is left of the task's
+    own prompt.
+
+    Args:
+        episode: The demonstration. In a prompt image its objects are ordered by id, as in the scenes of task
+            prompts. Objects without any box, which stand for steps without detections, are left out.
+    """
+    objects = ObjectTable.concatenate([episode.objects, episode.final])
+    num_frames = episode.num_steps + 1
+    frame = np.repeat(np.arange(num_frames), [*episode.objects_per_step, len(episode.final)])
+    order = np.lexsort((objects.ids, frame))
+    order = order[np.asarray(objects.masks.any(axis=1))[order]]
+    prompt = PreprocessedPrompt(
+        text=motion_text(num_frames),
+        objects=objects.select(order),
+        objects_per_image=np.bincount(frame[order], minlength=num_frames).astype(np.int16),
+        is_scene=np.ones(num_frames, np.bool_),
+    )
+    return replace(episode, prompt=prompt)
+
+
+def motion_prompt(observations: Sequence[Mapping], objects: Sequence[ObjectRecord]) -> RenderedPrompt:
+    """Make the prompt of an in-context demonstration.
+
+    Args:
+        observations: `rgb` and `segm`, each view name to array.
+        objects: The objects of the scene.
+    """
+    records = tuple(sorted(objects, key=lambda record: record.object_id))
+    images = {}
+    for number, seen in enumerate(observations):
+        name = f"frame_{number}"
+        images[name] = PromptImage(name, "scene", dict(seen["rgb"]), dict(seen["segm"]), records)
+    return RenderedPrompt(motion_text(len(images)), images)
+
+
+def motion_text(num_frames: int) -> str:
+    """Return the text for so many frames, with a placeholder for each."""
+    frames = " ".join(f"{{frame_{number}}}" for number in range(num_frames))
+    return MOTION_TEXT.format(frames=frames)

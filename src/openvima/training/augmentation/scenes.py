@@ -1,0 +1,218 @@
+"""Augmentation of the scenes of contrastive pretraining.
+
+Random textures and shapes (domain randomization); hard negatives, which differ from an object in one
+respect; rearranged second views; and grayscale prompt images, as in `novel_noun`, which identify an object by
+its shape alone.
+"""
+
+import math
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openvima.catalog.geometry import Assets
+from openvima.catalog.partitions import OBJECT_SETS
+from openvima.catalog.random_pack import is_random, random_name
+from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Placement, Pose, Scene
+from openvima.tasks.table import NO_SCALE
+
+_MOVABLE, _CONTAINERS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
+_PALETTE_SIZE = 3  # random textures of a scene, so that some of its objects share one
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeKinds:
+    """How often random shapes are of special kinds; see `PretrainingConfig`."""
+
+    grating_prob: float = 0.0
+    eared_prob: float = 0.0
+    ring_and_block_prob: float = 0.0
+
+    def of_movable(self, rng: np.random.Generator) -> str:
+        """Draw the kind of a movable shape."""
+        if not _happens(self.ring_and_block_prob, rng):
+            return "shape"
+        return "ring" if rng.random() < 0.5 else "block"
+
+    def of_container(self, rng: np.random.Generator) -> str:
+        """Draw the kind of a container."""
+        if _happens(self.grating_prob, rng):
+            return "grating"
+        return "eared container" if _happens(self.eared_prob, rng) else "container"
+
+
+def with_random_appearance(
+    scene: Scene, prob: float, assets: Assets, rng: np.random.Generator, kinds: ShapeKinds | None = None
+) -> Scene:
+    """Give some of the objects a random texture, and some a random shape.
+
+    Args:
+        scene: Objects of the training partition; only movable ones and containers get random shapes.
+        prob: Probability of either for each object.
+        assets: A pack with random textures and shapes.
+        rng: Source of all draws.
+        kinds: How often which kinds of shapes; none of the special ones by default.
+    """
+    palette = [random_name("texture", rng) for _ in range(_PALETTE_SIZE)]
+    # In half of the scenes equal containers stay equal, so that only texture distinguishes them.
+    common = {} if rng.random() < 0.5 else None
+    placements = []
+    for placement in scene.placements:
+        if rng.random() < prob:
+            dark = "dark " if rng.random() < 0.25 else ""
+            placement = replace(placement, texture=dark + palette[int(rng.integers(_PALETTE_SIZE))])
+        if rng.random() < prob:
+            placement = _with_random_shape(placement, assets, rng, common, kinds or ShapeKinds())
+        placements.append(placement)
+    return replace(scene, placements=tuple(placements))
+
+
+def at_rest(placement: Placement, assets: Assets) -> Placement:
+    """Put an object on the table at the height of its own shape."""
+    height = assets.geometry(placement.object, placement.size, placement.scale).rest_z_m
+    return placement.at(Pose((placement.pose.x, placement.pose.y, height), placement.pose.quaternion))
+
+
+def _with_random_shape(
+    placement: Placement,
+    assets: Assets,
+    rng: np.random.Generator,
+    common: dict[str, str] | None,
+    kinds: ShapeKinds,
+) -> Placement:
+    is_container = placement.object in _CONTAINERS
+    if not is_container and placement.object not in _MOVABLE:
+        return placement
+    name = random_name(kinds.of_container(rng) if is_container else kinds.of_movable(rng), rng)
+    if common is not None and is_container:
+        name = common.setdefault(placement.object, name)
+    return at_rest(replace(placement, object=name), assets)
+
+
+def _happens(prob: float, rng: np.random.Generator) -> bool:
+    return bool(prob) and bool(rng.random() < prob)  # draws nothing at 0, so that other draws stay
+
+
+EDGE_M = 0.06  # from the edge of the workspace to the middle of an object
+_JITTER_M = 0.02
+
+
+def rearranged(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int, float]]:
+    """Rotate each object by a random angle; in half of the scenes movable objects also swap positions.
+
+    Returns:
+        The scene, and the rotation of each object by id: counter-clockwise seen from above, in 0 … 2π.
+    """
+    rotations = {p.id: rng.uniform(0, 2 * math.pi) for p in scene.placements}
+    movable = [p for p in scene.placements if not p.fixed]
+    positions = {p.id: (p.pose.x, p.pose.y) for p in scene.placements}
+    if rng.random() < 0.5:
+        others = [movable[int(index)].pose for index in rng.permutation(len(movable))]
+        positions |= {p.id: _near(other, rng) for p, other in zip(movable, others, strict=True)}
+    poses = {
+        p.id: Pose((*positions[p.id], p.pose.z), p.pose.rotated(rotations[p.id]).quaternion)
+        for p in scene.placements
+    }
+    return scene.with_poses(poses), rotations
+
+
+def _near(pose: Pose, rng: np.random.Generator) -> tuple[float, float]:
+    """Return a position near another one, inside the workspace."""
+    x, y = np.array((pose.x, pose.y)) + rng.uniform(-_JITTER_M, _JITTER_M, 2)
+    low, high = np.array(WORKSPACE_LOW) + EDGE_M, np.array(WORKSPACE_HIGH) - EDGE_M
+    x, y = np.clip((x, y), low, high).tolist()
+    return x, y
+
+
+_KINDS = ("height", "shade", "texture", "shape")
+_STRETCH = (1.35, 2.2)  # ratio of heights
+_TRIES = 20
+_CLEARANCE_M = 0.12
+
+
+def with_hard_negatives(
+    scene: Scene, prob: float, shades: AbstractSet[str], assets: Assets, rng: np.random.Generator
+) -> Scene:
+    """Add hard negatives, which differ from an object in height, shade, texture or shape alone.
+
+    Args:
+        scene: The scene.
+        prob: Probability for each movable object; there may be no room for its hard negative.
+        shades: Textures, light and dark, that movable objects may have.
+        assets: Source of shapes.
+        rng: Source of all draws.
+    """
+    placements = list(scene.placements)
+    for original in scene.placements:
+        is_eligible = original.object in _MOVABLE or is_random(original.object)
+        if original.fixed or not is_eligible or rng.random() >= prob:
+            continue
+        position = _free_position(placements, rng)
+        kind = _KINDS[int(rng.integers(len(_KINDS)))]
+        negative = _changed(original, kind, scene.placements, shades, assets, rng)
+        if position and negative:
+            pose = Pose.planar(*position, rng.uniform(0, 2 * math.pi), z=negative.pose.z)
+            placements.append(replace(negative, id=placements[-1].id + 1, pose=pose))
+    return replace(scene, placements=tuple(placements))
+
+
+def _changed(
+    original: Placement,
+    kind: str,
+    others: Sequence[Placement],
+    shades: AbstractSet[str],
+    assets: Assets,
+    rng: np.random.Generator,
+) -> Placement | None:
+    """Return the object changed in one respect; None where that is impossible."""
+    if kind == "height":
+        x, y, z = original.scale
+        stretch = rng.uniform(*_STRETCH)
+        factor = stretch if rng.random() < 0.5 else 1 / stretch
+        return at_rest(replace(original, scale=(x, y, z * factor)), assets)
+    if kind == "shade":
+        shade = _other_shade(original.texture, shades)
+        return None if shade is None else replace(original, texture=shade)
+    if kind == "texture":
+        names = [p.texture for p in others if not p.fixed and p.texture != original.texture]
+        return replace(original, texture=names[int(rng.integers(len(names)))]) if names else None
+    shapes = [p for p in others if not p.fixed and p.object != original.object]
+    if not shapes:
+        return None
+    shape = shapes[int(rng.integers(len(shapes)))]
+    return at_rest(replace(original, object=shape.object, size=shape.size, scale=shape.scale), assets)
+
+
+def _other_shade(texture: str, shades: AbstractSet[str]) -> str | None:
+    if is_random(texture):
+        return texture.removeprefix("dark ") if texture.startswith("dark ") else f"dark {texture}"
+    spec = texture_spec(texture)
+    other = spec.light_variant if spec.is_dark else spec.dark_variant
+    return other if other in shades else None
+
+
+def _free_position(placements: Sequence[Placement], rng: np.random.Generator) -> tuple[float, float] | None:
+    """Return a position clear of other objects, or None where none was found."""
+    low, high = np.array(WORKSPACE_LOW) + EDGE_M, np.array(WORKSPACE_HIGH) - EDGE_M
+    for _ in range(_TRIES):
+        x, y = rng.uniform(low, high).tolist()
+        if all(math.hypot(x - p.pose.x, y - p.pose.y) >= _clearance(p) for p in placements):
+            return x, y
+    return None
+
+
+def _clearance(placement: Placement) -> float:
+    return _CLEARANCE_M + (0.06 if placement.fixed else 0.0)
+
+
+def draw_grayscale(count: int, prob: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw which of some objects have a grayscale prompt image, shape (count,), bool."""
+    return rng.random(count) < prob
+
+
+def grayscale(placement: Placement) -> Placement:
+    """Return an object as a grayscale prompt image shows it: neutral texture, no scale."""
+    return replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE)
