@@ -12,7 +12,7 @@ import yaml
 
 from openvima.atomic_io import atomic_write_file
 from openvima.data import Dataset
-from openvima.data.appearance_stats import appearance_record, appearance_text
+from openvima.data.appearances import appearance_record, appearance_text
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import load_network, read_info, write_checkpoint

@@ -48,6 +48,8 @@ _counters: Any = None
 
 Counts = Sequence[Sequence[int]]
 """The numbers last passed to `count`, one row per job; zeros before it starts."""
+Report = Callable[[int, int, str], None]
+"""Called with the number of things done, that of all, and a note."""
 
 
 class Job(Protocol):

@@ -10,8 +10,14 @@ import pytest
 from openvima.catalog import TEXTURE_SETS
 from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.appearance_stats import ROLES, appearance_record, appearance_text, appearances_of
-from openvima.data.leakage import leaks, training_appearances
+from openvima.data.appearances import (
+    ROLES,
+    appearance_record,
+    appearance_text,
+    appearances_of,
+    find_leaks,
+    training_appearances,
+)
 from openvima.data.manifest import MANIFEST_NAME
 from openvima.errors import LevelError
 from recorded_seeds import seeds_of
@@ -69,7 +75,7 @@ def test_the_table_names_its_data_and_survives_a_file(demos: Path, record: dict[
 
 
 def test_demonstrations_for_training_keep_to_their_partition(record: dict[str, Any]) -> None:
-    assert leaks(record) == []
+    assert find_leaks(record) == []
 
 
 @pytest.mark.parametrize(
@@ -92,14 +98,16 @@ def test_appearances_outside_the_partition_are_named(
     roles.setdefault(role, {"appearances": []})["appearances"].append(
         {"objects": [appearance[0]], "textures": [appearance[1]]}
     )
-    assert leaks(changed) == [f"visual_manipulation shows {appearance[0]!r} in {appearance[1]!r} as {role}."]
+    assert find_leaks(changed) == [
+        f"visual_manipulation shows {appearance[0]!r} in {appearance[1]!r} as {role}."
+    ]
 
 
 def test_other_tasks_and_levels_are_named(record: dict[str, Any]) -> None:
     changed = deepcopy(record)
     changed["tasks"]["follow_motion"] = changed["tasks"]["rearrange"]
     changed["tasks"]["rearrange"] = {**changed["tasks"]["rearrange"], "levels": ["L1", "train"]}
-    problems = leaks(changed)
+    problems = find_leaks(changed)
     assert "follow_motion is none of the training tasks." in problems
     assert "rearrange has episodes of level L1." in problems
     with pytest.raises(LevelError):

@@ -9,7 +9,7 @@ import pytest
 
 import worker_jobs
 from openvima.data import GenerateConfig, GenerationProgress, generate, plan
-from openvima.data.resuming import is_finished
+from openvima.data.manifest import is_finished
 from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
 from openvima.multiprocess import ray_imap_unordered
 from small_data_sets import contents

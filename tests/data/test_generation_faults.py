@@ -194,7 +194,7 @@ def test_a_truncated_shard_stops_generating_and_reading(whole: Path, tmp_path: P
     with pytest.raises(ShardError, match="truncated"):
         _ = dataset[0]
     assert dataset[2].task == "rotate"  # of another shard
-    with pytest.raises(ShardError, match="--repair"):
+    with pytest.raises(ShardError, match="openvima data verify"):
         generate(config(tmp_path))
 
 

@@ -13,7 +13,7 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
-from openvima.data.verification import VerifyConfig, repair, verify
+from openvima.data.verification import VerifyConfig, verify
 from openvima.errors import FolderLockedError
 from small_data_sets import contents, with_plain_images, write_folder
 from small_generations import config
@@ -46,8 +46,6 @@ def test_a_second_writer_is_refused_and_changes_nothing(source: Path, tmp_path: 
                 write()
         assert contents(out) == before
     with holding(source):
-        with pytest.raises(FolderLockedError):
-            repair(source, NO_REPLAY)
         assert verify(source, NO_REPLAY).is_clean  # reading needs no lock
 
 
@@ -108,9 +106,9 @@ def test_a_full_disk_ends_in_one_line_and_leaves_nothing_half_written(
     def full(*arguments: object, **options: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("openvima.data.writer._Sink.write", full)
+    monkeypatch.setattr("openvima.data.shard._Sink.write", full)
     monkeypatch.setattr("shutil.copyfile", full)
-    monkeypatch.setattr("openvima.data.lerobot.writer.pq.ParquetWriter.write_table", full)
+    monkeypatch.setattr("openvima.data.lerobot_files.pq.ParquetWriter.write_table", full)
     with pytest.raises(OSError, match="No space left") as found:
         writers(source, out)[name]()
     assert str(found.value.filename).startswith(str(out))

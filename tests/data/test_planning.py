@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from openvima.data import GenerateConfig, plan
-from openvima.data.planning import MAX_EPISODES, MAX_FIRST_SEED, shard_episodes
+from openvima.data.planning import MAX_EPISODES, MAX_FIRST_SEED, generate_command, shard_episodes
 from openvima.env import EnvConfig
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
 from openvima.tasks.seeding import MAX_SEED
@@ -64,7 +64,7 @@ def test_who_does_the_work_does_not_matter(tmp_path: Path) -> None:
         assert plan(config(tmp_path, **changes)) == blocks
 
 
-def test_settings_survive_their_record(tmp_path: Path) -> None:
+def test_the_command_of_a_record_has_its_settings(tmp_path: Path) -> None:
     asked = config(
         tmp_path,
         level="L1",
@@ -74,17 +74,12 @@ def test_settings_survive_their_record(tmp_path: Path) -> None:
         images=False,
     )
     record = json.loads(json.dumps(asked.record()))
-    assert GenerateConfig.from_record(tmp_path, record) == asked
-    grown = replace(asked, shard_size=None, workers=2)
-    assert GenerateConfig.from_record(tmp_path, grown.record(), workers=2) == grown
     assert str(tmp_path) not in json.dumps(record)
-
-
-def test_a_record_that_lacks_a_setting_is_named(tmp_path: Path) -> None:
-    record = config(tmp_path).record()
-    del record["episodes"]
-    with pytest.raises(ConfigError, match="lack 'episodes'"):
-        GenerateConfig.from_record(tmp_path, record)
+    command = generate_command(Path("my demos"), record, keep_failed=True)
+    for words in ("--out 'my demos'", "--level L1", "--seed 5", "--task-options difficulty=hard", "--compat"):
+        assert words in command
+    for words in ("--compression zstd", "--no-images", "--keep-failed"):
+        assert words in command
 
 
 def test_a_level_that_does_not_exist_is_told(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.query import DemonstrationQuery, find_demonstrations
+from openvima.data.reader import DemonstrationQuery, find_demonstrations
 from openvima.errors import DatasetError
 
 

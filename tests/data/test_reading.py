@@ -11,13 +11,10 @@ import pytest
 
 from naive import interleaved
 from openvima.data import Dataset, Demonstration, Shard, ShardWriter
-from openvima.data.checksums import measure
 from openvima.data.encoding import Encoder, ShardInfo
-from openvima.data.image_layout import pixels, planes
 from openvima.data.manifest import finish_folder
-from openvima.data.record_stream import decode_record
+from openvima.data.records import pixels, planes
 from openvima.data.schema import ARRAYS, COLUMNS, VIEWS
-from openvima.data.shard import ODD_ERRORS
 from openvima.errors import DatasetError, ShardError
 from small_data_sets import write_folder
 
@@ -186,44 +183,6 @@ def test_memory_that_is_used_again_changes_nothing(made_up: MadeUp) -> None:
     for seed, (num_steps, num_images) in enumerate(shapes):
         demo = made_up(seed, num_steps=num_steps, num_images=num_images)
         assert encoder.encode(demo).equals(Encoder().encode(demo))
-
-
-def test_a_record_is_decoded_alone_as_in_its_shard(shard: Shard) -> None:
-    _, spans = measure(shard.path)
-    content = shard.path.read_bytes()
-    for row, span in enumerate(spans):
-        record = memoryview(content)[span.offset : span.offset + span.num_bytes]
-        assert decode_record(record, COLUMNS.names).equals(shard.batch(row))
-        steps = decode_record(record, ["steps", "rgb_top"]).column("steps")
-        assert steps.to_pylist() == [shard.read(row, ["steps"])["steps"]]
-
-
-END_OF_SHARD = b"\xff\xff\xff\xff\0\0\0\0"
-
-
-def test_bytes_that_are_no_record_are_refused_and_the_next_record_is_read(shard: Shard) -> None:
-    _, (span, _) = measure(shard.path)
-    content = shard.path.read_bytes()
-    record = memoryview(content)[span.offset : span.offset + span.num_bytes]
-    lengthened = b"\xff\xff\xff\xff\xff\xff\xff\x7f" + record[8:]
-    for odd in (b"", b"odd", END_OF_SHARD, record[:100], record[:-100], lengthened, content[8 : span.offset]):
-        with pytest.raises(ODD_ERRORS):
-            decode_record(memoryview(odd), ["rgb_top"])
-        assert decode_record(record, ["rgb_top"]).num_rows == 1
-
-
-def test_a_data_set_is_read_without_opening_its_shards(
-    tmp_path: Path, made_up: MadeUp, info: ShardInfo
-) -> None:
-    demos = [made_up(1), made_up(2)]
-    path = tmp_path / info.file_name
-    write(path, info, demos)
-    finish_folder(tmp_path, [path], command="test", config={}, versions={})
-    dataset = Dataset(tmp_path)
-    values = dataset.read(1, ["rgb_top", "seed"])
-    assert values["seed"] == demos[1].seed
-    assert np.array_equal(planes(values["rgb_top"]), demos[1].rgb["top"])
-    assert not dataset.shard(path.name)._readers
 
 
 def test_the_schema_says_how_images_are_shaped() -> None:

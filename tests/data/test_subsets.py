@@ -14,8 +14,17 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, ShardWriter
 from openvima.data.encoding import ShardInfo, Skipped
 from openvima.data.manifest import finish_folder
-from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, parse_splits, sample, split
-from openvima.data.subsets.choosing import assign_splits, select_sample
+from openvima.data.subsets import (
+    MergeConfig,
+    Splits,
+    SubsetConfig,
+    assign_splits,
+    merge,
+    parse_splits,
+    sample,
+    select_sample,
+    split,
+)
 from openvima.errors import ConfigError, DatasetError, ShardError
 
 MadeUp = Callable[..., Demonstration]
@@ -77,7 +86,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_smaller_samples_are_part_of_larger_ones() -> None:
     index = index_of(2000)
-    chosen = [select_sample(index, fraction, 0) for fraction in (0.001, 0.01, 0.1, 1.0)]
+    chosen = [select_sample(index, 0, fraction=fraction) for fraction in (0.001, 0.01, 0.1, 1.0)]
     assert [mask.sum() for mask in chosen] == [4, 40, 400, 4000]
     for smaller, larger in itertools.pairwise(chosen):
         assert not (smaller & ~larger).any()
@@ -85,20 +94,21 @@ def test_smaller_samples_are_part_of_larger_ones() -> None:
 
 def test_each_task_keeps_its_proportion_and_at_least_one_episode() -> None:
     index = pa.concat_tables([index_of(1000, ("rotate",)), index_of(30, ("stack",)), index_of(3, ("twist",))])
-    chosen = index.filter(pa.array(select_sample(index, 0.1, 0))).column("task").to_pylist()
+    chosen = index.filter(pa.array(select_sample(index, 0, fraction=0.1))).column("task").to_pylist()
     assert {task: chosen.count(task) for task in set(chosen)} == {"rotate": 100, "stack": 3, "twist": 1}
 
 
 def test_choices_do_not_depend_on_the_order_of_episodes_but_on_the_seed() -> None:
     index = index_of(300)
     shuffled = index.take(np.random.default_rng(0).permutation(len(index)))
-    assert names(index, select_sample(index, 0.1, 0)) == names(shuffled, select_sample(shuffled, 0.1, 0))
-    assert names(index, select_sample(index, 0.1, 0)) != names(index, select_sample(index, 0.1, 1))
+    first, other = (select_sample(index, seed, fraction=0.1) for seed in (0, 1))
+    assert names(index, first) == names(shuffled, select_sample(shuffled, 0, fraction=0.1))
+    assert names(index, first) != names(index, other)
 
 
 def test_the_episodes_of_a_sample_are_these() -> None:
     index = index_of(1000, ("rotate",))
-    chosen = index.filter(pa.array(select_sample(index, 0.003, 0))).column("seed").to_pylist()
+    chosen = index.filter(pa.array(select_sample(index, 0, fraction=0.003))).column("seed").to_pylist()
     assert chosen == [
         90,
         654,
@@ -123,7 +133,7 @@ def test_an_episode_stays_in_its_part_when_data_are_added() -> None:
 
 def test_small_samples_lie_in_all_parts() -> None:
     index = index_of(5000)
-    sampled = select_sample(index, 0.1, 0)
+    sampled = select_sample(index, 0, fraction=0.1)
     assert abs(assign_splits(index, HALVES, 0)["a"][sampled].mean() - 0.5) < 0.1
 
 

@@ -13,9 +13,7 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter, generate
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
-from openvima.data.page import write_page
-from openvima.data.page.charts import bar_chart
-from openvima.data.page.episodes import episode_card
+from openvima.data.page import bar_chart, episode_card, write_page
 from openvima.data.summary import Histogram, Summary, Unfinished, summarise_folder
 from openvima.errors import ConfigError, DatasetError
 from openvima.html import render_page

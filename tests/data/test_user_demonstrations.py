@@ -62,14 +62,14 @@ def test_sampled_and_composed_successes_make_one_data_set(tmp_path: Path) -> Non
 
 
 def test_a_changed_pose_of_a_composed_demonstration_does_not_replay(tmp_path: Path) -> None:
-    from openvima.data.verification.replay import first_difference
+    from openvima.data.replay import find_difference
     from openvima.env import TabletopEnv
 
     demo = demonstrate(scene(), clicked(scene(), random.Random(0)))
     env = TabletopEnv("rotate")
-    assert first_difference(env, demo) == ""
+    assert find_difference(env, demo) == ""
     other = dataclasses.replace(demo, actions=(Action.planar((0.45, -0.25), (0.3, 0.0)),))
-    assert first_difference(env, other) == "the joint path differs in step 0"
+    assert find_difference(env, other) == "the joint path differs in step 0"
 
 
 def test_nothing_of_an_evaluation_is_recorded(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,11 +27,10 @@ from openvima.data import (
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import fingerprint, finish_folder
 from openvima.data.planning import COMMAND
-from openvima.data.verification import Verification
-from openvima.data.verification.episodes import faults
+from openvima.data.verification import Verification, find_faults
 from openvima.errors import ConfigError, DatasetError
 from openvima.scene import Action, ObjectRecord, Outcome
-from small_data_sets import edit_manifest, finish, with_plain_images, write_folder
+from small_data_sets import contents, edit_manifest, finish, with_plain_images, write_folder
 
 MadeUp = Callable[..., Demonstration]
 TASKS = ("rotate", "sweep_without_exceeding")
@@ -87,7 +88,6 @@ def test_two_workers_find_the_same(folder: Path) -> None:
     (folder / "extra.arrow").write_bytes(b"")
     one, two = verify(folder), verify(folder, VerifyConfig(workers=2))
     assert one == two
-    assert one.damaged == (FIRST,)
 
 
 def test_a_shard_that_the_manifest_does_not_list_is_named(folder: Path) -> None:
@@ -253,7 +253,7 @@ def test_what_other_versions_wrote_is_compared_and_noted(
 ) -> None:
     rewrite(folder, FIRST, _with_another_path)
     monkeypatch.setattr(
-        "openvima.data.verification.replay.package_versions", lambda: {"openvima": "9", "pyarrow": "1"}
+        "openvima.data.verification.package_versions", lambda: {"openvima": "9", "pyarrow": "1"}
     )
     found = verify(folder, ALL)
     assert found.is_clean
@@ -314,20 +314,20 @@ def _faulty() -> Iterator[tuple[str, dict[str, object]]]:
 @pytest.mark.parametrize(("cause", "change"), list(_faulty()))
 def test_values_that_cannot_be_are_named(made_up: MadeUp, cause: str, change: dict) -> None:
     demo = with_plain_images(made_up())
-    assert list(faults(demo)) == []
-    assert cause in set(faults(dataclasses.replace(demo, **change)))
+    assert list(find_faults(demo)) == []
+    assert cause in set(find_faults(dataclasses.replace(demo, **change)))
 
 
 def test_images_that_do_not_fit_the_rest_are_named(made_up: MadeUp) -> None:
     demo = with_plain_images(made_up())
     one_less = dataclasses.replace(demo, rgb={**demo.rgb, "top": demo.rgb["top"][1:]})
-    assert list(faults(one_less)) == ["the top view does not have one image more than there are actions"]
+    assert list(find_faults(one_less)) == ["the top view does not have one image more than there are actions"]
     strange = {**demo.segm, "front": np.full_like(demo.segm["front"], 77)}
-    assert list(faults(dataclasses.replace(demo, segm=strange))) == [
+    assert list(find_faults(dataclasses.replace(demo, segm=strange))) == [
         "the segmentation of the front view shows an object that is not in the scene"
     ]
     scenes = dataclasses.replace(demo, scenes=demo.scenes[1:])
-    assert list(faults(scenes)) == ["the objects do not have one pose more than there are actions"]
+    assert list(find_faults(scenes)) == ["the objects do not have one pose more than there are actions"]
 
 
 def test_settings_and_folders_that_cannot_be_are_refused(tmp_path: Path) -> None:
@@ -351,11 +351,24 @@ def test_the_command_exits_with_1_and_names_problems(folder: Path, capsys: pytes
     assert main(["data", "verify", str(folder), "--replay", "0"]) == 1
     shown = capsys.readouterr().out
     assert f"{FIRST}: it is missing" in shown
-    assert f"openvima data verify {folder} --repair" in shown
+    assert f"`openvima generate --out {folder} --tasks {','.join(TASKS)} --episodes 3" in shown
     assert main(["data", "verify", str(folder), "--replay", "0", "--json"]) == 1
     record = json.loads(capsys.readouterr().out)
     assert record["clean"] is False
     assert record["problems"][0]["file"] == FIRST
+
+
+@pytest.mark.parametrize("name", [FIRST, "index.parquet", "dataset.json"])
+def test_the_command_that_is_named_makes_a_damaged_file_again(folder: Path, whole: Path, name: str) -> None:
+    (folder / name).write_bytes((whole / name).read_bytes()[:-9])
+    remedies = {problem.remedy for problem in verify(folder, NONE).problems if problem.file == name}
+    (folder / name).unlink()
+    if name != "dataset.json":  # which alone holds the settings
+        (command,) = (re.findall(r"Delete it and make it again: `(.*)`", remedy)[0] for remedy in remedies)
+    else:
+        command = f"openvima generate --out {folder} --tasks {','.join(TASKS)} --episodes 3 --shard-size 2"
+    assert main(shlex.split(command)[1:]) == 0
+    assert contents(folder) == contents(whole)
 
 
 def test_the_command_refuses_what_is_no_number_of_episodes(

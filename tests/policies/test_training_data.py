@@ -9,8 +9,7 @@ import pytest
 
 import openvima
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
-from openvima.data.appearance_stats import appearances_of
-from openvima.data.leakage import leaks
+from openvima.data.appearances import appearances_of, find_leaks
 from openvima.scene import ObjectImage, Placement, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.seeding import make_rng
@@ -57,7 +56,7 @@ def test_it_learnt_the_training_tasks_at_the_training_level_and_nothing_else() -
 
 
 def test_all_that_it_saw_is_from_the_training_partition() -> None:
-    assert leaks(RECORD) == []
+    assert find_leaks(RECORD) == []
 
 
 def test_a_novel_appearance_among_its_data_would_be_noticed() -> None:
@@ -72,10 +71,10 @@ def test_a_novel_appearance_among_its_data_would_be_noticed() -> None:
         ("twist", "prompted", "letter A", "brick"),
     ):
         problem = f"{task} shows {name!r} in {texture!r} as {role}."
-        assert leaks(with_appearance(task, role, name, texture)) == [problem]
+        assert find_leaks(with_appearance(task, role, name, texture)) == [problem]
     levels = deepcopy(RECORD)
     levels["tasks"]["rotate"]["levels"].append("L3")
-    assert leaks(levels) == ["rotate has episodes of level L3."]
+    assert find_leaks(levels) == ["rotate has episodes of level L3."]
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.data.object_cache import open_object_cache  # noqa: E402
-from openvima.data.subsets.merging import MergeConfig, merge  # noqa: E402
+from openvima.data.subsets import MergeConfig, merge  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.loading import held_out_data  # noqa: E402

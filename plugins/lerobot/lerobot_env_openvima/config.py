@@ -10,8 +10,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_env_openvima.env import OpenVimaEnv
-from openvima.data.lerobot.dense import frame_layout
-from openvima.data.lerobot.features import IMAGE_PREFIX, MAX_PROMPT_IMAGES, FrameLayout
+from openvima.data.lerobot_frames import IMAGE_PREFIX, MAX_PROMPT_IMAGES, FrameLayout, frame_layout
 from openvima.env.tabletop import IMAGE_SHAPE
 from openvima.errors import ConfigError
 from openvima.scene.command import CONTROL_HZ, END_EFFECTOR, PRIMITIVES, check_control

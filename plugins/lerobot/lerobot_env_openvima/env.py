@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from openvima.data.lerobot.features import FrameLayout
+from openvima.data.lerobot_frames import FrameLayout
 from openvima.env.tabletop import IMAGE_SHAPE, TabletopEnv
 from openvima.errors import ActionError
 from openvima.scene.command import steps_per_primitive

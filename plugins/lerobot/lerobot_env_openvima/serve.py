@@ -22,8 +22,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from openvima.data.lerobot.dense import frame_layout
-from openvima.data.lerobot.features import ACTION_NAMES, IMAGE_PREFIX
+from openvima.data.lerobot_frames import ACTION_NAMES, IMAGE_PREFIX, frame_layout
 from openvima.errors import PolicyError
 from openvima.policies.base import Policy, prompt_hash
 from openvima.scene import RenderedPrompt

@@ -71,7 +71,7 @@ def main(
         Exit status.
     """
     from openvima.data import GenerateConfig, generate, plan
-    from openvima.data.resuming import is_finished
+    from openvima.data.manifest import is_finished
     from openvima.env import EnvConfig
 
     config = GenerateConfig(

@@ -6,30 +6,27 @@ from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
     from openvima.data.generation import generate
-    from openvima.data.planning import GenerateConfig, plan
-    from openvima.data.progress import GenerationProgress, TaskProgress
+    from openvima.data.planning import GenerateConfig, GenerationProgress, TaskProgress, plan
     from openvima.data.reader import Dataset
     from openvima.data.records import Demonstration, Step, rollout_oracle
-    from openvima.data.shard import Shard
+    from openvima.data.shard import Shard, ShardWriter
     from openvima.data.user_demonstrations import record_demonstration
-    from openvima.data.verification import VerifyConfig, repair, verify
-    from openvima.data.writer import ShardWriter
+    from openvima.data.verification import VerifyConfig, verify
 
 # Reading needs no simulation, so each name brings only what it needs.
 _HOMES = {
     "Dataset": "reader",
     "Demonstration": "records",
     "GenerateConfig": "planning",
-    "GenerationProgress": "progress",
+    "GenerationProgress": "planning",
     "Shard": "shard",
-    "ShardWriter": "writer",
+    "ShardWriter": "shard",
     "Step": "records",
-    "TaskProgress": "progress",
+    "TaskProgress": "planning",
     "VerifyConfig": "verification",
     "generate": "generation",
     "plan": "planning",
     "record_demonstration": "user_demonstrations",
-    "repair": "verification",
     "rollout_oracle": "records",
     "verify": "verification",
 }
@@ -47,7 +44,6 @@ __all__ = [
     "generate",
     "plan",
     "record_demonstration",
-    "repair",
     "rollout_oracle",
     "verify",
 ]

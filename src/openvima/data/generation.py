@@ -1,25 +1,214 @@
-"""Writing data sets: oracle demonstrations by many processes, the same bytes whatever their number."""
+"""What a folder already holds of the data set that is asked for, and what does not belong to it."""
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 from openvima.atomic_io import FINISH_S, folder_lock, parts_in_range
-from openvima.data.checksums import spans_of
-from openvima.data.manifest import FAILED_FOLDER, ShardSummary, finish_folder, previous_summaries, set_aside
-from openvima.data.oracle_rollouts import write_block
-from openvima.data.planning import COMMAND, Block, GenerateConfig, plan
-from openvima.data.progress import NUM_COUNTS, Report, reporter
-from openvima.data.resuming import (
-    check_folder,
+from openvima.data.encoding import ShardInfo, SkipKind, Skipped
+from openvima.data.manifest import (
+    FAILED_FOLDER,
+    MANIFEST_NAME,
+    ShardSummary,
+    check_failed,
     clear,
-    is_done,
+    finish_folder,
     is_finished,
+    previous_summaries,
     remove_leftovers,
+    set_aside,
     storage_error,
 )
-from openvima.errors import DatasetError
+from openvima.data.planning import COMMAND, DOMAIN, NUM_COUNTS, Block, GenerateConfig, Report, plan, reporter
+from openvima.data.reader import read_manifest
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.data.shard import Shard, ShardWriter, spans_of
+from openvima.env import TabletopEnv
+from openvima.env.config import ENV_SETTINGS, EnvConfig
+from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.multiprocess import Counts, imap_with_progress
+
+FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
+
+
+def is_done(block: Block) -> bool:
+    """Say whether a block's shard needs no work.
+
+    A shard is whole if its name exists. It is written again if more episodes are asked for than when it was
+    written, or if its failed episodes are wanted now and were not kept.
+    """
+    if not block.path.is_file():
+        return False
+    shard = Shard(block.path)
+    if len(shard) != block.episodes:
+        return False
+    return block.failed_path is None or block.failed_path.is_file() or not _has_failed(shard)
+
+
+def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+    """Refuse a folder whose shards do not belong to the data set that is asked for.
+
+    Raises:
+        DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
+        ShardError: A shard is damaged.
+    """
+    check_failed(config.out)
+    _check_origin(config.out)
+    wanted = {block.path.name: block for block in blocks}
+    for path in sorted(config.out.glob("*.arrow")):
+        shard = Shard(path)
+        problems = _differences(shard.info, blocks[0].info)
+        block = wanted.get(path.name)
+        if block is None and not problems:
+            problems = [_surplus(shard.info, config)]
+        if block is not None and len(shard) > block.episodes:
+            problems.append(f"it has {len(shard)} episodes, asked for are {block.episodes}")
+        if problems:
+            raise DatasetError(
+                f"{path} belongs to another data set, or to a larger one: {'; '.join(problems)}. "
+                "Give its settings, another --out, or --force to delete it."
+            )
+    failed = config.out / FAILED_FOLDER
+    if not config.keep_failed and any(failed.glob("*.arrow")):
+        raise DatasetError(
+            f"{failed} holds the episodes that the oracle did not solve. "
+            "Give --keep-failed to keep it up to date, or delete it."
+        )
+
+
+def _check_origin(folder: Path) -> None:
+    """Refuse what other commands made: shards of a sample say the same of themselves, with other episodes."""
+    if not (folder / MANIFEST_NAME).is_file():
+        return
+    manifest = read_manifest(folder)
+    if manifest["command"] != COMMAND or "kept" in manifest["config"]:
+        raise DatasetError(
+            f"{folder} belongs to another data set: `{manifest['command']}` made it. "
+            "Give another --out, or --force to delete it."
+        )
+
+
+def _has_failed(shard: Shard) -> bool:
+    rows = shard.table(["skipped"]).column("skipped").to_pylist()
+    return any(skipped["kind"] in FAILED_KINDS for row in rows for skipped in row)
+
+
+def _surplus(found: ShardInfo, config: GenerateConfig) -> str:
+    if found.task in config.resolved_tasks():
+        return f"it has episodes beyond the {config.episodes} a task that are asked for"
+    return f"its task {found.task} is not asked for"
+
+
+def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
+    names = ("level", "domain", "shard_size", "first_seed", *ENV_SETTINGS, "compression", "images")
+    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
+    pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
+    return [
+        f"{name} is {str(there) or 'none'}, asked for is {str(here) or 'none'}"
+        for name, there, here in pairs
+        if there != here
+    ]
+
+
+def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:
+    """Write one shard, and one of its failed episodes if these are kept.
+
+    Args:
+        block: What to write.
+        count: Called with the numbers of episodes written, seeds tried, and redraws so far.
+
+    Raises:
+        OracleError: The oracle solved too few of the block's episodes.
+        ShardError: A record that is to be copied is damaged.
+    """
+    num_kept, num_redraws, skipped = 0, 0, []
+    with contextlib.ExitStack() as files:  # closed in reverse: where a shard is, its failed episodes are too
+        kept = files.enter_context(ShardWriter(block.path, block.info))
+        failed: ShardWriter | None = None
+        if block.kept:
+            num_kept, next_seed = len(block.kept), _copy_kept(block, kept)
+            rest = range(next_seed, block.seeds.stop)
+            block = replace(block, episodes=block.episodes - num_kept, seeds=rest)
+        for num_tried, rollout in enumerate(rollouts(block), start=1):
+            if isinstance(rollout, Skipped):
+                skipped.append(rollout)
+            elif rollout.outcome.success:
+                kept.write(rollout, skipped)
+                num_kept, skipped = num_kept + 1, []
+            else:
+                skipped.append(why_skipped(rollout))
+                if block.failed_path is not None:
+                    if failed is None:
+                        block.failed_path.parent.mkdir(exist_ok=True)
+                        failed = files.enter_context(ShardWriter(block.failed_path, block.info))
+                    failed.write(rollout)
+            num_redraws += 0 if isinstance(rollout, Skipped) else rollout.num_redraws
+            count(num_kept, num_tried, num_redraws)
+
+
+def _copy_kept(block: Block, writer: ShardWriter) -> int:
+    """Copy the records that a shard has already; return the seed to go on with.
+
+    Raises:
+        ShardError: One is damaged.
+    """
+    shard = Shard(block.path)
+    for row, span in enumerate(block.kept):
+        shard.check(row, span)
+        writer.copy(shard.batch(row))
+    return shard.read(len(block.kept) - 1, ["seed"])["seed"] + 1
+
+
+def rollouts(block: Block) -> Iterator[Demonstration | Skipped]:
+    """Roll out seeds until enough of them are solved.
+
+    Args:
+        block: Its seeds and number of episodes.
+
+    Yields:
+        The result of `attempt` for each seed; the last one is solved.
+
+    Raises:
+        OracleError: The seeds ran out.
+    """
+    env = _env(block.info.task, block.info.level, block.env_config)
+    num_solved, reason = 0, ""
+    for seed in block.seeds:
+        rollout = attempt(env, seed)
+        yield rollout
+        if isinstance(rollout, Skipped) or not rollout.outcome.success:
+            reason = (rollout if isinstance(rollout, Skipped) else why_skipped(rollout)).reason
+            continue
+        num_solved += 1
+        if num_solved == block.episodes:
+            return
+    raise OracleError(
+        f"the oracle solved {num_solved} of {len(block.seeds)} episodes of {block.info.task!r} at level "
+        f"{block.info.level}, {block.episodes} were needed; the last one failed: {reason}."
+    )
+
+
+def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
+    """Roll out one episode, solved or not; return the reason if there is none."""
+    try:
+        return rollout_oracle(env, seed)
+    except SamplingError as error:
+        return Skipped(seed, "not_sampled", str(error))
+    except OracleError as error:
+        return Skipped(seed, "no_action", str(error))
+
+
+def why_skipped(demo: Demonstration) -> Skipped:
+    """Return the reason why an unsolved episode is skipped."""
+    kind: SkipKind = "failed" if demo.outcome.failure else "unsolved"
+    return Skipped(demo.seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
+
+
+@lru_cache(maxsize=4)
+def _env(task: str, level: str, env_config: EnvConfig) -> TabletopEnv:
+    return env_config.make(task, level, domain=DOMAIN)
 
 
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:

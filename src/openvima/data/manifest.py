@@ -17,17 +17,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from openvima.atomic_io import atomic_write_file
-from openvima.data.checksums import Envelope, Span, measure
+from openvima.atomic_io import NO_SPACE, atomic_write_file
 from openvima.data.schema import SCHEMA_VERSION
-from openvima.data.shard import Shard
-from openvima.errors import DatasetError, ShardError
+from openvima.data.shard import Envelope, Shard, Span, measure
+from openvima.errors import DatasetError, ShardError, StorageError
 
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
 PREVIOUS_NAME = ".dataset.json.old"  # while a data set is being extended
 BROKEN_NAME = "broken.json"  # episodes that an import left out
 FAILED_FOLDER = "failed"  # episodes that the oracle did not solve; a data set of the same form
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, PREVIOUS_NAME)
 CACHE_FOLDER = "object_cache"  # derived from the shards, safe to delete
 LICENCE = "MIT"
 
@@ -59,7 +59,7 @@ _SHARD_KEYS: dict[str, type] = {
     "sha256": str,
 }
 _COUNTS: dict[str, type] = dict.fromkeys(("episodes", "steps", "shards", "bytes"), int)
-_TASK_KEYS: dict[str, Any] = {  # Any: a type or a union of such
+_TASK_KEYS: dict[str, Any] = {
     **dict.fromkeys(("episodes", "steps", "seeds_tried", "redraws"), int),
     "success_rate": int | float,
 }
@@ -110,7 +110,7 @@ class ShardSummary:
     """
 
     name: str
-    entry: dict[str, Any]  # Any: JSON
+    entry: dict[str, Any]
     index: pa.Table
 
 
@@ -119,7 +119,7 @@ def finish_folder(
     shards: Sequence[Path],
     *,
     command: str,
-    config: Mapping[str, Any],  # Any: JSON
+    config: Mapping[str, Any],
     versions: Mapping[str, str],
     licence: str = LICENCE,
     known: Mapping[str, ShardSummary] = MappingProxyType({}),
@@ -192,7 +192,7 @@ def index_parts(index: pa.Table) -> dict[str, pa.Table]:
 
 def summarise(
     path: Path,
-    known: Mapping[str, Any] | None = None,  # Any: a number and a text
+    known: Mapping[str, Any] | None = None,
 ) -> ShardSummary:
     """Read what index and manifest hold of a shard.
 
@@ -216,9 +216,7 @@ def summarise(
     return ShardSummary(path.name, entry, _index_part(table, path.name, spans))
 
 
-def compose(
-    summaries: Sequence[ShardSummary], origin: Mapping[str, Any]
-) -> tuple[pa.Table, dict[str, Any]]:  # Any: JSON
+def compose(summaries: Sequence[ShardSummary], origin: Mapping[str, Any]) -> tuple[pa.Table, dict[str, Any]]:
     """Put index and manifest together.
 
     Args:
@@ -252,13 +250,13 @@ def compose(
     return index.combine_chunks(), manifest
 
 
-def manifest_checksum(manifest: Mapping[str, Any]) -> str:  # Any: JSON
+def manifest_checksum(manifest: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a manifest's entries but its own checksum, whatever their order and layout."""
     entries = {key: value for key, value in manifest.items() if key != "checksum"}
     return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
 
 
-def parse_manifest(content: bytes) -> dict[str, Any]:  # Any: JSON
+def parse_manifest(content: bytes) -> dict[str, Any]:
     """Read a manifest and compare it with its own checksum.
 
     Raises:
@@ -279,7 +277,7 @@ def parse_manifest(content: bytes) -> dict[str, Any]:  # Any: JSON
     return manifest
 
 
-def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:  # Any: JSON
+def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:
     """Read an index and compare it with its checksum in the manifest.
 
     Raises:
@@ -298,7 +296,7 @@ def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:  # Any
     return index
 
 
-def _lacking(manifest: Mapping[str, Any]) -> list[str]:  # Any: JSON
+def _lacking(manifest: Mapping[str, Any]) -> list[str]:
     """Name what a manifest lacks that something else than this package wrote."""
     lacking = [key for key, kind in _TYPES.items() if not isinstance(manifest.get(key), kind)]
     if lacking:
@@ -314,7 +312,7 @@ def _lacking(manifest: Mapping[str, Any]) -> list[str]:  # Any: JSON
     ]
 
 
-def _is_value(value: object, kind: Any) -> bool:  # Any: see `_TASK_KEYS`
+def _is_value(value: object, kind: Any) -> bool:
     """Whether a value has a type, and is no whole number that a count or an index could not hold."""
     return isinstance(value, kind) and (not isinstance(value, int) or 0 <= value < 2**63)
 
@@ -326,7 +324,7 @@ def _check_names(names: Iterable[str]) -> None:
             raise DatasetError(f"it names the shard {name!r:.80}, which is no plain file name like a.arrow")
 
 
-def _check_rows(index: pa.Table, shards: Mapping[str, Any]) -> None:  # Any: JSON
+def _check_rows(index: pa.Table, shards: Mapping[str, Any]) -> None:
     """Refuse an index of shards or rows that the manifest does not have."""
     names = index.column("shard").combine_chunks().dictionary_encode()
     if unknown := sorted(set(names.dictionary.to_pylist()) - shards.keys()):
@@ -365,7 +363,7 @@ def read_inside(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def fingerprint(path: Path) -> dict[str, Any]:  # Any: a number and a text
+def fingerprint(path: Path) -> dict[str, Any]:
     """Return the size and the SHA-256 of a file, as the manifest holds them: `bytes` and `sha256`."""
     with open(path, "rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -395,3 +393,46 @@ def _index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
 
 def _sum(table: pa.Table, column: str) -> int:
     return int(table.column(column).to_numpy().sum())
+
+
+def is_finished(folder: Path) -> bool:
+    """Say whether a folder has its manifest and index, which are written last."""
+    return (folder / MANIFEST_NAME).is_file() and (folder / INDEX_NAME).is_file()
+
+
+def clear(folder: Path) -> None:
+    """Delete a data set, its failed episodes too; other files stay."""
+    check_failed(folder)
+    for part in (folder, folder / FAILED_FOLDER):
+        for path in [*(part / name for name in _NAMES), *part.glob("*.arrow")]:
+            path.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path, shards: Iterable[Path] | None = None) -> None:
+    """Delete what killed writers, perhaps on other machines, left in a folder that is locked.
+
+    Args:
+        folder: The data folder; its failed episodes count too.
+        shards: The locked shards; None means the whole folder.
+    """
+    names = None if shards is None else {path.name for path in shards}
+    for file in (*folder.glob(".*.tmp"), *(folder / FAILED_FOLDER).glob(".*.tmp")):  # .NAME.PROCESS.tmp
+        name = file.name[1:].rsplit(".", 2)[0]
+        if name in names if names is not None else name in _NAMES or name.endswith(".arrow"):
+            file.unlink(missing_ok=True)
+
+
+def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> StorageError:
+    """Return the error to raise where a folder cannot be written to; it says how much of the work is kept.
+
+    Args:
+        folder: The data set's folder.
+        shards: All its shards, written or not.
+        error: What the system said.
+    """
+    num_there = sum(path.is_file() for path in shards)
+    remedy = "Make room" if error.errno in NO_SPACE else "Make sure that it can be written to"
+    return StorageError(
+        f"cannot write to {folder}: {error.strerror or error}. {num_there} of {len(shards)} shards are "
+        f"whole and were kept. {remedy}; the same command then goes on from there."
+    )

@@ -20,13 +20,11 @@ import pyarrow as pa
 from xxhash import xxh3_64
 
 from openvima.atomic_io import NO_SPACE, atomic_write, folder_lock
-from openvima.data.checksums import Envelope, mapped, spans_of
-from openvima.data.hash_split import split_hashes
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, left_out_episode, preprocess
-from openvima.data.reader import Dataset
+from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
-from openvima.data.shard import ODD_ERRORS, Shard
+from openvima.data.shard import DAMAGE_ERRORS, Envelope, Shard, map_file, spans_of
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.input_files import as_path
 from openvima.multiprocess import imap_unordered
@@ -126,7 +124,7 @@ class CacheFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            reader = pa.ipc.open_file(pa.py_buffer(mapped(path)))
+            reader = pa.ipc.open_file(pa.py_buffer(map_file(path)))
             about = _read_about(reader.schema)
             self._rows = reader.get_batch(0)
             self._rows.validate(full=True)  # no list reaches beyond its numbers
@@ -134,7 +132,7 @@ class CacheFile:
                 name: _unpack(self._rows.column(name), shape)
                 for name, (_, shape) in _arrays(about["kind"]).items()
             }
-        except ODD_ERRORS as error:
+        except DAMAGE_ERRORS as error:
             raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
         self.kind: InputKind = about["kind"]
         self.source, self.variant = about["source"], about["variant"]

@@ -5,23 +5,24 @@ data set of more episodes begins with the very shards of a smaller one: asking f
 """
 
 import itertools
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+import shlex
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
-from openvima.catalog.user_assets import recorded_assets
-from openvima.data.checksums import Span
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
-from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
+from openvima.data.shard import Span
+from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
 from openvima.errors import ConfigError, LevelError, brief_repr, unknown_name
 from openvima.input_files import settle
-from openvima.multiprocess import MAX_WORKERS
+from openvima.multiprocess import MAX_WORKERS, Counts
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.registry import named_tasks
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
@@ -143,7 +144,7 @@ class GenerateConfig:
         check_task_options(tasks, self.env_config.task_options)
         return tasks
 
-    def record(self) -> dict[str, Any]:  # Any: JSON
+    def record(self) -> dict[str, Any]:
         """Return the settings that decide the content, as the manifest holds them: no path, no machine."""
         return {
             "tasks": list(self.resolved_tasks()),
@@ -157,31 +158,24 @@ class GenerateConfig:
             **self.env_config.record(),
         }
 
-    @staticmethod
-    def from_record(out: Path, record: Mapping[str, Any], **changes: Any) -> "GenerateConfig":  # Any: JSON
-        """Make the settings with which the content of a folder can be generated again.
 
-        Args:
-            out: The folder.
-            record: `config` of its manifest.
-            changes: Fields to set besides, such as `workers`.
+def generate_command(out: Path, record: Mapping[str, Any], *, keep_failed: bool = False) -> str:
+    """Return the command that writes a data set, or what a folder lacks of it.
 
-        Raises:
-            ConfigError: The record lacks a setting, or holds one that is not allowed.
-        """
-        try:
-            settings: dict[str, Any] = {
-                "tasks": tuple(record["tasks"]),
-                "shard_size": record["shard_size"] or None,
-                "env_config": replace(
-                    EnvConfig.from_record(record), assets=recorded_assets(record["assets"])
-                ),
-                **{name: record[name] for name in ("level", "episodes", "start_seed")},
-                **{name: record[name] for name in ("compression", "images")},
-            }
-        except KeyError as error:
-            raise ConfigError(f"the settings recorded in {out} lack {error}.") from None
-        return GenerateConfig(**{**settings, "out": out, **changes})
+    Args:
+        out: The folder.
+        record: `config` of its manifest.
+        keep_failed: Whether it holds failed episodes too.
+    """
+    tasks = record.get("tasks")
+    options = {"--out": out, "--tasks": ",".join(map(str, tasks)) if isinstance(tasks, list) else None}
+    options |= {f"--{name}": record.get(name) for name in ("episodes", "level", "compression")}
+    options |= {"--seed": record.get("start_seed"), "--shard-size": record.get("shard_size")}
+    options |= {f"--{name.replace('_', '-')}": record.get(name) for name in ENV_SETTINGS if name != "compat"}
+    words = [word for name, value in options.items() if value for word in (name, str(value))]
+    flags = {"--no-images": not record.get("images", True), "--compat": record.get("compat")}
+    flags["--keep-failed"] = keep_failed
+    return shlex.join([*COMMAND.split(), *words, *(name for name, is_set in flags.items() if is_set)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,3 +262,100 @@ def _division(config: GenerateConfig) -> Iterator[tuple[int, int, range]]:
 
 def _num_seeds(episodes: int) -> int:
     return SEEDS_PER_EPISODE * episodes + SPARE_SEEDS
+
+
+NUM_COUNTS = 3  # that a block tells: episodes written, seeds tried, redraws
+
+
+@dataclass(frozen=True, slots=True)
+class TaskProgress:
+    """How far one task is.
+
+    Args:
+        task: Its name.
+        done: Episodes written, those of whole shards that were there before included.
+        total: Episodes asked for.
+        written: Episodes written by this run.
+        tried: Seeds that this run tried.
+        redraws: Unlucky draws that the sampler threw away in this run.
+    """
+
+    task: str
+    done: int
+    total: int
+    written: int = 0
+    tried: int = 0
+    redraws: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class GenerationProgress:
+    """How far all tasks are.
+
+    Args:
+        tasks: One entry a task, by name.
+    """
+
+    tasks: tuple[TaskProgress, ...]
+
+    __repr__ = brief_repr
+
+    @property
+    def done(self) -> int:
+        """Episodes written, those of whole shards that were there before included."""
+        return sum(task.done for task in self.tasks)
+
+    @property
+    def total(self) -> int:
+        """Episodes asked for."""
+        return sum(task.total for task in self.tasks)
+
+    @property
+    def written(self) -> int:
+        """Episodes written by this run."""
+        return sum(task.written for task in self.tasks)
+
+    @property
+    def tried(self) -> int:
+        """Seeds that this run tried."""
+        return sum(task.tried for task in self.tasks)
+
+
+Report = Callable[[GenerationProgress], None]
+
+
+def reporter(
+    report: Report | None, blocks: Sequence[Block], missing: Sequence[Block]
+) -> Callable[[Counts], None]:
+    """Make of a caller's `report` what an engine calls; it first receives what was there before.
+
+    Args:
+        report: The caller's, if it wants to know.
+        blocks: All blocks of this run.
+        missing: Those that are still to be written, in the order in which an engine gets them.
+    """
+    if report is None:
+        return lambda counts: None
+    totals, left = Counter[str](), Counter[str]()
+    for block in blocks:
+        totals[block.info.task] += block.episodes
+    for block in missing:
+        left[block.info.task] += block.episodes
+
+    def tell(counts: Counts) -> None:
+        sums = {task: [0] * NUM_COUNTS for task in totals}
+        for block, row in zip(missing, counts, strict=True):
+            of_task = sums[block.info.task]
+            for index, number in enumerate(row):
+                of_task[index] += number
+        report(
+            GenerationProgress(
+                tuple(
+                    TaskProgress(task, totals[task] - left[task] + sums[task][0], totals[task], *sums[task])
+                    for task in sorted(totals)
+                )
+            )
+        )
+
+    tell([(0,) * NUM_COUNTS] * len(missing))
+    return tell

@@ -1,15 +1,16 @@
-"""Reading a folder of demonstrations as a sequence of episodes."""
+"""Reading a folder of demonstrations, or one on the Hugging Face Hub, as a sequence of episodes."""
 
+import hashlib
 import shlex
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.checksums import Envelope, Span
-from openvima.data.hub import data_folder
+from openvima.catalog import LEVELS, OBJECTS, TEXTURES
 from openvima.data.manifest import (
     INDEX_NAME,
     MANIFEST_NAME,
@@ -20,10 +21,13 @@ from openvima.data.manifest import (
 )
 from openvima.data.records import Demonstration, Step
 from openvima.data.schema import VIEWS
-from openvima.data.shard import Shard, remedy
+from openvima.data.shard import Envelope, Shard, Span, remedy
 from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
 from openvima.html import notebook_html
-from openvima.input_files import names_of
+from openvima.hub import cache_folder, dataset_name, fetch
+from openvima.input_files import as_path, names_of
+
+_MAX_MANIFEST_BYTES = 2**28  # of 500,000 shards
 
 
 class Dataset:
@@ -56,7 +60,9 @@ class Dataset:
         self.tasks = None if tasks is None else names_of(tasks)
         self.manifest = read_manifest(self.path)
         index = _read_index(self.path, self.manifest)
-        self.index = index.filter(of_tasks(index, self.tasks, self.path)) if self.tasks is not None else index
+        if self.tasks is not None:
+            index = index.filter(select_tasks(index, self.tasks, self.path))
+        self.index = index
         names = self.index.column("shard").combine_chunks().dictionary_encode()
         self._names = names.dictionary.to_pylist()
         self._name_of = names.indices.to_numpy()  # numbers instead of a million texts
@@ -85,7 +91,7 @@ class Dataset:
     def __iter__(self) -> Iterator[Demonstration]:
         return (self[episode_index] for episode_index in range(len(self)))
 
-    def read(self, episode_index: int, columns: Sequence[str]) -> dict[str, Any]:  # Any: one column, one type
+    def read(self, episode_index: int, columns: Sequence[str]) -> dict[str, Any]:
         """Read some columns of one episode, as `Shard.read` does.
 
         Example:
@@ -129,8 +135,8 @@ class Dataset:
             self._shards[name] = Shard(self.path / name, Envelope.from_entry(self.manifest["shards"][name]))
         return self._shards[name]
 
-    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
-        return _reopened, (self.path, self.tasks)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopen, (self.path, self.tasks)
 
     def _checked(self, episode_index: int) -> tuple[Shard, int]:
         """The shard and row of an episode whose bytes are what the index says."""
@@ -142,7 +148,32 @@ class Dataset:
         return shard, row
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
+def _reopen(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
+    return Dataset(path, tasks=tasks)
+
+
+def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:
+    path = folder / INDEX_NAME
+    try:
+        return parse_index(read_inside(path), manifest)
+    except FileNotFoundError:
+        raise DatasetError(f"{path} is missing. {remedy(folder)}") from None
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
+
+
+def _check_shards(folder: Path, names: Sequence[str]) -> None:
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        raise DatasetError(
+            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {remedy(folder)}"
+        )
+    outside = [name for name in names if not is_inside(folder / name)]
+    if outside:
+        raise DatasetError(f"{folder / outside[0]} is a link that leads out of the folder. {remedy(folder)}")
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of a data folder.
 
     Raises:
@@ -152,12 +183,12 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
     try:
         return parse_manifest(read_inside(path))
     except (FileNotFoundError, NotADirectoryError):
-        raise DatasetError(why_no_data_set(folder)) from None
+        raise DatasetError(explain_missing(folder)) from None
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
 
 
-def why_no_data_set(folder: Path) -> str:
+def explain_missing(folder: Path) -> str:
     """Say what is wrong with a path where no manifest is, and what helps."""
     if folder.is_file():
         return f"{folder} is a file; give the folder that holds the data set, such as {folder.parent}."
@@ -171,7 +202,7 @@ def why_no_data_set(folder: Path) -> str:
     return f"{folder} holds no data set ({MANIFEST_NAME} is missing){hint}."
 
 
-def of_tasks(index: pa.Table, tasks: Sequence[str] | None, folder: Path) -> np.ndarray:
+def select_tasks(index: pa.Table, tasks: Sequence[str] | None, folder: Path) -> np.ndarray:
     """Tell which episodes are of some tasks.
 
     Args:
@@ -197,26 +228,138 @@ def of_tasks(index: pa.Table, tasks: Sequence[str] | None, folder: Path) -> np.n
     return np.isin(present, tasks)
 
 
-def _reopened(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
-    return Dataset(path, tasks=tasks)
+def data_folder(path: str | Path, *, shards: bool = True) -> Path:
+    """Return the folder of a data set; one on the Hub is downloaded, into a folder of its commit.
 
+    Args:
+        path: A folder, or the name of a data set on the Hub such as "hf://owner/name@revision".
+        shards: Whether to fetch the shards that its manifest lists; else manifest and index only. No other
+            file of the repository is fetched.
 
-def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:  # Any: JSON
-    path = folder / INDEX_NAME
-    try:
-        return parse_index(read_inside(path), manifest)
-    except FileNotFoundError:
-        raise DatasetError(f"{path} is missing. {remedy(folder)}") from None
-    except DatasetError as error:
-        raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
+    Returns:
+        The folder. Of one on the Hub only the manifest was checked, as readers check shards.
 
-
-def _check_shards(folder: Path, names: Sequence[str]) -> None:
-    missing = [name for name in names if not (folder / name).is_file()]
-    if missing:
+    Raises:
+        HubError: There is no such repository, or it cannot be reached.
+        DatasetError: It holds no data set, or its manifest is damaged.
+        MissingExtraError: `huggingface_hub` is not installed.
+    """
+    name = dataset_name(path)
+    if name is None:
+        return as_path(path)
+    # The client's cache has a folder per commit, of links. A data set must be of plain files.
+    commit = fetch(name, (MANIFEST_NAME,), kind="dataset").name
+    fixed, folder = replace(name, revision=commit), cache_folder(name, commit)
+    fetch(fixed, (MANIFEST_NAME, INDEX_NAME), kind="dataset", into=folder)
+    manifest = folder / MANIFEST_NAME
+    if not manifest.is_file():
+        raise DatasetError(f"{name} on the Hugging Face Hub holds no data set ({MANIFEST_NAME} is missing).")
+    if (size := manifest.stat().st_size) > _MAX_MANIFEST_BYTES:
         raise DatasetError(
-            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {remedy(folder)}"
+            f"{MANIFEST_NAME} of {fixed} has {size} bytes; at most {_MAX_MANIFEST_BYTES} are read."
         )
-    outside = [name for name in names if not is_inside(folder / name)]
-    if outside:
-        raise DatasetError(f"{folder / outside[0]} is a link that leads out of the folder. {remedy(folder)}")
+    if shards:
+        try:
+            names = list(parse_manifest(read_inside(manifest))["shards"])  # plain file names
+        except DatasetError as error:
+            raise DatasetError(f"{MANIFEST_NAME} of {fixed}: {error}.") from None
+        fetch(fixed, names, kind="dataset", into=folder)
+    return folder
+
+
+def split_hashes(index: pa.Table, purpose: str = "") -> np.ndarray:
+    """Return a uniform number between 0 and 1 for each demonstration, shape (N,), float64.
+
+    It follows from its task and seed alone, so that it stays when data are added.
+
+    Args:
+        index: Of the demonstrations: `Dataset.index`.
+        purpose: Other purposes have other numbers.
+    """
+    names = zip(index.column("task").to_pylist(), index.column("seed").to_pylist(), strict=True)
+    return np.array([_hash(f"{purpose}{task}/{seed}") for task, seed in names], np.float64)
+
+
+def _hash(name: str) -> float:
+    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") / 2**64
+
+
+@dataclass(frozen=True, slots=True)
+class DemonstrationQuery:
+    """Which demonstrations to find; empty fields admit all.
+
+    Args:
+        task: Name of the task.
+        level: "train" or "L1" to "L4".
+        object: Object of the catalogue that is on the table.
+        texture: Texture on the table; together with `object`, of that object.
+        min_steps: Fewest steps.
+        max_steps: Most steps; None for no limit.
+
+    Raises:
+        DatasetError: There is no such level, object or texture.
+    """
+
+    task: str = ""
+    level: str = ""
+    object: str = ""
+    texture: str = ""
+    min_steps: int = 0
+    max_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        known = {"level": LEVELS, "object": OBJECTS, "texture": TEXTURES}
+        for field, names in known.items():
+            if (name := getattr(self, field)) and name not in names:
+                raise DatasetError(unknown_name(field, name, names))
+
+
+def find_demonstrations(dataset: Dataset, query: DemonstrationQuery) -> np.ndarray:
+    """Find demonstrations.
+
+    Shards are read only for objects and textures, without images, and only those with candidates.
+
+    Args:
+        dataset: The data set.
+        query: What to find.
+
+    Returns:
+        Indices into the data set, ascending, int64.
+
+    Raises:
+        DatasetError: The data set has no such task.
+        ShardError: A shard is damaged.
+    """
+    index = dataset.index
+    known = dataset.manifest["tasks"]
+    if query.task and query.task not in known:
+        raise DatasetError(unknown_name(f"task in {dataset.path} called", query.task, known))
+    steps = index.column("steps").to_numpy()
+    chosen = steps >= query.min_steps
+    if query.max_steps is not None:
+        chosen &= steps <= query.max_steps
+    for field in ("task", "level"):
+        if value := getattr(query, field):
+            chosen &= index.column(field).to_numpy() == value
+    found = np.flatnonzero(chosen)
+    return _filter_by_appearance(dataset, found, query) if query.object or query.texture else found
+
+
+def _filter_by_appearance(dataset: Dataset, candidates: np.ndarray, query: DemonstrationQuery) -> np.ndarray:
+    """Keep the demonstrations with an object that fits."""
+    rows: dict[str, list[tuple[int, int]]] = {}
+    for index, (name, row) in zip(candidates.tolist(), dataset.locations(candidates), strict=True):
+        rows.setdefault(name, []).append((index, row))
+    kept = []
+    for name, members in rows.items():
+        lists = dataset.shard(name).table(["objects"]).column("objects").combine_chunks()
+        objects: pa.StructArray = lists.flatten()
+        fits = np.ones(len(objects), bool)
+        for field in ("object", "texture"):
+            if value := getattr(query, field):
+                fits &= objects.field(field).to_numpy(zero_copy_only=False) == value
+        owners = np.repeat(np.arange(len(lists)), lists.value_lengths().to_numpy())
+        showing = set(owners[fits].tolist())
+        kept += [index for index, row in members if row in showing]
+    return np.array(sorted(kept), np.int64)

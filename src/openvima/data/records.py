@@ -1,4 +1,4 @@
-"""A demonstration: observations, actions and outcome of one rollout of the oracle or a user."""
+"""A demonstration: observations, actions and outcome of one rollout; its columns, as shards store them."""
 
 import itertools
 import json
@@ -14,8 +14,7 @@ import numpy as np
 import xxhash
 
 from openvima import __version__
-from openvima.data.image_layout import ImageBuffers, pixels
-from openvima.data.schema import VIEWS
+from openvima.data.schema import ARRAYS, IMAGE_SHAPE, VIEWS
 from openvima.errors import brief_repr
 from openvima.html import notebook_html
 from openvima.scene import (
@@ -29,9 +28,10 @@ from openvima.scene import (
     Scene,
 )
 
+_NUM_PIXELS = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
+
 if TYPE_CHECKING:  # reading needs no simulation
     from openvima.env import TabletopEnv
-
 
 _MOST_FRAMES = 6  # in a notebook
 _JSON = json.JSONEncoder(sort_keys=True)
@@ -113,7 +113,7 @@ class Demonstration:
         Unlike the bytes of a file they depend neither on the version of pyarrow nor on compression. The
         versions of the packages do not count.
         """
-        return columns_of(self).content_hash
+        return make_columns(self).content_hash
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,52 +125,10 @@ class Step:
         action: The action.
     """
 
-    observation: dict[str, Any]  # Any: nested dictionaries
+    observation: dict[str, Any]
     action: Action
 
     __repr__ = brief_repr
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Columns:
-    """A demonstration, column by column; only "skipped" is missing.
-
-    Args:
-        records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
-        numbers: Column name to numbers, shape (rows, width): poses, the four arrays of the actions, and the
-            waypoints of all joint paths, one path after the other.
-        path_lengths: Waypoints of each joint path.
-        images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
-            and `segm_…` (N, 128, 256).
-        content_hash: 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
-    """
-
-    records: dict[str, Any]  # Any: texts, numbers, and lists and dictionaries of them
-    numbers: dict[str, np.ndarray]
-    path_lengths: list[int]
-    images: dict[str, np.ndarray]
-    content_hash: str
-
-
-def columns_of(demo: Demonstration, buffers: ImageBuffers | None = None) -> Columns:
-    """Return the columns of a demonstration.
-
-    Args:
-        demo: The demonstration.
-        buffers: Memory for its images; None gives them their own.
-    """
-    records, arrays = _records(demo), _arrays(demo)
-    path_lengths = [len(path) for path in demo.joint_paths]
-    described = {**records, "assets": demo.assets, "path_lengths": path_lengths}
-    digest = xxhash.xxh3_128(_JSON.encode(described).encode())
-    images = {}
-    for name, array in itertools.chain(arrays.items(), _images(demo, buffers or ImageBuffers())):
-        digest.update(array.nbytes.to_bytes(8, "little"))
-        digest.update(array.reshape(-1).view(np.uint8).data)  # while it is in the CPU cache
-        if name not in arrays:
-            images[name] = array
-    numbers = {name: array.reshape(-1, array.shape[-1]) for name, array in arrays.items()}
-    return Columns(records, numbers, path_lengths, images, digest.hexdigest())
 
 
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
@@ -210,7 +168,7 @@ class Rollout:
         self._actions: list[Action] = []
         self._paths: list[np.ndarray] = []
 
-    def step(self, action: Action) -> dict[str, Any]:  # Any: as the environment's info
+    def step(self, action: Action) -> dict[str, Any]:
         """Execute an action and return the info of the environment."""
         observation, *_, info = self._env.perform(action)
         self._actions.append(action)
@@ -235,8 +193,8 @@ class Rollout:
             num_redraws=episode.num_redraws,
             max_steps=episode.max_steps,
             prompt=env.prompt,
-            rgb=_stacked(self._observations, "rgb"),
-            segm=_stacked(self._observations, "segm"),
+            rgb=_stack(self._observations, "rgb"),
+            segm=_stack(self._observations, "segm"),
             end_effector=env.scene.end_effector,
             actions=tuple(self._actions),
             pick_ids=tuple(pick_ids),
@@ -250,6 +208,10 @@ class Rollout:
         )
 
 
+def _stack(observations: Sequence[Mapping[str, Any]], key: str) -> dict[str, np.ndarray]:
+    return {view: np.stack([o[key][view] for o in observations]) for view in observations[0][key]}
+
+
 def package_versions() -> dict[str, str]:
     """Return the versions of all packages that decide the bytes of a demonstration."""
     return dict(versions_of("mujoco", "numba", "numpy", "pyarrow"))
@@ -261,7 +223,75 @@ def versions_of(*packages: str) -> Mapping[str, str]:
     return MappingProxyType({"openvima": __version__, **{name: version(name) for name in packages}})
 
 
-def _records(demo: Demonstration) -> dict[str, Any]:  # Any: as in `Columns`
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """A demonstration, column by column; only "skipped" is missing.
+
+    Args:
+        records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
+        numbers: Column name to numbers, shape (rows, width): poses, the four arrays of the actions, and the
+            waypoints of all joint paths, one path after the other.
+        path_lengths: Waypoints of each joint path.
+        images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
+            and `segm_…` (N, 128, 256).
+        content_hash: 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
+    """
+
+    records: dict[str, Any]
+    numbers: dict[str, np.ndarray]
+    path_lengths: list[int]
+    images: dict[str, np.ndarray]
+    content_hash: str
+
+
+class ImageBuffers:
+    """Reusable memory for the images of an episode: allocating costs more than filling."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, np.ndarray] = {}
+
+    def images(self, name: str, count: int) -> np.ndarray:
+        """Return room for images, valid until the next call.
+
+        Args:
+            name: Column that they are for; each has its own memory.
+            count: Number of images.
+
+        Returns:
+            An array of uint8 with the shape of the column.
+        """
+        _, shape = ARRAYS[name]
+        if name not in self._arrays or count > len(self._arrays[name]):
+            self._arrays[name] = np.empty((count, *shape), np.uint8)
+        return self._arrays[name][:count]
+
+    def owns(self, name: str, memory: np.ndarray) -> bool:
+        """Tell whether an array is the present memory of a column."""
+        return self._arrays.get(name) is memory
+
+
+def make_columns(demo: Demonstration, buffers: ImageBuffers | None = None) -> Columns:
+    """Return the columns of a demonstration.
+
+    Args:
+        demo: The demonstration.
+        buffers: Memory for its images; None gives them their own.
+    """
+    records, arrays = _records(demo), _arrays(demo)
+    path_lengths = [len(path) for path in demo.joint_paths]
+    described = {**records, "assets": demo.assets, "path_lengths": path_lengths}
+    digest = xxhash.xxh3_128(_JSON.encode(described).encode())
+    images = {}
+    for name, array in itertools.chain(arrays.items(), _images(demo, buffers or ImageBuffers())):
+        digest.update(array.nbytes.to_bytes(8, "little"))
+        digest.update(array.reshape(-1).view(np.uint8).data)  # while it is in the CPU cache
+        if name not in arrays:
+            images[name] = array
+    numbers = {name: array.reshape(-1, array.shape[-1]) for name, array in arrays.items()}
+    return Columns(records, numbers, path_lengths, images, digest.hexdigest())
+
+
+def _records(demo: Demonstration) -> dict[str, Any]:
     return {
         "task": demo.task,
         "level": demo.level,
@@ -333,5 +363,34 @@ def _images(demo: Demonstration, buffers: ImageBuffers) -> Iterator[tuple[str, n
         yield f"segm_{view}", np.ascontiguousarray(demo.segm[view])
 
 
-def _stacked(observations: Sequence[Mapping[str, Any]], key: str) -> dict[str, np.ndarray]:
-    return {view: np.stack([o[key][view] for o in observations]) for view in observations[0][key]}
+def pixels(planes: np.ndarray | Sequence[np.ndarray], out: np.ndarray) -> np.ndarray:
+    """Copy images so that their colours come last.
+
+    Args:
+        planes: N images of shape (3, 128, 256), uint8.
+        out: Where to, shape (N, 128, 256, 3), uint8, contiguous; also what is returned.
+    """
+    from openvima.data.kernels import join_colours  # Numba takes a moment to be imported
+
+    parts = [planes] if isinstance(planes, np.ndarray) else [image[np.newaxis] for image in planes]
+    joined, end = out.reshape(len(out), 3 * _NUM_PIXELS), 0
+    for part in parts:
+        start, end = end, end + len(part)
+        join_colours(np.ascontiguousarray(part).reshape(-1, 3, _NUM_PIXELS), joined[start:end])
+    return out
+
+
+def planes(pixels: np.ndarray) -> np.ndarray:
+    """Return images with their colours first, as observations have them.
+
+    Args:
+        pixels: Shape (N, 128, 256, 3), uint8, contiguous.
+
+    Returns:
+        A copy of shape (N, 3, 128, 256), uint8, contiguous.
+    """
+    from openvima.data.kernels import part_colours
+
+    parted = np.empty((len(pixels), 3, *IMAGE_SHAPE), np.uint8)
+    part_colours(pixels.reshape(-1, 3 * _NUM_PIXELS), parted.reshape(-1, 3, _NUM_PIXELS))
+    return parted

@@ -42,7 +42,7 @@ from openvima.errors import (
     UnknownTextureError,
 )
 from openvima.render.rasteriser import Rasteriser
-from openvima.scene import ObjectImage, Placement, Pose, Prompt, RenderedPrompt, Scene, SceneImage
+from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
 from openvima.scene.prompt import PLACEHOLDER, PromptFill
 from openvima.tasks import sample_episode
 from openvima.tasks.prompts import MULTIMODAL
@@ -61,7 +61,7 @@ UNKNOWN_SCENES = (
 _PROFILE = re.compile(r"\b(profiles?|outlines?|shapes?)\b", re.IGNORECASE)
 
 
-def rerendered(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonstration:
+def rerender(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonstration:
     """Render the images of a demonstration.
 
     Args:
@@ -73,61 +73,40 @@ def rerendered(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demon
         The demonstration with the images that the environment showed when it was recorded.
 
     Raises:
-        ShardError: It is not the same any more: the packages that draw are others than those that wrote.
+        ShardError: It is not the same any more: the packages that render are others than those that wrote.
         AssetError: The asset pack is not there, or is a function that was not loaded before.
         UnknownObjectError, UnknownTextureError: An object or texture of a user is not registered.
     """
     try:
-        rgb, segm = draw_observations(demo.scenes, info)
-        prompt = draw_prompt(demo, info)
+        rasteriser = _rasteriser(info.assets)
+        rgb, segm = render_observations(rasteriser, demo.scenes)
+        prompt = rasteriser.prompt(sample_prompt(demo, info, rasteriser.assets))
     except (AssetError, UnknownObjectError, UnknownTextureError):
         raise
-    except OpenVimaError as error:  # the task draws no episode for this seed, or is gone
-        raise _changed(demo, info, f" ({error})") from error
+    except OpenVimaError as error:  # the task samples no episode for this seed, or is gone
+        raise _explain_change(demo, info, f" ({error})") from error
     result = dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=prompt)
     if result.content_hash() != content_hash:
-        raise _changed(demo, info)
+        raise _explain_change(demo, info)
     return result
 
 
-def draw_observations(
-    scenes: Sequence[Scene], info: ShardInfo
+def render_observations(
+    rasteriser: Rasteriser, scenes: Sequence[Scene]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Render the observations of some scenes.
-
-    Args:
-        scenes: N scenes.
-        info: Of the shard that stores them.
+    """Render the observations of N scenes.
 
     Returns:
         View name to images, shape (N, 3, 128, 256), uint8; view name to object ids, shape (N, 128, 256),
         uint8.
     """
-    return draw_with(_rasteriser(info.assets), scenes)
-
-
-def draw_with(
-    rasteriser: Rasteriser, scenes: Sequence[Scene]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Render the observations of some scenes; see `draw_observations`."""
-    drawn = [rasteriser.scene(scene) for scene in scenes]
-    rgb = {view: np.stack([images[view].rgb for images in drawn]) for view in VIEWS}
-    segm = {view: np.stack([images[view].segm for images in drawn]) for view in VIEWS}
+    rendered = [rasteriser.scene(scene) for scene in scenes]
+    rgb = {view: np.stack([images[view].rgb for images in rendered]) for view in VIEWS}
+    segm = {view: np.stack([images[view].segm for images in rendered]) for view in VIEWS}
     return rgb, segm
 
 
-def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
-    """Render the prompt images of a demonstration.
-
-    Args:
-        demo: Names the episode; its own prompt is not used.
-        info: Of the shard that stores it.
-    """
-    rasteriser = _rasteriser(info.assets)
-    return rasteriser.prompt(sampled_prompt(demo, info, rasteriser.assets))
-
-
-def sampled_prompt(demo: Demonstration, info: ShardInfo, assets: Assets) -> Prompt:
+def sample_prompt(demo: Demonstration, info: ShardInfo, assets: Assets) -> Prompt:
     """Sample the episode of a demonstration again, and return its prompt.
 
     Args:
@@ -153,7 +132,7 @@ def _rasteriser(assets: str) -> Rasteriser:
     return Rasteriser(load_assets(recorded_assets(assets)))
 
 
-def _changed(demo: Demonstration, info: ShardInfo, details: str = "") -> ShardError:
+def _explain_change(demo: Demonstration, info: ShardInfo, details: str = "") -> ShardError:
     installed = package_versions()
     others = [
         f"{name} {info.versions.get(name, 'none')} (installed: {installed.get(name, 'none')})"
@@ -185,14 +164,14 @@ def with_random_appearance(demo: Demonstration, info: ShardInfo, variant: int) -
     if not demo.scenes:
         raise DatasetError(UNKNOWN_SCENES.format(f"the demonstration of {demo.task} with seed {demo.seed}"))
     rasteriser = _random_rasteriser(info.assets)
-    prompt = sampled_prompt(demo, info, rasteriser.assets)
+    prompt = sample_prompt(demo, info, rasteriser.assets)
     placements = [*demo.scenes[0].placements, *_shown(prompt)]
     rng = np.random.default_rng([variant, demo.seed, *demo.task.encode()])
     in_words = info.prompts != MULTIMODAL
     appearance = RandomAppearance(
         placements, prompt.text, in_words=in_words, variant=variant, assets=rasteriser.assets, rng=rng
     )
-    rgb, segm = draw_with(rasteriser, [appearance.of_scene(scene) for scene in demo.scenes])
+    rgb, segm = render_observations(rasteriser, [appearance.of_scene(scene) for scene in demo.scenes])
     images = tuple((name, appearance.of_image(fill)) for name, fill in prompt.images)
     rendered = rasteriser.prompt(dataclasses.replace(prompt, images=images))
     return dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=rendered)

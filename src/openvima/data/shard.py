@@ -1,25 +1,128 @@
-"""Reading one shard of demonstrations."""
+"""One shard: a file of demonstrations, its checksums, reading and writing.
 
+A shard is a head (magic bytes and schema), records one after the other, and a tail (the footer that says
+where they are). The index holds a CRC-32 of each record, the manifest one of head and tail together: Arrow
+then never sees a damaged byte, on which it may fail in many ways, and a flipped pixel does not go unnoticed.
+"""
+
+import contextlib
+import itertools
 import shlex
-from collections.abc import Sequence
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, BinaryIO
 
 import pyarrow as pa
 
-from openvima.atomic_io import NO_SPACE
-from openvima.data.checksums import Envelope, Span, mapped
-from openvima.data.decoding import actions_in, decode, decode_columns
-from openvima.data.encoding import ShardInfo
-from openvima.data.image_layout import planes
-from openvima.data.record_stream import decode_record
-from openvima.data.records import Demonstration, Step, columns_of
+from openvima.atomic_io import NO_SPACE, atomic_write
+from openvima.data.encoding import Encoder, ShardInfo, Skipped, actions_in, decode, decode_columns
+from openvima.data.records import Demonstration, Step, make_columns, planes
 from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION, VIEWS
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS
 
 # What Arrow raises when it is given damaged bytes.
-ODD_ERRORS = (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
+DAMAGE_ERRORS = (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
+COMPRESSION_LEVELS = {"zstd": 3}  # higher ones are much slower for a few percent
+_MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
+_BUFFER_BYTES = 1 << 20  # Arrow writes an episode in 150 pieces
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Where a record lies in its file, and the CRC-32 of its bytes."""
+
+    offset: int
+    num_bytes: int
+    crc32: int
+
+    def fault_in(self, content: memoryview) -> str:
+        """Say what is wrong with the record in a file's content; nothing if it is as it was."""
+        record = content[self.offset : self.offset + self.num_bytes]
+        return "" if zlib.crc32(record) == self.crc32 else "its checksum is wrong"
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """What lies around the records.
+
+    Args:
+        file_bytes: Size of the whole file.
+        head_bytes: Bytes before the first record.
+        tail_bytes: Bytes after the last one.
+        crc32: CRC-32 of head and tail.
+    """
+
+    file_bytes: int
+    head_bytes: int
+    tail_bytes: int
+    crc32: int
+
+    def to_entry(self) -> dict[str, int]:
+        """Return what the manifest holds of a shard's envelope."""
+        names = ("bytes", "head_bytes", "tail_bytes", "frame_crc32")
+        return dict(zip(names, (self.file_bytes, self.head_bytes, self.tail_bytes, self.crc32), strict=True))
+
+    def fault_in(self, content: memoryview) -> str:
+        """Say what is wrong around the records in a file's content; nothing if all is as it was."""
+        if len(content) != self.file_bytes:
+            return f"it has {len(content):,} of {self.file_bytes:,} bytes"
+        is_same = _envelope_crc32(content, self.head_bytes, self.tail_bytes) == self.crc32
+        return "" if is_same else "the checksum of its schema and footer is wrong"
+
+    @staticmethod
+    def from_entry(entry: Mapping[str, Any]) -> "Envelope":
+        """Read a shard's entry in the manifest."""
+        return Envelope(entry["bytes"], entry["head_bytes"], entry["tail_bytes"], entry["frame_crc32"])
+
+
+def map_file(path: Path) -> memoryview:
+    """Map a file into memory; its bytes are read when they are touched.
+
+    Raises:
+        FileNotFoundError: There is no regular file; to open a pipe would block.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    with pa.memory_map(str(path)) as file:  # the buffer keeps the mapping
+        return memoryview(file.read_buffer())
+
+
+def measure(path: Path) -> tuple[Envelope, list[Span]]:
+    """Find the parts of a whole shard and their checksums.
+
+    Raises:
+        ShardError: It is no chain of records.
+    """
+    content, ends = map_file(path), []
+    try:
+        with pa.memory_map(str(path)) as file:
+            file.seek(_MAGIC_BYTES)
+            with contextlib.suppress(EOFError):  # the mark after the last record
+                while pa.ipc.read_message(file):
+                    ends.append(file.tell())
+    except (pa.ArrowInvalid, OSError) as error:
+        raise ShardError(f"{path}: {str(error).splitlines()[0]}") from None
+    if not ends:
+        raise ShardError(f"{path}: it ends before its schema")
+    spans = [
+        Span(start, end - start, zlib.crc32(content[start:end])) for start, end in itertools.pairwise(ends)
+    ]
+    head, tail = ends[0], len(content) - ends[-1]
+    return Envelope(len(content), head, tail, _envelope_crc32(content, head, tail)), spans
+
+
+def spans_of(index: pa.Table) -> list[Span]:
+    """Return where the records of a shard lie, from its part of the index."""
+    columns = (index.column(name).to_pylist() for name in ("offset", "num_bytes", "crc32"))
+    return [Span(*numbers) for numbers in zip(*columns, strict=True)]
+
+
+def _envelope_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:
+    return zlib.crc32(content[len(content) - tail_bytes :], zlib.crc32(content[:head_bytes]))
 
 
 class Shard:
@@ -38,12 +141,16 @@ class Shard:
 
     def __init__(self, path: Path, envelope: Envelope | None = None) -> None:
         self.path = path
-        self._content = _mapped(path)
+        try:
+            self._content = map_file(path)
+        except FileNotFoundError:
+            raise ShardError(f"there is no file {path}. {remedy(path.parent)}") from None
+        except DAMAGE_ERRORS as error:
+            raise self._damage("it", error) from None
         if envelope is not None and (fault := envelope.fault_in(self._content)):
-            raise ShardError(_damaged(path, "it", fault))
+            raise self._damage("it", fault)
         self._readers: dict[tuple[str, ...], pa.RecordBatchFileReader] = {}  # of some columns each
         self._info: ShardInfo | None = None
-        self._checked: tuple[int, Span | None] = -1, None  # the row whose checksum was compared last
         if envelope is None:
             _ = self.info
 
@@ -51,30 +158,30 @@ class Shard:
     def info(self) -> ShardInfo:
         """What all rows have in common."""
         if self._info is None:
-            self._reader_of(COLUMNS.names)
+            self._open(COLUMNS.names)
         assert self._info is not None  # opening sets it
         return self._info
 
     def __len__(self) -> int:
-        reader = next(iter(self._readers.values()), None) or self._reader_of(COLUMNS.names)
+        reader = next(iter(self._readers.values()), None) or self._open(COLUMNS.names)
         return reader.num_record_batches
 
     def __getitem__(self, row: int) -> Demonstration:
         batch = self.batch(row)
         try:
             demo = decode(batch, self.info)
-        except ODD_ERRORS as error:
-            raise self._row_error(row, error) from None
+        except DAMAGE_ERRORS as error:
+            raise self._row_damage(row, error) from None
         if self.info.images:
             return demo
-        from openvima.data.rerender import rerendered  # with which the renderer comes
+        from openvima.data.rerender import rerender  # with which the renderer comes
 
         try:
-            return rerendered(demo, self.info, batch.column("content_hash")[0].as_py())
+            return rerender(demo, self.info, batch.column("content_hash")[0].as_py())
         except ShardError as error:
             raise ShardError(f"{self.path}, record {row}: {error}") from None
 
-    def read(self, row: int, columns: Sequence[str]) -> dict[str, Any]:  # Any: one column, one type
+    def read(self, row: int, columns: Sequence[str]) -> dict[str, Any]:
         """Read some columns of one row; nothing is decompressed for the others.
 
         Args:
@@ -89,19 +196,14 @@ class Shard:
             DatasetError: There is no such column.
             ShardError: The row is damaged.
         """
-        needed = tuple(dict.fromkeys((*columns, "steps") if "poses" in columns else columns))
-        checked, span = self._checked
-        if checked == row and span is not None:
-            batch = self._decoded(row, span, needed)
-        else:
-            batch = self._batch(self._reader_of(needed), row)
+        batch = self._read_batch(row, (*columns, "steps") if "poses" in columns else columns)
         try:
             values = decode_columns(batch)
-        except ODD_ERRORS as error:
-            raise self._row_error(row, error) from None
+        except DAMAGE_ERRORS as error:
+            raise self._row_damage(row, error) from None
         images = IMAGES.intersection(columns)
         if images and not any(len(values[name]) for name in images) and not self.info.images:
-            values |= columns_of(self[row]).images
+            values |= make_columns(self[row]).images
         return {name: values[name] for name in columns}
 
     def step(self, row: int, step: int, *, views: Sequence[str] = VIEWS, segm: bool = True) -> Step:
@@ -127,7 +229,7 @@ class Shard:
         actions = actions_in(values)
         if not 0 <= step < len(actions):
             raise IndexError(f"step {step} of {len(actions)}; count from 0 to {len(actions) - 1}.")
-        observation: dict[str, Any] = {  # Any: as an environment's
+        observation: dict[str, Any] = {
             "rgb": {view: planes(values[f"rgb_{view}"][step : step + 1])[0] for view in views},
             "ee": END_EFFECTORS.index(values["end_effector"]),
         }
@@ -142,32 +244,10 @@ class Shard:
             IndexError: There are fewer rows.
             ShardError: It is damaged.
         """
-        return self._batch(self._reader_of(COLUMNS.names), row)
-
-    def _batch(self, reader: pa.RecordBatchFileReader, row: int) -> pa.RecordBatch:
-        if not 0 <= row < len(self):  # which also ends loops over a shard
-            raise IndexError(f"record {row} of {len(self)} in {self.path}; count from 0 to {len(self) - 1}.")
-        try:
-            batch = reader.get_batch(row)
-            batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
-        except ODD_ERRORS as error:
-            raise self._row_error(row, error) from None
-        return batch
-
-    def _decoded(self, row: int, span: Span, columns: Sequence[str]) -> pa.RecordBatch:
-        """Read some columns of a row that was checked, without opening the file for it."""
-        for name in columns:
-            if name not in COLUMNS.names:
-                raise DatasetError(unknown_name("column", name, COLUMNS.names))
-        try:
-            return decode_record(self._content[span.offset : span.offset + span.num_bytes], columns)
-        except ODD_ERRORS as error:
-            raise self._row_error(row, error) from None
+        return self._read_batch(row, COLUMNS.names)
 
     def check(self, row: int, span: Span) -> None:
         """Compare the bytes of a row with their checksum, before anything is made of them.
-
-        The next call of `read` for this row does without opening the file.
 
         Args:
             row: The row.
@@ -177,8 +257,7 @@ class Shard:
             ShardError: They are damaged.
         """
         if fault := span.fault_in(self._content):
-            raise self._row_error(row, fault)
-        self._checked = row, span
+            raise self._row_damage(row, fault)
 
     def table(self, names: Sequence[str]) -> pa.Table:
         """Read some columns of all rows, without touching the others.
@@ -187,70 +266,138 @@ class Shard:
             names: Columns of `schema.COLUMNS`.
         """
         try:
-            table = self._reader_of(names).read_all()
+            table = self._open(names).read_all()
             table.validate(full=True)  # as for a row
-        except ODD_ERRORS as error:
-            raise ShardError(_damaged(self.path, "its records", error)) from None
+        except DAMAGE_ERRORS as error:
+            raise self._damage("its records", error) from None
         return table.select(list(names))
 
-    def _reader_of(self, columns: Sequence[str]) -> pa.RecordBatchFileReader:
-        """A reader to which the other columns do not exist; to open one takes 0.2 ms.
+    def _read_batch(self, row: int, columns: Sequence[str]) -> pa.RecordBatch:
+        reader = self._open(columns)
+        if not 0 <= row < len(self):  # which also ends loops over a shard
+            raise IndexError(f"record {row} of {len(self)} in {self.path}; count from 0 to {len(self) - 1}.")
+        try:
+            batch = reader.get_batch(row)
+            batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
+        except DAMAGE_ERRORS as error:
+            raise self._row_damage(row, error) from None
+        return batch
+
+    def _open(self, columns: Sequence[str]) -> pa.RecordBatchFileReader:
+        """Return a reader to which the other columns do not exist; to open one takes 0.2 ms.
 
         Raises:
             DatasetError: There is no such column.
             ShardError: The file is damaged, or has other columns.
         """
-        key = tuple(columns)
+        key = tuple(dict.fromkeys(columns))
         if key not in self._readers:
-            for name in columns:
+            for name in key:
                 if name not in COLUMNS.names:
                     raise DatasetError(unknown_name("column", name, COLUMNS.names))
-            numbers = [COLUMNS.get_field_index(name) for name in columns]
-            reader = _opened(self.path, self._content, None if len(numbers) == len(COLUMNS) else numbers)
-            self._info = self._info or self._described(reader)
-            if not reader.schema.equals(pa.schema([COLUMNS.field(number) for number in sorted(numbers)])):
+            numbers = sorted(COLUMNS.get_field_index(name) for name in key)
+            included = None if len(numbers) == len(COLUMNS) else numbers
+            options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=included)
+            try:
+                reader = pa.ipc.open_file(pa.py_buffer(self._content), options=options)
+            except DAMAGE_ERRORS as error:
+                raise self._damage("it", error) from None
+            try:
+                self._info = self._info or ShardInfo.from_metadata(reader.schema.metadata)
+            except ShardError as error:
+                raise ShardError(f"{self.path}: {error}") from None
+            if not reader.schema.equals(pa.schema([COLUMNS.field(number) for number in numbers])):
                 raise ShardError(
                     f"{self.path} has other columns than schema version {SCHEMA_VERSION} asks for."
                 )
             self._readers[key] = reader
         return self._readers[key]
 
-    def _described(self, reader: pa.RecordBatchFileReader) -> ShardInfo:
-        try:
-            return ShardInfo.from_metadata(reader.schema.metadata)
-        except ShardError as error:
-            raise ShardError(f"{self.path}: {error}") from None
-
-    def _row_error(self, row: int, error: Exception | str) -> ShardError:
+    def _row_damage(self, row: int, error: Exception | str) -> ShardError:
         if isinstance(error, OSError) and error.errno in NO_SPACE:
             raise error  # nothing is damaged: Numba keeps what it compiled on a full disk
-        return ShardError(_damaged(self.path, f"record {row} of {len(self)}", error))
+        return self._damage(f"record {row} of {len(self)}", error)
+
+    def _damage(self, what: str, error: Exception | str) -> ShardError:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        return ShardError(
+            f"{self.path}: {what} is truncated, damaged or no shard ({reason}). {remedy(self.path.parent)}"
+        )
 
 
 def remedy(folder: Path) -> str:
-    """Return a sentence that says what makes a damaged folder whole."""
-    return (
-        f"`openvima data verify {shlex.quote(str(folder))} --repair` makes it anew, or keeps what is whole."
-    )
+    """Return a sentence that says what to do about a damaged folder."""
+    return f"`openvima data verify {shlex.quote(str(folder))}` names all damage, and what makes it again."
 
 
-def _mapped(path: Path) -> memoryview:
-    try:
-        return mapped(path)
-    except FileNotFoundError:
-        raise ShardError(f"there is no file {path}. {remedy(path.parent)}") from None
-    except ODD_ERRORS as error:
-        raise ShardError(_damaged(path, "it", error)) from None
+class ShardWriter:
+    """Writes one shard; a context manager.
+
+    The file gets its name when the block ends without an exception, so a file with that name is whole. After
+    an exception nothing is left; after a crash a hidden temporary file is, which the next run deletes.
+
+    Args:
+        path: Final name of the shard.
+        info: What all its rows have in common.
+    """
+
+    def __init__(self, path: Path, info: ShardInfo) -> None:
+        self.path = path
+        self._schema = COLUMNS.with_metadata(info.to_metadata())
+        self._encoder = Encoder(self._schema, with_images=info.images)
+        codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
+        options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
+        self._closing = contextlib.ExitStack()
+        sink = _Sink(self._closing.enter_context(atomic_write(path)))
+        stream = pa.BufferedOutputStream(pa.PythonFile(sink, "w"), _BUFFER_BYTES)
+        self._closing.callback(stream.flush)
+        self._writer = self._closing.enter_context(pa.ipc.new_file(stream, self._schema, options=options))
+
+    def write(self, demo: Demonstration, skipped: Sequence[Skipped] = ()) -> None:
+        """Append one episode.
+
+        Args:
+            demo: The demonstration.
+            skipped: Seeds tried just before it in vain.
+        """
+        self._writer.write_batch(self._encoder.encode(demo, skipped))
+
+    def copy(self, batch: pa.RecordBatch) -> None:
+        """Append one episode as another shard holds it.
+
+        Args:
+            batch: The row, as `Shard.batch` gives it.
+        """
+        self._writer.write_batch(batch.replace_schema_metadata(self._schema.metadata))
+
+    def __enter__(self) -> "ShardWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._closing.__exit__(kind, error, traceback)
 
 
-def _opened(path: Path, content: memoryview, columns: list[int] | None = None) -> pa.RecordBatchFileReader:
-    options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=columns)
-    try:
-        return pa.ipc.open_file(pa.py_buffer(content), options=options)
-    except ODD_ERRORS as error:
-        raise ShardError(_damaged(path, "it", error)) from None
+class _Sink:
+    """A file that raises only once: what Arrow could not write, it tries again as it ends, and complains."""
 
+    closed = False  # `atomic_write` closes the file
 
-def _damaged(path: Path, what: str, error: Exception | str) -> str:
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
-    return f"{path}: {what} is truncated, damaged or no shard ({reason}). {remedy(path.parent)}"
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._has_failed = file, False
+
+    def write(self, data: bytes) -> int:
+        if self._has_failed:
+            return len(data)
+        try:
+            return self._file.write(data)
+        except BaseException:
+            self._has_failed = True
+            raise
+
+    def flush(self) -> None:
+        """Nothing: `atomic_write` does it."""
+
+    def close(self) -> None:
+        """Nothing, likewise."""

@@ -1,7 +1,7 @@
 """Summary of a folder of demonstrations: counts, sizes and histograms."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.hub import data_folder
 from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
-from openvima.data.reader import Dataset
+from openvima.data.reader import Dataset, data_folder
 from openvima.data.schema import COLUMNS, IMAGES
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, echo
 from openvima.hub import dataset_name
+from openvima.multiprocess import Report
 
 _NUM_MEASURED = 3  # episodes of each task to measure the size of images on
-
-Report = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +73,7 @@ class Summary:
     """
 
     folder: Path
-    manifest: dict[str, Any]  # Any: JSON
+    manifest: dict[str, Any]
     tasks: tuple[TaskSummary, ...]
     histograms: tuple[Histogram, ...]
     num_failed: int | None
@@ -87,7 +85,7 @@ class Summary:
         shards = sum(entry["bytes"] for entry in self.manifest["shards"].values())
         return shards + sum((self.folder / name).stat().st_size for name in (INDEX_NAME, MANIFEST_NAME))
 
-    def to_record(self) -> dict[str, Any]:  # Any: JSON
+    def to_record(self) -> dict[str, Any]:
         """Return everything as plain values: the entries of the manifest, and an entry "summary"."""
         tasks = {
             task.task: {name: getattr(task, name) for name in task.__slots__ if name != "task"}
@@ -120,7 +118,7 @@ class Unfinished:
     episodes: dict[str, int]
     damaged: tuple[str, ...]
 
-    def to_record(self) -> dict[str, Any]:  # Any: JSON
+    def to_record(self) -> dict[str, Any]:
         """Return everything as plain values."""
         counts = {"shards": self.shards, "episodes": self.episodes, "damaged": list(self.damaged)}
         return {"summary": {"finished": False, **counts}}
@@ -242,7 +240,7 @@ def _shard_histograms(dataset: Dataset, report: Report) -> list[Histogram]:
     ]
 
 
-def _in_order(counts: Mapping[Any, int]) -> dict[str, int]:  # Any: texts or numbers
+def _in_order(counts: Mapping[Any, int]) -> dict[str, int]:
     return {str(value): counts[value] for value in sorted(counts)}
 
 
@@ -250,7 +248,7 @@ def _most_first(counts: Counter[str]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda entry: (-entry[1], entry[0])))
 
 
-def _value_counts(values: pa.Array | pa.ChunkedArray) -> dict[Any, int]:  # Any: texts or numbers
+def _value_counts(values: pa.Array | pa.ChunkedArray) -> dict[Any, int]:
     return {entry["values"]: entry["counts"] for entry in values.value_counts().to_pylist()}
 
 

@@ -11,12 +11,18 @@ from pathlib import Path
 from openvima.atomic_io import folder_lock
 from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import MANIFEST_NAME, ShardSummary, finish_folder, previous_summaries, set_aside
+from openvima.data.manifest import (
+    MANIFEST_NAME,
+    ShardSummary,
+    finish_folder,
+    previous_summaries,
+    remove_leftovers,
+    set_aside,
+    storage_error,
+)
 from openvima.data.reader import read_manifest
 from openvima.data.records import Demonstration, Rollout, package_versions
-from openvima.data.resuming import remove_leftovers, storage_error
-from openvima.data.shard import Shard
-from openvima.data.writer import ShardWriter
+from openvima.data.shard import Shard, ShardWriter
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import DatasetError, EpisodeError

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
-from openvima.data.shard import ODD_ERRORS
+from openvima.data.shard import DAMAGE_ERRORS
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import ActionError, DatasetError, OracleError, PolicyError
 from openvima.evaluation.results import Row
@@ -150,7 +150,7 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
         raise DatasetError(
             f"there is no {path}; evaluations of this version write it. Evaluate again with --force."
         ) from None
-    except (EOFError, struct.error, *ODD_ERRORS) as error:
+    except (EOFError, struct.error, *DAMAGE_ERRORS) as error:
         if isinstance(error, DatasetError):
             raise
         raise DatasetError(f"{path} is damaged ({(str(error).splitlines() or [repr(error)])[0]}).") from None

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from openvima.atomic_io import atomic_write_file, folder_lock, is_lock_file
 from openvima.catalog.packs import load_assets
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.resuming import is_finished
+from openvima.data.manifest import is_finished
 from openvima.data.subsets import SubsetConfig, sample
 from openvima.errors import ConfigError, InputFileError, differences
 from openvima.evaluation.results import Results

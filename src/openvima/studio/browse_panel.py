@@ -9,7 +9,7 @@ import viser
 from openvima.catalog import LEVELS, OBJECTS, TEXTURES
 from openvima.data import Dataset, Demonstration
 from openvima.data.manifest import MANIFEST_NAME
-from openvima.data.query import DemonstrationQuery, find_demonstrations
+from openvima.data.reader import DemonstrationQuery, find_demonstrations
 from openvima.env.tabletop import VideoFrame
 from openvima.errors import DatasetError, PolicyError
 from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode, success_rates

@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from openvima.data.hash_split import split_hashes
-from openvima.data.hub import data_folder
 from openvima.data.object_cache import ObjectCache
-from openvima.data.reader import Dataset, read_manifest
+from openvima.data.reader import Dataset, data_folder, read_manifest, split_hashes
 from openvima.data.rerender import UNKNOWN_SCENES
 from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.perception.preprocessing import split_prompt

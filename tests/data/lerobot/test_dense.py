@@ -9,8 +9,8 @@ import pytest
 import openvima
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.lerobot import LerobotConfig, export_lerobot
-from openvima.data.lerobot.dense import DenseLayout, dense_trajectory
-from openvima.data.verification.replay import first_difference
+from openvima.data.lerobot_frames import DenseLayout, dense_trajectory
+from openvima.data.replay import find_difference
 from openvima.env import EnvConfig
 from openvima.errors import ConfigError, DatasetError
 
@@ -48,7 +48,7 @@ def test_the_export_has_a_frame_for_each_command_at_its_true_time(data, tmp_path
 def test_a_replay_gives_the_same_bytes_and_another_path_is_noticed(data) -> None:
     (demo,) = Dataset(data)
     env = CONTROL.make(demo.task, demo.level, domain=demo.domain)
-    assert first_difference(env, demo) == ""
+    assert find_difference(env, demo) == ""
     demo.joint_paths[0][3, 0] += 1e-3
     with pytest.raises(DatasetError, match=r"rotate, seed \d+: the path of step 0 differs"):
         dense_trajectory(demo, CONTROL)

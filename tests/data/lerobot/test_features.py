@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from openvima.data import Demonstration
-from openvima.data.lerobot.dense import frame_layout
-from openvima.data.lerobot.features import FrameLayout, action_from_row
+from openvima.data.lerobot_frames import FrameLayout, action_from_row, frame_layout
 from openvima.env import TabletopEnv
 from openvima.errors import ActionError
 from openvima.scene import END_EFFECTORS, Action

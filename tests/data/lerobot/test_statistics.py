@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from openvima.data.lerobot.statistics import QUANTILES, PixelCounts, value_statistics
+from openvima.data.lerobot_files import QUANTILES, PixelCounts, value_statistics
 
 
 def smallest_not_exceeded_by(values: np.ndarray, share: float) -> float:

@@ -6,9 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from openvima.data.lerobot import layout
-from openvima.data.lerobot.layout import FileNumber
-from openvima.data.lerobot.tables import NumberedTable
+from openvima.data.lerobot_files import DATA_PATH, FileNumber, NumberedTable
 
 
 def test_a_chunk_is_full_after_a_thousand_files() -> None:
@@ -19,7 +17,7 @@ def test_a_chunk_is_full_after_a_thousand_files() -> None:
 @pytest.mark.parametrize("group_bytes", [1000, 10**6])
 def test_files_stay_below_their_limit_and_hold_all_rows_in_order(tmp_path: Path, group_bytes: int) -> None:
     limit, numbers = 20_000, []
-    with NumberedTable(tmp_path, layout.DATA_PATH, limit_bytes=limit, group_bytes=group_bytes) as table:
+    with NumberedTable(tmp_path, DATA_PATH, limit_bytes=limit, group_bytes=group_bytes) as table:
         for start in range(0, 10_000, 50):
             numbers.append(table.write(pa.table({"x": pa.array(range(start, start + 50))})))
     files = sorted(tmp_path.rglob("*.parquet"))
@@ -32,7 +30,7 @@ def test_files_stay_below_their_limit_and_hold_all_rows_in_order(tmp_path: Path,
 
 
 def test_rows_written_together_share_a_row_group(tmp_path: Path) -> None:
-    with NumberedTable(tmp_path, layout.DATA_PATH, limit_bytes=10**6, group_bytes=500) as table:
+    with NumberedTable(tmp_path, DATA_PATH, limit_bytes=10**6, group_bytes=500) as table:
         for start in range(0, 300, 30):
             table.write(pa.table({"x": pa.array(range(start, start + 30))}))
     file = pq.ParquetFile(next(tmp_path.rglob("*.parquet")))

@@ -6,9 +6,8 @@ import av
 import numpy as np
 import pytest
 
-from openvima.data.lerobot import videos
-from openvima.data.lerobot.layout import FileNumber
-from openvima.data.lerobot.videos import NumberedVideo, PixelFormat
+from openvima.data import lerobot_files
+from openvima.data.lerobot_files import FileNumber, NumberedVideo, PixelFormat
 
 LARGE = 10**9
 
@@ -88,7 +87,7 @@ def test_files_stay_below_their_limit(tmp_path: Path) -> None:
 
 
 def test_a_file_is_closed_after_so_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(videos, "MAX_FRAMES", 4)
+    monkeypatch.setattr(lerobot_files, "MAX_FRAMES", 4)
     with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video:
         places = [video.write(pictures(1), num_frames=3) for _ in range(3)]
     assert [(place.number.file, place.first_frame) for place in places] == [(0, 0), (0, 3), (1, 0)]

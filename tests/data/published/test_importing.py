@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from openvima.cli.main import main
-from openvima.data import Dataset
-from openvima.data.published import ImportConfig, PublishedData, import_published, importing
+from openvima.data import Dataset, published
+from openvima.data.published import ImportConfig, PublishedData, import_published
 from openvima.data.shard import Shard
 from openvima.errors import ConfigError, DatasetError
 from published_data import PUBLISHED, MadeEpisode, write_folder, write_zip
@@ -112,7 +112,7 @@ def test_a_full_disk_loses_no_whole_shard(source: Path, imported: Path, tmp_path
 
 def test_a_whole_import_is_left_alone(imported: Path, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = {path: path.stat().st_mtime_ns for path in imported.iterdir()}
-    monkeypatch.setattr(importing, "write_block", None)
+    monkeypatch.setattr(published, "write_block", None)
     import_published(config(source, imported))
     assert {path: path.stat().st_mtime_ns for path in imported.iterdir()} == before
 

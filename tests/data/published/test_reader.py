@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from openvima.data import Demonstration
-from openvima.data.published import Broken, EpisodeKey, PublishedData
-from openvima.data.published.names import split_of
-from openvima.data.published.picks import picked_ids
+from openvima.data.published import Broken, EpisodeKey, PublishedData, split_of
+from openvima.data.published_episode import picked_ids
 from openvima.data.records import rollout_oracle
 from openvima.data.schema import UNKNOWN_ID
 from openvima.env import EnvConfig

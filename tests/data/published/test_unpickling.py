@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import published_data
-from openvima.data.published.unpickling import (
+from openvima.data.published_episode import (
     MAX_OPERATIONS,
     STAND_INS,
     Global,

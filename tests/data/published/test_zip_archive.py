@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 import published_data
-from openvima.data.published.layout import MAX_EPISODE_BYTES
-from openvima.data.published.zip_archive import ZipArchive
+from openvima.data.published_sources import MAX_EPISODE_BYTES, ZipArchive
 from openvima.errors import DatasetError, MemberError
 
 EPISODES = {

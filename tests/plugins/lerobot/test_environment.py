@@ -10,8 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from openvima.data.lerobot.dense import DenseLayout
-from openvima.data.lerobot.features import FrameLayout
+from openvima.data.lerobot_frames import DenseLayout, FrameLayout
 
 FILE = Path(__file__).parents[3] / "plugins/lerobot/lerobot_env_openvima/env.py"
 FIXED = {"prompts": "multimodal", "control": "primitives", "layout": FrameLayout(1, True), "fps": 1}

@@ -81,14 +81,13 @@ def info(
 def _write_appearance(folder: Path, file: Path) -> None:
     """Write the appearance statistics; report on standard error what is outside the training partition."""
     from openvima.atomic_io import atomic_write_file
-    from openvima.data.appearance_stats import appearance_record, appearance_text
-    from openvima.data.leakage import leaks
+    from openvima.data.appearances import appearance_record, appearance_text, find_leaks
     from openvima.data.reader import Dataset
 
     with progress_bar("files") as report:
         record = appearance_record(Dataset(folder), report)
     atomic_write_file(file, appearance_text(record))
-    problems = leaks(record)
+    problems = find_leaks(record)
     for problem in problems[:_NUM_AT_END]:
         print(f"outside the training partition: {problem}", file=sys.stderr)
     if len(problems) > _NUM_AT_END:
@@ -134,7 +133,7 @@ def _summary(summary: "Summary", name: str) -> "Iterator[str | Table]":
             yield from _bars(histogram)
 
 
-def _settings(config: dict[str, Any]) -> str:  # Any: JSON
+def _settings(config: dict[str, Any]) -> str:
     """Format scalar settings in one line."""
     plain = {name: value for name, value in config.items() if isinstance(value, str | int | float | bool)}
     return "".join(f", {name.replace('_', ' ')} {_shown(value)}" for name, value in sorted(plain.items()))

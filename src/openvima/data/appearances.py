@@ -1,7 +1,15 @@
 """Appearance statistics: combinations of object and texture in demonstrations, by task and role.
 
 They document the training data of a policy: `training_data.json` beside its weights identifies the data set
-by content and lists every combination in it. `leakage.py` compares it with the training partition.
+by content and lists every combination in it. `find_leaks` compares it with the training partition, so that
+L2, L3 and L4 stay unseen. The benchmark itself makes three exceptions at every level:
+
+- in `visual_manipulation`, `novel_noun` and `scene_understanding` distractors have textures of either role;
+- in `rearrange` and `rearrange_then_restore` the distractor has any of the 49 light textures, ten of which no
+  other role has before L3;
+- prompt images of a shape alone, in `novel_adj` and `novel_noun`, render it in gray.
+
+Dragged objects, bases and all shapes keep to the partition strictly.
 
 Roles of objects on the table:
 
@@ -19,17 +27,19 @@ import hashlib
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
 from typing import Any
 
 import numpy as np
 
+from openvima.catalog import NEUTRAL_TEXTURE, OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
 from openvima.data.manifest import MANIFEST_NAME
 from openvima.data.reader import Dataset
+from openvima.multiprocess import Report
 
 Appearance = tuple[str, str]  # names of object and texture
-Row = Mapping[str, Any]  # Any: values of an episode's columns
+Row = Mapping[str, Any]
 
 ROLES: tuple[str, ...] = ("dragged", "base", "distractor", "other_movable", "other_fixed", "prompted")
 _SCENE_IMAGE = "scene"  # name of the prompt image of the whole table
@@ -48,9 +58,7 @@ _FROM_MANIFEST = (
 )
 
 
-def appearance_record(
-    dataset: Dataset, report: Callable[[int, int, str], None] | None = None
-) -> dict[str, Any]:  # Any: JSON
+def appearance_record(dataset: Dataset, report: Report | None = None) -> dict[str, Any]:
     """Collect the appearance statistics of a data set; reads every shard, without images.
 
     Args:
@@ -81,13 +89,13 @@ def appearance_record(
     return {"manifest": {**manifest, "sha256": sha256}, "tasks": tasks}
 
 
-def appearance_text(record: Mapping[str, Any]) -> str:  # Any: JSON
+def appearance_text(record: Mapping[str, Any]) -> str:
     """Format the record as JSON, each list of names or ranges in one line."""
     text = json.dumps(record, indent=1, ensure_ascii=False)
     return _LIST.sub(lambda found: json.dumps(json.loads(found[0]), ensure_ascii=False), text) + "\n"
 
 
-def appearances_of(role: Mapping[str, Any]) -> frozenset[Appearance]:  # Any: JSON
+def appearances_of(role: Mapping[str, Any]) -> frozenset[Appearance]:
     """Return all combinations of object and texture of a role in the record."""
     return frozenset(
         (name, texture)
@@ -123,7 +131,7 @@ def _appearance(part: Row) -> Appearance:
     return part["object"], part["texture"]
 
 
-def _episodes(dataset: Dataset, task: str) -> dict[str, Any]:  # Any: JSON
+def _episodes(dataset: Dataset, task: str) -> dict[str, Any]:
     """Summarise the episodes of a task in the index."""
     index = dataset.index
     rows = index.filter(np.array(index.column("task").to_pylist()) == task)
@@ -139,7 +147,7 @@ def _episodes(dataset: Dataset, task: str) -> dict[str, Any]:  # Any: JSON
     }
 
 
-def _tables(roles: Mapping[str, Counter[Appearance]]) -> dict[str, Any]:  # Any: JSON
+def _tables(roles: Mapping[str, Counter[Appearance]]) -> dict[str, Any]:
     return {
         role: {"count": roles[role].total(), "appearances": _grouped(roles[role])}
         for role in ROLES
@@ -147,7 +155,7 @@ def _tables(roles: Mapping[str, Counter[Appearance]]) -> dict[str, Any]:  # Any:
     }
 
 
-def _grouped(appearances: Counter[Appearance]) -> list[dict[str, Any]]:  # Any: JSON
+def _grouped(appearances: Counter[Appearance]) -> list[dict[str, Any]]:
     """Group objects that have most of their textures in common."""
     textures: dict[str, set[str]] = defaultdict(set)
     for name, texture in appearances:
@@ -164,6 +172,67 @@ def _grouped(appearances: Counter[Appearance]) -> list[dict[str, Any]]:  # Any: 
     return [_group(names, union, textures) for names, union in groups]
 
 
-def _group(names: list[str], union: set[str], found: Mapping[str, set[str]]) -> dict[str, Any]:  # Any: JSON
+def _group(names: list[str], union: set[str], found: Mapping[str, set[str]]) -> dict[str, Any]:
     lacking = {name: sorted(union - found[name]) for name in names if union != found[name]}
     return {"objects": names, "textures": sorted(union), **({"lacking": lacking} if lacking else {})}
+
+
+_LEVEL = "train"
+_TEXTURES_OF_EITHER_ROLE = ("visual_manipulation", "novel_noun", "scene_understanding")
+_TEXTURES_OF_ALL = ("rearrange", "rearrange_then_restore")
+_SHAPES_ALONE = ("novel_adj", "novel_noun")
+_SWEEPS = ("sweep_without_exceeding",)  # the line is in no list of bases
+
+
+def find_leaks(record: Mapping[str, Any]) -> list[str]:
+    """Compare appearance statistics with the training partition.
+
+    Args:
+        record: The result of `appearance_record`.
+
+    Returns:
+        One sentence for each task, level or appearance outside the training partition.
+    """
+    return [problem for task, entry in record["tasks"].items() for problem in _problems(task, entry)]
+
+
+def training_appearances(task: str) -> dict[str, frozenset[Appearance]]:
+    """Return the combinations of object and texture that each role may have in demonstrations of a task.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        LevelError: It is none of the training tasks.
+    """
+    names = pool(task, _LEVEL)
+    shapes, bases = names.dragged_objects, names.base_objects
+    bases += OBJECT_SETS["constraint"] if task in _SWEEPS else ()
+    dragged, base = _appearances(shapes, names.dragged_textures), _appearances(bases, names.base_textures)
+    appearances = dict(zip(ROLES, (dragged, base, dragged, dragged, base, dragged | base), strict=True))
+    if task in _TEXTURES_OF_EITHER_ROLE:
+        either = (*names.dragged_textures, *names.base_textures)
+        appearances["other_movable"], appearances["other_fixed"] = (
+            _appearances(shapes, either),
+            _appearances(bases, either),
+        )
+    if task == "scene_understanding":  # its prompt contains distractors too
+        appearances["prompted"] = appearances["other_movable"] | appearances["other_fixed"]
+    if task in _TEXTURES_OF_ALL:
+        appearances["distractor"] = _appearances(shapes, TEXTURE_SETS["T"])
+    if task in _SHAPES_ALONE:
+        appearances["prompted"] |= _appearances((*shapes, *bases), (NEUTRAL_TEXTURE,))
+    return appearances
+
+
+def _problems(task: str, entry: Mapping[str, Any]) -> list[str]:
+    if task not in tasks_at(_LEVEL):
+        return [f"{task} is none of the training tasks."]
+    problems = [f"{task} has episodes of level {level}." for level in entry["levels"] if level != _LEVEL]
+    allowed = training_appearances(task)
+    for role, table in entry["roles"].items():
+        strange = sorted(appearances_of(table) - allowed.get(role, frozenset()))
+        problems += [f"{task} shows {name!r} in {texture!r} as {role}." for name, texture in strange]
+    return problems
+
+
+def _appearances(objects: Iterable[str], textures: Iterable[str]) -> frozenset[Appearance]:
+    return frozenset(product(objects, textures))

@@ -1,6 +1,5 @@
 """Export of demonstrations to a LeRobotDataset v3.0: Parquet, MP4 and JSON that LeRobot opens as its own."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,20 +9,26 @@ import pyarrow.parquet as pq
 
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
-from openvima.data.lerobot import layout
-from openvima.data.lerobot.dense import DenseLayout, dense_settings, dense_trajectory
-from openvima.data.lerobot.features import FrameLayout
-from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
-from openvima.data.lerobot.writer import LerobotWriter, write_json
+from openvima.data.lerobot_files import (
+    DATA_FILE_MB,
+    INFO_PATH,
+    PIXEL_FORMATS,
+    SOURCE_EPISODES_PATH,
+    SOURCE_PATH,
+    VIDEO_FILE_MB,
+    LerobotWriter,
+    PixelFormat,
+    write_json,
+)
+from openvima.data.lerobot_frames import FrameLayout, dense_settings, dense_trajectory, frame_layout
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import settle
-from openvima.scene.command import CONTROL_HZ
+from openvima.multiprocess import Report
+from openvima.scene.command import CONTROL_HZ, END_EFFECTOR, PRIMITIVES
 from openvima.video.encoder import import_av
 
 RATES = (1, 2, 4, 8, 16, 32, 64)
-
-Report = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +57,8 @@ class LerobotConfig:
     tasks: tuple[str, ...] | None = None
     fps: int | None = None
     pixels: PixelFormat = "yuv444p"
-    data_file_mb: int = layout.DATA_FILE_MB
-    video_file_mb: int = layout.VIDEO_FILE_MB
+    data_file_mb: int = DATA_FILE_MB
+    video_file_mb: int = VIDEO_FILE_MB
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -98,11 +103,11 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     settings = dense_settings(dataset)
     if settings and config.fps is not None:
         raise ConfigError(f"fps is {config.fps}, but a step of low-level control lasts 0.1 s; leave it out.")
-    frames, fps = survey(dataset), CONTROL_HZ if settings else config.fps or 1
+    fps = CONTROL_HZ if settings else config.fps or 1
     with folder_lock(config.out), atomic_folder(config.out) as folder:
         with LerobotWriter(
             folder,
-            DenseLayout(frames.num_prompt_images, frames.has_joints) if settings else frames,
+            survey(dataset, END_EFFECTOR if settings else PRIMITIVES),
             fps=fps,
             pixels=config.pixels,
             data_file_mb=config.data_file_mb,
@@ -116,11 +121,12 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     return config.out
 
 
-def survey(dataset: Dataset) -> FrameLayout:
+def survey(dataset: Dataset, control: str) -> FrameLayout:
     """Find what the frames of all episodes have in common, without reading images.
 
     Args:
         dataset: The demonstrations.
+        control: "primitives" or "end_effector".
 
     Raises:
         DatasetError: An episode has no steps, so no frames either.
@@ -132,7 +138,7 @@ def survey(dataset: Dataset) -> FrameLayout:
             raise DatasetError(f"{dataset.path / name} holds an episode without steps; LeRobot takes none.")
         num_images = max(num_images, *_lengths(table["prompt_images"].combine_chunks()))
         has_joints = has_joints and _has_joints(table)
-    return FrameLayout(num_images, has_joints)
+    return frame_layout(control, num_images, has_joints)
 
 
 def _has_joints(table: pa.Table) -> bool:
@@ -150,7 +156,7 @@ def _check_out(config: LerobotConfig) -> None:
     is_taken = not all(map(is_lock_file, out.iterdir())) if out.is_dir() else out.exists()
     if is_taken and not config.force:
         raise DatasetError(f"{out} is there already; give another folder, or --force to replace it.")
-    if is_taken and not (out / layout.INFO_PATH).is_file():
+    if is_taken and not (out / INFO_PATH).is_file():
         raise DatasetError(f"{out} holds other things than an export, so --force does not replace it.")
 
 
@@ -161,7 +167,7 @@ def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig, fps: in
     versions = {"openvima": __version__, "av": import_av().__version__, "pyarrow": pa.__version__}
     settings = {"tasks": config.tasks, "fps": fps, "pixels": config.pixels}
     write_json(
-        folder / layout.SOURCE_PATH,
+        folder / SOURCE_PATH,
         {
             "command": "openvima data export-lerobot",
             "config": settings,
@@ -172,4 +178,4 @@ def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig, fps: in
     index = dataset.index.select(["task", "level", "seed", "content_hash"])
     numbers = pa.array(range(index.num_rows), pa.int64())
     index = index.add_column(0, "episode_index", numbers)
-    pq.write_table(index, folder / layout.SOURCE_EPISODES_PATH, compression="snappy")
+    pq.write_table(index, folder / SOURCE_EPISODES_PATH, compression="snappy")

@@ -1,37 +1,297 @@
-"""Converting the published data set to shards, the same bytes whatever the number of workers."""
+"""Names that differ between the published files and this package, and names that neither knows."""
 
+import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple, Protocol
 
 from openvima.atomic_io import NO_SPACE, atomic_write_file, folder_lock
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import BROKEN_NAME, MANIFEST_NAME, finish_folder
-from openvima.data.published.episode import ASSETS, DOMAIN, LEVEL, package_versions
-from openvima.data.published.reader import (
-    Broken,
-    EpisodePlace,
-    PublishedData,
-    Source,
-    open_source,
-    read_place,
+from openvima.data.manifest import (
+    BROKEN_NAME,
+    MANIFEST_NAME,
+    clear,
+    finish_folder,
+    is_finished,
+    remove_leftovers,
+    storage_error,
 )
-from openvima.data.resuming import clear, is_finished, remove_leftovers, storage_error
-from openvima.data.shard import Shard
-from openvima.data.writer import ShardWriter
-from openvima.errors import ConfigError, DatasetError
-from openvima.input_files import settle
-from openvima.multiprocess import MAX_WORKERS, Counts, imap_with_progress
+from openvima.data.published_episode import ASSETS, DOMAIN, LEVEL, demonstration_of, package_versions
+from openvima.data.published_sources import EpisodeFolders, ZipArchive
+from openvima.data.records import Demonstration
+from openvima.data.shard import Shard, ShardWriter
+from openvima.errors import ConfigError, DatasetError, MemberError, unknown_name
+from openvima.input_files import as_path, names_of, settle
+from openvima.multiprocess import MAX_WORKERS, Counts, Report, imap_with_progress
+from openvima.tasks import list_tasks, task_spec
+
+Split = Literal["train", "validation"]
+
+# Folder names of the published files and of older ones, and what the tasks are called today.
+OLD_TASK_NAMES = {
+    "simple_manipulation": "visual_manipulation",
+    "same_profile": "same_shape",
+    "same_color": "same_texture",
+    "sweep": "sweep_without_exceeding",
+}
+# The authors advise 600,000 episodes for training and 50,000 for validation, but list neither.
+_NUM_FOLDS = 13
+
+
+def todays_task(folder_name: str) -> str | None:
+    """Return the name of the task whose episodes a folder holds; None if there is no such task."""
+    name = OLD_TASK_NAMES.get(folder_name, folder_name)
+    return name if name in list_tasks() else None
+
+
+def split_of(task: str, episode_id: str) -> Split:
+    """Tell whether an episode is for training or for validation, 12 to 1 and always the same.
+
+    Args:
+        task: Today's name of the task.
+        episode_id: Name of the episode's folder, such as "000123".
+    """
+    digest = hashlib.sha256(f"{task}/{int(episode_id):06d}".encode()).digest()
+    return "validation" if int.from_bytes(digest[:8], "big") % _NUM_FOLDS == 0 else "train"
+
+
+SPLITS = ("all", "train", "validation")
+
+
+class EpisodeKey(NamedTuple):
+    """Names one episode.
+
+    Args:
+        task: Today's name of the task.
+        id: Name of the episode's folder, such as "000123".
+    """
+
+    task: str
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """An episode, or a folder of them, that cannot be read.
+
+    Args:
+        member: Its folder, such as "rotate/000123".
+        reason: Why.
+    """
+
+    member: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodePlace:
+    """Where an episode lies.
+
+    Args:
+        key: Its name.
+        folder: Its folder below that of all tasks, such as "same_profile/000123".
+        place: For the archive or folder that holds it.
+    """
+
+    key: EpisodeKey
+    folder: str
+    place: Any
+
+
+class Source(Protocol):
+    """An archive, or folders."""
+
+    path: Path
+
+    def digest(self) -> str:
+        """Return 32 hexadecimal digits that stand for the content."""
+        ...
+
+    def episodes(self) -> Mapping[str, Any]:
+        """Return the folders of all episodes, and their places."""
+        ...
+
+    def files(self, place: Any) -> Mapping[str, bytes]:
+        """Return the files of an episode."""
+        ...
+
+
+class PublishedData(Sequence[Demonstration]):
+    """The data set that the benchmark's authors published, or one that their generator wrote.
+
+    It is read where it is: nothing is unpacked, and nothing in a file is ever run. Both generations are read,
+    also side by side: old and new names of tasks and packages, positions with and without height. Objects can
+    be sent to other processes: they open files anew.
+
+    Args:
+        path: The zip archive, or a folder with unpacked episodes `…/TASK/ID/`.
+        tasks: Keep the episodes of these tasks only; None keeps all.
+        split: "all", or one of two splits: "train" (twelve thirteenths, by a hash of task and id) or
+            "validation".
+
+    Raises:
+        DatasetError: There are no episodes, the archive is damaged, or it lacks a task.
+        ConfigError: There is no such split.
+
+    Example:
+        >>> data = PublishedData("vima.zip")
+        >>> data.keys[0]
+        EpisodeKey(task='follow_order', id='000000')
+        >>> data.read("follow_order", "000000").prompt.text
+        'Stack objects in this order {frame_0} {frame_1} {frame_2}.'
+    """
+
+    def __init__(
+        self, path: str | Path, *, tasks: str | Sequence[str] | None = None, split: str = "all"
+    ) -> None:
+        if split not in SPLITS:
+            raise ConfigError(unknown_name("split", split, SPLITS))
+        self.path = as_path(path)
+        self.tasks = None if tasks is None else names_of(tasks)
+        self.split = split
+        self._source = open_source(self.path)
+        places, self.broken_folders = _sorted_places(self._source)
+        if self.tasks is not None:
+            places = _of_tasks(places, self.tasks, self.path)
+        self.places = tuple(place for place in places if split in ("all", split_of(*place.key)))
+        if not self.places:
+            raise DatasetError(
+                f"{self.path} holds no episodes; give vima.zip, or the folder it was unpacked to."
+            )
+        self._index_of: dict[EpisodeKey, int] = {}
+
+    @property
+    def keys(self) -> tuple[EpisodeKey, ...]:
+        """Task and id of all episodes, sorted."""
+        return tuple(place.key for place in self.places)
+
+    def digest(self) -> str:
+        """Return 32 hexadecimal digits that stand for the archive, or for the episodes' names in folders."""
+        return self._source.digest()
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __getitem__(self, index: int) -> Demonstration:  # type: ignore[override]  # no slices
+        return self._read(self.places[index])
+
+    def read(self, task: str, episode_id: str) -> Demonstration:
+        """Read one episode.
+
+        Args:
+            task: Old or new name of the task.
+            episode_id: Name of its folder, such as "000123".
+
+        Raises:
+            DatasetError: There is no such episode.
+            MemberError: It is broken; the message names archive, file and reason.
+        """
+        if not self._index_of:
+            self._index_of = {place.key: index for index, place in enumerate(self.places)}
+        key = EpisodeKey(todays_task(task) or task, episode_id)
+        if key not in self._index_of:
+            raise DatasetError(
+                f"{self.path} has no episode {task}/{episode_id}; its ids have gaps, see `keys`."
+            )
+        return self._read(self.places[self._index_of[key]])
+
+    def demonstrations(
+        self, task: str | None = None, on_broken: Callable[[Broken], None] | None = None
+    ) -> Iterator[Demonstration]:
+        """Read all episodes that are whole.
+
+        Args:
+            task: Those of this task only; old or new name.
+            on_broken: Called with each one that is not.
+        """
+        wanted = None if task is None else todays_task(task) or task
+        for place in self.places:
+            if wanted not in (None, place.key.task):
+                continue
+            found = read_place(self._source, place)
+            if isinstance(found, Demonstration):
+                yield found
+            elif on_broken is not None:
+                on_broken(found)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopened, (self.path, self.tasks, self.split)
+
+    def _read(self, place: EpisodePlace) -> Demonstration:
+        found = read_place(self._source, place)
+        if isinstance(found, Broken):
+            raise MemberError(f"{self.path}: {found.member}: {found.reason}")
+        return found
+
+
+def open_source(path: Path) -> Source:
+    """Open a zip archive or a folder.
+
+    Raises:
+        DatasetError: It is neither.
+    """
+    if path.is_dir():
+        return EpisodeFolders(path)
+    if not path.is_file():
+        raise DatasetError(
+            f"there is no file or folder {path}; give vima.zip, or the folder it was unpacked to."
+        )
+    return ZipArchive(path)
+
+
+def read_place(source: Source, place: EpisodePlace) -> Demonstration | Broken:
+    """Read one episode, or say what is wrong with it."""
+    try:
+        return demonstration_of(source.files(place.place), task=place.key.task, folder=place.folder)
+    except MemberError as error:
+        return Broken(place.folder, str(error))
+
+
+def _reopened(path: Path, tasks: tuple[str, ...] | None, split: str) -> PublishedData:
+    return PublishedData(path, tasks=tasks, split=split)
+
+
+def _sorted_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]]:
+    """All episodes of known tasks by task and id, and the folders of others."""
+    places: dict[EpisodeKey, tuple[str, EpisodePlace]] = {}
+    todays: dict[str, str | None] = {}
+    for path, place in source.episodes().items():
+        parent, _, episode_id = path.rpartition("/")
+        if parent not in todays:
+            todays[parent] = todays_task(parent.rpartition("/")[2])
+        task = todays[parent]
+        if task is None:
+            continue
+        key = EpisodeKey(task, episode_id)
+        if key in places:
+            raise DatasetError(f"{source.path} holds {task} {episode_id} twice: {places[key][0]} and {path}.")
+        folder = f"{parent.rpartition('/')[2]}/{episode_id}"
+        places[key] = path, EpisodePlace(key, folder, place)
+    strange = sorted(parent for parent, task in todays.items() if task is None)
+    unknown = "there is no task of that name, so its episodes are left out."
+    return [places[key][1] for key in sorted(places)], tuple(Broken(parent, unknown) for parent in strange)
+
+
+def _of_tasks(places: Sequence[EpisodePlace], tasks: Sequence[str], path: Path) -> list[EpisodePlace]:
+    present = {place.key.task for place in places}
+    wanted = set()
+    for task in tasks:
+        name = todays_task(task) or task_spec(task).name
+        if name not in present:
+            raise DatasetError(
+                f"{path} has no episodes of {name}; it has {', '.join(sorted(present)) or 'none'}."
+            )
+        wanted.add(name)
+    return [place for place in places if place.key.task in wanted]
+
 
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set
 SHARD_SIZE = 1000  # episodes read; broken ones leave their shard smaller
 _NUM_PROBES = 3  # episodes of each task
-
-Report = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +453,7 @@ def write_block(block: Block, count: Callable[..., None]) -> list[Broken]:
     return broken
 
 
-def _read(path: Path, places: Sequence[EpisodePlace]) -> Iterator[Any]:  # Any: Demonstration or Broken
+def _read(path: Path, places: Sequence[EpisodePlace]) -> Iterator[Any]:
     source: Source = open_source(path)
     return (read_place(source, place) for place in places)
 

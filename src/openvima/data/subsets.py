@@ -1,0 +1,469 @@
+"""Data sets derived from others: sample, split and merge.
+
+Episodes are selected by a hash of their identity, never by their position: the selection is the same for any
+order of the episodes, on every machine, and with or without images.
+"""
+
+import hashlib
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+
+from openvima.atomic_io import atomic_folder, folder_lock
+from openvima.data.derived import ShardPart, check_out, number_shards, provenance, write_shards
+from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import finish_folder
+from openvima.data.planning import LARGEST_SHARD
+from openvima.data.reader import Dataset, select_tasks
+from openvima.env.config import EnvConfig
+from openvima.errors import ConfigError, DatasetError, unknown_name
+from openvima.input_files import as_path, names_of, settle
+from openvima.multiprocess import Report
+from openvima.tasks.prompts import MULTIMODAL
+
+Duplicates = Literal["refuse", "skip"]
+
+_SPLIT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_ROUNDING = 1e-6  # tolerance of the sum of fractions
+_NUM_NAMED = 3  # duplicates that a message names
+
+
+@dataclass(frozen=True, slots=True)
+class Splits:
+    """Splits of a data set.
+
+    Args:
+        fractions: Name to fraction; the fractions add up to 1.
+
+    Raises:
+        ConfigError: They do not, or a name cannot be that of a folder.
+    """
+
+    fractions: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        problems = []
+        for name, fraction in self.fractions.items():
+            if not _SPLIT_NAME.fullmatch(name):
+                problems.append(f"split {name!r} needs a name of letters, digits, '_' and '-'.")
+            if not 0 < fraction < 1:
+                problems.append(f"split {name!r} has the fraction {fraction}; it must lie between 0 and 1.")
+        total = sum(self.fractions.values())
+        if not problems and abs(total - 1) > _ROUNDING:
+            problems.append(f"the fractions add up to {total:g}; they must add up to 1.")
+        if problems:
+            raise ConfigError(" ".join(problems))
+
+
+def parse_splits(text: str) -> Splits:
+    """Parse splits from the command line.
+
+    Args:
+        text: Such as "training=0.923,validation=0.077".
+
+    Raises:
+        ConfigError: It is not of that form.
+    """
+    fractions: dict[str, float] = {}
+    for entry in text.split(","):
+        name, _, fraction = (word.strip() for word in entry.partition("="))
+        try:
+            number = float(fraction)
+        except ValueError:
+            raise ConfigError(
+                f"splits are {text!r}; give names and fractions such as training=0.923,validation=0.077."
+            ) from None
+        if name in fractions:
+            raise ConfigError(f"split {name!r} is named twice.")
+        fractions[name] = number
+    return Splits(fractions)
+
+
+@dataclass(frozen=True, slots=True)
+class SubsetConfig:
+    """What to take from where, and how to write it.
+
+    Args:
+        source: The data set.
+        out: The folder to write.
+        tasks: Take the episodes of these tasks only; None takes all.
+        seed: Another one gives another choice.
+        compression: Codec of the new shards, "lz4" or "zstd"; None keeps that of the source.
+        workers: Number of processes.
+        force: Replace a data set that is in the folder.
+    """
+
+    source: Path
+    out: Path
+    tasks: tuple[str, ...] | None = None
+    seed: int = 0
+    compression: str | None = None
+    workers: int = 1
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        settle(self, paths=("source", "out"), names=("tasks",))
+
+    def settings(self, dataset: Dataset) -> dict[str, Any]:
+        """Return what decides the content, without paths."""
+        return {
+            "source": provenance(dataset.manifest),
+            "tasks": None if self.tasks is None else sorted(self.tasks),
+            "seed": self.seed,
+            "compression": self.compression,
+        }
+
+
+def sample(
+    config: SubsetConfig,
+    fraction: float | None = None,
+    *,
+    episodes: int | None = None,
+    report: Report | None = None,
+) -> Path:
+    """Sample a data set: the same fraction, or the same number of episodes, of each task.
+
+    Samples of the same data and seed are nested: the 1 % sample is a subset of the 10 % sample. Records are
+    copied with their content hashes and their lists of skipped seeds.
+
+    Args:
+        config: What to read and write.
+        fraction: Above 0, at most 1; of each task round(fraction × episodes), but at least one.
+        episodes: Instead of a fraction: so many of each task, or all that it has.
+        report: Called with episodes written, episodes in all, and a note.
+
+    Returns:
+        The folder; its bytes do not depend on the number of workers.
+
+    Raises:
+        DatasetError: The source is no finished data set, or the folder cannot be used.
+        ShardError: The source is damaged.
+        ConfigError: Neither or both of fraction and number are given, or one is out of range.
+    """
+    if (fraction is None) == (episodes is None):
+        raise ConfigError("give either a fraction or a number of episodes.")
+    check_out(config.out, [config.source], force=config.force)
+    dataset = Dataset(config.source)
+    chosen = select_sample(dataset.index, config.seed, fraction=fraction, episodes=episodes)
+    chosen &= select_tasks(dataset.index, config.tasks, dataset.path)
+    size = {"fraction": fraction} if episodes is None else {"episodes": episodes}
+    settings = {**config.settings(dataset), **size}
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
+        _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
+    return config.out
+
+
+def split(config: SubsetConfig, splits: Splits, *, report: Report | None = None) -> Path:
+    """Split a data set: each episode goes to exactly one split.
+
+    Which one follows from the episode and the seed alone, so it stays there when episodes are added. The
+    sizes of the splits therefore come close to the fractions without meeting them.
+
+    Args:
+        config: What to read and write.
+        splits: Names and fractions.
+        report: Called with episodes written, episodes in all, and a note.
+
+    Returns:
+        The folder, with one data set per split.
+
+    Raises:
+        DatasetError: The source is not finished, a split would be empty, or the folder cannot be used.
+        ShardError: The source is damaged.
+    """
+    check_out(config.out, [config.source], force=config.force)
+    dataset = Dataset(config.source)
+    wanted = select_tasks(dataset.index, config.tasks, dataset.path)
+    chosen = {name: mask & wanted for name, mask in assign_splits(dataset.index, splits, config.seed).items()}
+    empty = [name for name, mask in chosen.items() if not mask.any()]
+    if empty:
+        raise DatasetError(
+            f"of {wanted.sum()} episodes none would fall into split {', '.join(empty)}. "
+            "Give it a larger fraction, or another --seed."
+        )
+    settings = {**config.settings(dataset), "splits": dict(splits.fractions)}
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
+        subsets = [
+            _Subset(folder / name, mask, "openvima data split", {**settings, "split": name})
+            for name, mask in chosen.items()
+        ]
+        _write(subsets, dataset, config, report)
+    return config.out
+
+
+def select_sample(
+    index: pa.Table, seed: int, *, fraction: float | None = None, episodes: int | None = None
+) -> np.ndarray:
+    """Select episodes of each task; samples of the same seed are nested.
+
+    Args:
+        index: The episodes.
+        seed: Seed of the sample.
+        fraction: As in `sample`.
+        episodes: As in `sample`.
+
+    Returns:
+        Whether each episode is selected, shape (N,), bool.
+
+    Raises:
+        ConfigError: The fraction or the number is out of range.
+    """
+    if fraction is not None and not 0 < fraction <= 1:
+        raise ConfigError(f"fraction is {fraction}; it must lie above 0 and not above 1.")
+    if episodes is not None and episodes < 1:
+        raise ConfigError(f"episodes is {episodes}; it must be at least 1.")
+    hashes = _hash_episodes(index, "sample", seed)
+    # Where hashes tie, as for one seed in two setups, the content decides.
+    tie_breaks = np.array(index.column("content_hash").to_pylist(), dtype=str)
+    tasks = np.array(index.column("task").to_pylist(), dtype=str)
+    chosen = np.zeros(len(tasks), bool)
+    for task in sorted(set(tasks.tolist())):
+        of_task = np.flatnonzero(tasks == task)
+        order = np.lexsort((tie_breaks[of_task], hashes[of_task]))
+        count = episodes if fraction is None else max(1, round(fraction * len(of_task)))
+        chosen[of_task[order[:count]]] = True
+    return chosen
+
+
+def assign_splits(index: pa.Table, splits: Splits, seed: int) -> dict[str, np.ndarray]:
+    """Assign each episode to a split.
+
+    The assignment is independent of other episodes: it stays when episodes are added, and sizes match the
+    fractions approximately.
+
+    Args:
+        index: The episodes.
+        splits: Names and fractions.
+        seed: Seed of the assignment.
+
+    Returns:
+        For each split, whether each episode is in it, shape (N,), bool; each episode is in exactly one.
+    """
+    # Unrelated to the hash of samples; otherwise small samples would all be in the first split.
+    places = _hash_episodes(index, "split", seed) / 2.0**64
+    bounds = [0.0, *itertools.accumulate(splits.fractions.values())]
+    bounds[-1] = np.inf
+    return {
+        name: (low <= places) & (places < high)
+        for name, (low, high) in zip(splits.fractions, itertools.pairwise(bounds), strict=True)
+    }
+
+
+def _hash_episodes(index: pa.Table, purpose: str, seed: int) -> np.ndarray:
+    """Hash each episode to 64 bits, shape (N,), uint64."""
+    columns = [index.column(name).to_pylist() for name in ("task", "level", "domain", "seed")]
+    digests = b"".join(
+        hashlib.blake2b("\n".join(map(str, (purpose, seed, *key))).encode(), digest_size=8).digest()
+        for key in zip(*columns, strict=True)
+    )
+    return np.frombuffer(digests, dtype="<u8")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Subset:
+    """One data set to write: its folder, which episodes it has, and what its manifest says."""
+
+    folder: Path
+    mask: np.ndarray
+    command: str
+    settings: dict[str, Any]
+
+
+def _write(subsets: Sequence[_Subset], dataset: Dataset, config: SubsetConfig, report: Report | None) -> None:
+    plans = []
+    for subset in subsets:
+        subset.folder.mkdir(exist_ok=True)
+        parts = _group(dataset, np.flatnonzero(subset.mask).tolist(), config.compression)
+        plans.append(number_shards(subset.folder, parts))
+    write_shards([shard for plan in plans for shard in plan], config.workers, report)
+    for subset, plan in zip(subsets, plans, strict=True):
+        finish_folder(
+            subset.folder,
+            [shard.path for shard in plan],
+            command=subset.command,
+            config=subset.settings,
+            versions=dataset.manifest["versions"],
+            licence=dataset.manifest["licence"],
+        )
+
+
+def _group(dataset: Dataset, episodes: Sequence[int], compression: str | None) -> list[ShardPart]:
+    """Divide chosen episodes, ascending, into shards of equal settings."""
+    commons: dict[str, tuple[tuple[str | bytes, ...], ShardInfo]] = {}  # of each source shard
+    groups: dict[tuple[str | bytes, ...], tuple[ShardInfo, list[int]]] = {}
+    for episode_index in episodes:
+        name, _ = dataset.locate(episode_index)
+        if name not in commons:
+            info = dataset.shard(name).info
+            codec = compression or info.compression
+            common = replace(info, number=0, shard_size=0, first_seed=0, compression=codec)
+            commons[name] = (info.task, info.level, *common.to_metadata().values()), common
+        key, common = commons[name]
+        groups.setdefault(key, (common, []))[1].append(episode_index)
+    return [
+        ShardPart(info, dataset, members[start : start + LARGEST_SHARD])
+        for _, (info, members) in sorted(groups.items())
+        for start in range(0, len(members), LARGEST_SHARD)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class MergeConfig:
+    """What to put together, and how.
+
+    Args:
+        sources: The data sets; their order does not matter.
+        out: The folder to write.
+        tasks: Take the episodes of these tasks only; None takes all.
+        duplicates: What to do with episodes that several sources hold: "refuse", or "skip" all but one.
+        compression: Codec of the new shards, "lz4" or "zstd"; None keeps those of the sources.
+        workers: Number of processes.
+        force: Replace a data set that is in the folder.
+    """
+
+    sources: tuple[Path, ...]
+    out: Path
+    tasks: tuple[str, ...] | None = None
+    duplicates: Duplicates = "refuse"
+    compression: str | None = None
+    workers: int = 1
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        settle(self, paths=("out",), names=("tasks",))
+        object.__setattr__(self, "sources", tuple(map(as_path, names_of(self.sources))))
+
+
+def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
+    """Put data sets together, of whatever tasks, levels, settings and versions.
+
+    Each shard says what its rows have in common, so it is copied byte for byte under a new number. Only
+    where another compression is asked for or episodes are skipped are shards written anew.
+
+    Args:
+        config: What to read and write.
+        report: Called with episodes written, episodes in all, and a note.
+
+    Returns:
+        The folder; its bytes do not depend on the order of the sources or the number of workers.
+
+    Raises:
+        DatasetError: A source is no finished data set, an episode occurs more than once, or the folder cannot
+            be used.
+        ShardError: A source is damaged.
+    """
+    if not config.sources:
+        raise DatasetError("there is nothing to merge; name at least one data set.")
+    check_out(config.out, config.sources, force=config.force)
+    datasets = sorted(map(Dataset, config.sources), key=lambda dataset: dataset.manifest["checksum"])
+    if config.tasks is not None:
+        _check_tasks(datasets, config.tasks)
+    parts = _find_shards(datasets, config.tasks)
+    if not parts:
+        raise DatasetError("the sources hold no episodes, so there is nothing to merge.")
+    parts = _skip_duplicates(parts, refuse=config.duplicates == "refuse")
+    settings = {
+        "sources": [provenance(dataset.manifest) for dataset in datasets],
+        "tasks": None if config.tasks is None else sorted(config.tasks),
+        "duplicates": config.duplicates,
+        "compression": config.compression,
+    }
+    manifests = [dataset.manifest for dataset in datasets]
+    packages = sorted({name for manifest in manifests for name in manifest["versions"]})
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
+        shards = number_shards(folder, [_choose_copy(part, config.compression) for part in parts])
+        write_shards(shards, config.workers, report)
+        finish_folder(
+            folder,
+            [shard.path for shard in shards],
+            command="openvima data merge",
+            config=settings,
+            versions={name: _join([m["versions"].get(name) for m in manifests], ", ") for name in packages},
+            licence=_join([manifest["licence"] for manifest in manifests], " AND "),  # an SPDX expression
+        )
+    return config.out
+
+
+def _check_tasks(datasets: Sequence[Dataset], tasks: Sequence[str]) -> None:
+    present = sorted({task for dataset in datasets for task in dataset.manifest["tasks"]})
+    if not tasks:
+        raise DatasetError(f"no task is named; the sources have {', '.join(present)}.")
+    for task in tasks:
+        if task not in present:
+            raise DatasetError(unknown_name("task in the sources called", task, present))
+
+
+def _find_shards(datasets: Sequence[Dataset], tasks: Sequence[str] | None) -> list[ShardPart]:
+    """Return the shards of the sources with their episodes, in the order of the merged data set."""
+    found = []
+    for dataset in datasets:
+        names, shard_of = np.unique(dataset.index.column("shard").to_pylist(), return_inverse=True)
+        seeds = dataset.index.column("seed").to_numpy()
+        task_of = np.array(dataset.index.column("task").to_pylist(), dtype=str)
+        wanted = np.ones(len(task_of), bool) if tasks is None else np.isin(task_of, tasks)
+        for number, name in enumerate(names.tolist()):
+            episodes = np.flatnonzero((shard_of == number) & wanted)
+            if len(episodes):
+                info, sha256 = dataset.shard(name).info, dataset.manifest["shards"][name]["sha256"]
+                # Of duplicates the first is kept: rather one with images than one without.
+                first_seed = int(seeds[episodes[0]])
+                order = (info.task, info.level, info.domain, first_seed, not info.images, sha256)
+                found.append((order, ShardPart(info, dataset, episodes.tolist(), name)))
+    return [part for _, part in sorted(found, key=lambda entry: entry[0])]
+
+
+def _skip_duplicates(parts: Sequence[ShardPart], *, refuse: bool) -> list[ShardPart]:
+    """Keep the first of all episodes of one name and setup.
+
+    Where only the prompts or task options of two setups differ, episodes of equal content count as of one.
+
+    Raises:
+        DatasetError: Some occur more than once, and they are refused.
+    """
+    setup_of_content: dict[tuple[EnvConfig, str], EnvConfig] = {}
+    folders: dict[tuple[Any, ...], Path] = {}  # name and setup to where it was first
+    kept, repeats, total = [], [], 0
+    for part in parts:
+        setup = part.info.env_config
+        common = replace(setup, prompts=MULTIMODAL, task_options="")
+        names = ("task", "level", "domain", "seed", "content_hash")
+        rows = part.dataset.index.select(names).take(part.episodes).to_pylist()
+        episodes = []
+        for episode_index, row in zip(part.episodes, rows, strict=True):
+            content = common, row.pop("content_hash")
+            key = *row.values(), setup_of_content.setdefault(content, setup)
+            if key not in folders:
+                folders[key] = part.dataset.path
+                episodes.append(episode_index)
+            else:
+                where = " and ".join(dict.fromkeys(map(str, (folders[key], part.dataset.path))))
+                repeats.append("{task} {level} {domain} seed {seed}".format(**row) + f" in {where}")
+        total += len(rows)
+        if episodes:
+            kept.append(replace(part, episodes=episodes))
+    if repeats and refuse:
+        more = "; …" if len(repeats) > _NUM_NAMED else ""
+        raise DatasetError(
+            f"{len(repeats)} of {total} episodes repeat others: {'; '.join(repeats[:_NUM_NAMED])}{more}. "
+            "Leave a source out, or keep one of each with --duplicates skip."
+        )
+    return kept
+
+
+def _choose_copy(part: ShardPart, compression: str | None) -> ShardPart:
+    """Copy a shard's file if all its episodes are wanted as they are; else a new one is written."""
+    num_episodes = part.dataset.manifest["shards"][part.original]["episodes"]
+    if len(part.episodes) == num_episodes and compression in (None, part.info.compression):
+        return part
+    info = replace(part.info, compression=compression or part.info.compression)
+    return replace(part, info=info, original="")
+
+
+def _join(words: Sequence[str | None], between: str) -> str:
+    return between.join(sorted({word for word in words if word}))

@@ -1,0 +1,679 @@
+"""Verifying a data folder: manifest, index, shards, object cache, and a sample of replayed episodes.
+
+Nothing is changed. What is damaged is named, with the command that makes it again.
+"""
+
+import hashlib
+import itertools
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from openvima.catalog.packs import load_assets
+from openvima.catalog.user_assets import recorded_assets
+from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import (
+    CACHE_FOLDER,
+    FAILED_FOLDER,
+    INDEX_NAME,
+    MANIFEST_NAME,
+    ShardSummary,
+    check_failed,
+    compose,
+    fingerprint,
+    index_parts,
+    is_inside,
+    joint_hash,
+    parse_index,
+    parse_manifest,
+    read_inside,
+    summarise,
+)
+from openvima.data.object_cache import CacheFile
+from openvima.data.planning import COMMAND, generate_command
+from openvima.data.preprocessed import PreprocessedEpisode, preprocess
+from openvima.data.reader import explain_missing
+from openvima.data.records import Demonstration, package_versions
+from openvima.data.replay import ReplayTask, replay_shard
+from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
+from openvima.data.shard import Envelope, Shard, map_file, remedy, spans_of
+from openvima.env.config import ENV_SETTINGS
+from openvima.errors import AssetError, ConfigError, DatasetError, OpenVimaError, ShardError, echo
+from openvima.input_files import as_path
+from openvima.multiprocess import Report, check_workers, imap_unordered
+from openvima.scene import (
+    ACTION_SHAPES,
+    BACKGROUND_ID,
+    END_EFFECTORS,
+    FIRST_OBJECT_ID,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+)
+from openvima.scene.command import PRIMITIVES
+from openvima.tasks.oracle import TIED_TO_TABLE
+from openvima.tasks.prompts import MULTIMODAL
+from openvima.user_code import is_code
+
+_PUBLISHED = "published"  # domain of imported demonstrations
+_MAX_ROWS_NAMED = 8
+_UNIT_TOLERANCE = 1e-3  # float32 quaternions of published data are off by up to 1e-7
+_KEY_COLUMNS = ("task", "level", "domain", "seed", "steps", "content_hash", "success")
+_NOT_AGAIN = "The files are intact, but another machine or other code wrote them. Generate them again."
+_CACHE_REMEDY = "Delete it; `openvima data preprocess` makes it again."
+_IN_ANY_CACHE = ("task", "seed", "end_effector", "actions")  # what depends on no detector
+
+
+@dataclass(frozen=True, slots=True)
+class VerifyConfig:
+    """Settings of a verification.
+
+    Args:
+        replay: Episodes of each task to replay in the simulator; None means all.
+        seed: Decides which episodes are replayed.
+        assets: Asset pack to replay with, as for `openvima generate`; None means the one of that name.
+        workers: Number of processes.
+
+    Raises:
+        ConfigError: A number is out of its range.
+    """
+
+    replay: int | None = 1
+    seed: int = 0
+    assets: str | None = None
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.replay is not None and self.replay < 0:
+            raise ConfigError(f"replay is {self.replay}; it must be 0 or more, or all.")
+        check_workers(self.workers)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Problem:
+    """A problem of one file.
+
+    Args:
+        file: Name of the file, relative to the data folder.
+        cause: What is wrong with it.
+        remedy: What to do.
+    """
+
+    file: str
+    cause: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.cause}. {self.remedy}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """Result of a verification.
+
+    Args:
+        folder: The data folder.
+        problems: All problems, by file.
+        notes: Remarks that are no problems.
+        num_shards: Shards that were checked.
+        num_episodes: Episodes that were decoded and compared with their content hashes.
+        num_replayed: Episodes that were replayed.
+        num_cache_files: Files of the object cache that were compared with the demonstrations.
+    """
+
+    folder: Path
+    problems: tuple[Problem, ...]
+    notes: tuple[str, ...] = ()
+    num_shards: int = 0
+    num_episodes: int = 0
+    num_replayed: int = 0
+    num_cache_files: int = 0
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether there are no problems."""
+        return not self.problems
+
+    def record(self) -> dict[str, Any]:
+        """Return everything as plain values."""
+        return {
+            "folder": str(self.folder),
+            "clean": self.is_clean,
+            "shards": self.num_shards,
+            "episodes": self.num_episodes,
+            "replayed": self.num_replayed,
+            "cache_files": self.num_cache_files,
+            "problems": [asdict(problem) for problem in self.problems],
+            "notes": list(self.notes),
+        }
+
+
+DEFAULT = VerifyConfig()
+
+
+def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | None = None) -> Verification:
+    """Find all problems of a data set; nothing is changed.
+
+    Args:
+        folder: Folder of demonstrations. Its `failed` episodes and its object cache are checked too.
+        config: How thoroughly to verify.
+        report: Called with episodes done, episodes in all, and the current stage.
+
+    Returns:
+        The result.
+
+    Raises:
+        DatasetError: There is no data set.
+        ConfigError: The assets are a function that is missing or fails.
+        WorkerError: A worker died.
+    """
+    folder = as_path(folder)
+    if config.assets is not None and is_code(config.assets):
+        load_assets(config.assets)
+    check_failed(folder)
+    found = _Verifier(folder, config, report).run()
+    failed = folder / FAILED_FOLDER
+    if not (failed / MANIFEST_NAME).is_file() and not any(failed.glob("*.arrow")):
+        return found
+    inner = _Verifier(failed, config, report).run()
+    problems = [replace(problem, file=f"{FAILED_FOLDER}/{problem.file}") for problem in inner.problems]
+    inner = replace(inner, problems=tuple(problems))
+    names = [field.name for field in fields(found) if field.name != "folder"]
+    both = replace(found, **{name: getattr(found, name) + getattr(inner, name) for name in names})
+    return replace(both, problems=tuple(sorted(both.problems)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ShardTask:
+    """A shard to check.
+
+    Args:
+        path: The file.
+        entry: Its entry in the manifest; None where that cannot be trusted.
+        index: Its part of the index; None where that cannot be trusted.
+        config: Settings of the manifest that all generated shards share; empty for others.
+        versions: Those of the manifest, for generated shards; empty for others.
+        is_failed: Whether it holds unsolved episodes.
+    """
+
+    path: Path
+    entry: dict[str, Any] | None
+    index: pa.Table | None
+    config: dict[str, Any]
+    versions: dict[str, str]
+    is_failed: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Checked:
+    """Result of checking a shard.
+
+    Args:
+        causes: What is wrong with it.
+        summary: Its part of index and manifest, as they should be; None if it is damaged.
+        info: Its metadata; None if unreadable.
+        num_episodes: Records that were decoded.
+    """
+
+    causes: Sequence[str]
+    summary: ShardSummary | None = None
+    info: ShardInfo | None = None
+    num_episodes: int = 0
+
+
+@dataclass(slots=True)
+class _Verifier:
+    """Verifies one folder, without the failed episodes in it."""
+
+    folder: Path
+    config: VerifyConfig
+    report: Report | None
+    manifest: dict[str, Any] | None = None  # None if it cannot be trusted
+    index: pa.Table | None = None  # likewise
+    problems: list[Problem] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def run(self) -> Verification:
+        """Check everything; later checks use what earlier ones have found to be whole."""
+        shards = sorted(path.name for path in self.folder.glob("*.arrow"))
+        if not shards and not (self.folder / MANIFEST_NAME).is_file():
+            raise DatasetError(explain_missing(self.folder))
+        self._read_manifest_and_index()
+        unlisted = "If a run was stopped, repeat its command; otherwise move the file elsewhere."
+        for name in shards if self.manifest is not None else ():
+            if name not in self.manifest["shards"]:
+                self._add(name, "the manifest does not list it", unlisted)
+        for path in sorted(self.folder.glob(".*.tmp")):
+            cause = "a process was killed while it wrote this, or is writing it. If not, delete it."
+            self.notes.append(f"{path}: {cause}")
+        tasks = self._shard_tasks(shards)
+        total = sum(0 if task.index is None else task.index.num_rows for task in tasks)
+        results = {task.path.name: found for task, found in self._map(check_shard, tasks, total, "comparing")}
+        checked = {task.path.name: results[task.path.name] for task in tasks}
+        for name, found in checked.items():
+            for cause in found.causes:
+                self._add(name, cause, self._remedy)
+        self._check_totals([found.summary for found in checked.values()])
+        num_replayed = self._replay(checked)
+        num_cache_files = self._check_cache(checked)
+        return Verification(
+            self.folder,
+            tuple(sorted(self.problems)),
+            tuple(self.notes),
+            num_shards=len(tasks),
+            num_episodes=sum(found.num_episodes for found in checked.values()),
+            num_replayed=num_replayed,
+            num_cache_files=num_cache_files,
+        )
+
+    @property
+    def _holds_failed(self) -> bool:
+        folder = self.folder.resolve()  # which has a name and a parent, even if "." was given
+        return folder.name == FAILED_FOLDER and (folder.parent / MANIFEST_NAME).is_file()
+
+    @property
+    def _is_generated(self) -> bool:
+        return self.manifest is not None and self.manifest["command"] == COMMAND
+
+    @property
+    def _remedy(self) -> str:
+        """What makes a file of the folder again."""
+        if self.manifest is None:
+            return "Delete it, or restore it from a copy, and repeat the command that wrote the folder."
+        if not self._is_generated:
+            command = echo(self.manifest["command"])
+            return f"Restore it from a copy, or delete the folder and write it again with `{command}`."
+        out = self.folder.parent if self._holds_failed else self.folder
+        keep_failed = self._holds_failed or (out / FAILED_FOLDER).is_dir()
+        command = generate_command(out, self.manifest["config"], keep_failed=keep_failed)
+        return f"Delete it and make it again: `{echo(command, len(command))}`"
+
+    def _add(self, file: str, cause: str, remedy: str) -> None:
+        self.problems.append(Problem(file, cause, remedy))
+
+    def _map(
+        self, job: Callable[..., Any], tasks: Sequence[Any], total: int, stage: str
+    ) -> Iterator[tuple[Any, Any]]:
+        report = self.report
+        watch = None if report is None else (lambda done: report(done, max(done, total), stage))
+        return imap_unordered(job, tasks, self.config.workers, report=watch)
+
+    def _read_manifest_and_index(self) -> None:
+        try:
+            self.manifest = parse_manifest(read_inside(self.folder / MANIFEST_NAME))
+        except FileNotFoundError:
+            self._add(MANIFEST_NAME, "it is missing", "Repeat the command that wrote the folder.")
+        except DatasetError as error:
+            self._add(MANIFEST_NAME, str(error), self._remedy)
+        try:
+            content = read_inside(self.folder / INDEX_NAME)
+            self.index = None if self.manifest is None else parse_index(content, self.manifest)
+        except FileNotFoundError:
+            self._add(INDEX_NAME, "it is missing", self._remedy)
+        except DatasetError as error:
+            self._add(INDEX_NAME, str(error), self._remedy)
+
+    def _shard_tasks(self, found: Sequence[str]) -> list[_ShardTask]:
+        """Return the manifest's shards in the order of the data set; without a manifest, all files."""
+        manifest, index = self.manifest, self.index
+        generated = manifest if manifest is not None and self._is_generated else {}
+        parts = {} if index is None else index_parts(index)
+        listed = found if manifest is None else [*parts, *sorted(manifest["shards"].keys() - parts.keys())]
+        return [
+            _ShardTask(
+                path=self.folder / name,
+                entry=None if manifest is None else manifest["shards"][name],
+                index=None if index is None else parts.get(name, index.slice(0, 0)),
+                config=generated.get("config", {}),
+                versions=generated.get("versions", {}),
+                is_failed=self._holds_failed,
+            )
+            for name in listed
+        ]
+
+    def _check_totals(self, found: Sequence[ShardSummary | None]) -> None:
+        """Compare whole shards with each other, and all together with index and manifest."""
+        summaries = [summary for summary in found if summary is not None]
+        first: dict[str, str] = {}
+        for summary in summaries:
+            hashes = summary.index.column("content_hash").to_pylist()
+            twice = []
+            for content_hash in hashes:
+                if content_hash in first:
+                    twice.append(first[content_hash])
+                first.setdefault(content_hash, summary.name)
+            if twice:
+                cause = f"{len(twice)} of its {len(hashes)} episodes are there twice, "
+                cause += f"the first of them also in {twice[0]}"
+                remedy = "Take one away, and repeat the command that wrote the folder."
+                self._add(summary.name, cause, remedy)
+        if self.manifest is None or len(summaries) < len(found):
+            return
+        index, expected = compose(summaries, {})
+        for key, value in expected.items():
+            if key != "shards" and self.manifest[key] != value:  # those were compared one by one
+                self._add(MANIFEST_NAME, f"{key!r} is not what the shards say", self._remedy)
+        if self.index is not None and not self.index.combine_chunks().equals(index):
+            cause = "it does not list what the shards hold, or not in this order"
+            self._add(INDEX_NAME, cause, self._remedy)
+
+    def _replay(self, checked: Mapping[str, _Checked]) -> int:
+        """Replay a sample of episodes; return their number."""
+        if self.config.replay == 0:
+            return 0
+        self.notes += _notes_on_origin(checked)
+        tasks = []
+        for task in self._replay_tasks(checked):
+            try:
+                recorded = task.assets == task.info.assets
+                tasks.append(replace(task, assets=recorded_assets(task.assets)) if recorded else task)
+            except AssetError as error:
+                self.notes.append(f"{task.path.name} cannot be replayed: {error}")
+        num_replayed, total = 0, sum(len(task.rows) for task in tasks)
+        for task, found in self._map(replay_shard, tasks, total, "replaying"):
+            name = task.path.name
+            if isinstance(found, str):
+                self.notes.append(f"{name} cannot be replayed: {found}")
+                continue
+            num_replayed += len(task.rows)
+            for cause in _by_cause(found, checked[name].num_episodes):
+                if others := _other_versions(task.info):
+                    self.notes.append(f"{name}, written by {others}, which may be why: replayed, {cause}")
+                else:
+                    self._add(name, f"replayed, {cause}", _NOT_AGAIN)
+        return num_replayed
+
+    def _replay_tasks(self, checked: Mapping[str, _Checked]) -> Iterator[ReplayTask]:
+        """Choose a pseudorandom sample of each task by hashes of content and seed."""
+        ranked: dict[str, list[tuple[bytes, str, int]]] = {}
+        for name, found in checked.items():
+            if found.summary is None or found.info is None or found.info.domain == _PUBLISHED:
+                continue
+            for row, content_hash in enumerate(found.summary.index.column("content_hash").to_pylist()):
+                rank = hashlib.sha256(f"{self.config.seed} {content_hash}".encode()).digest()
+                ranked.setdefault(found.info.task, []).append((rank, name, row))
+        chosen = [place for places in ranked.values() for place in sorted(places)[: self.config.replay]]
+        for name, places in itertools.groupby(sorted(chosen, key=lambda c: c[1:]), key=lambda c: c[1]):
+            info = checked[name].info
+            assert info is not None  # see above
+            is_recorded = self.config.assets is None or info.assets == "procedural"
+            assets = info.assets if is_recorded else self.config.assets
+            yield ReplayTask(self.folder / name, info, tuple(row for *_, row in places), assets)
+
+    def _check_cache(self, checked: Mapping[str, _Checked]) -> int:
+        """Compare the object cache with the demonstrations; return the number of files."""
+        tasks, total = [], 0
+        for name, found in sorted(checked.items()):
+            for path in sorted((self.folder / CACHE_FOLDER).glob(f"*/{name}")):
+                if found.summary is not None:
+                    content_hash = joint_hash(found.summary.index.column("content_hash"))
+                    tasks.append(_CacheTask(path, self.folder / name, content_hash))
+                    total += found.num_episodes
+        num_files = 0
+        for task, causes in self._map(check_cache_file, tasks, total, "comparing the object cache"):
+            num_files += causes is not None
+            for cause in causes or ():
+                self._add(str(task.path.relative_to(self.folder)), cause, _CACHE_REMEDY)
+        return num_files
+
+
+def check_shard(task: _ShardTask, count: Callable[[int], None]) -> _Checked:
+    """Check a shard; `count` is called with the number of episodes checked so far."""
+    if causes := list(_find_byte_faults(task)):
+        return _Checked(causes)
+    known = None if task.entry is None else {key: task.entry[key] for key in ("bytes", "sha256")}
+    try:
+        shard = Shard(task.path)
+        summary = summarise(task.path, known)
+    except ShardError as error:
+        return _Checked([_bare_cause(error, task.path)])
+    found = list(_find_record_faults(task, shard, count))
+    is_damaged = any(is_damage for _, _, is_damage in found)
+    causes = _by_cause(((row, cause) for row, cause, _ in found), len(shard))
+    causes += [*_find_setting_faults(task, shard.info), *_find_summary_faults(task, summary)]
+    return _Checked(causes, None if is_damaged else summary, shard.info, len(shard))
+
+
+def _bare_cause(error: OpenVimaError, path: Path) -> str:
+    """Return a reader's error message without file, record and remedy, which a problem adds."""
+    text = str(error).removesuffix(f" {remedy(path.parent)}").removesuffix(".")
+    return re.sub(rf"^{re.escape(str(path))}(, record \d+)?: (record \d+ of \d+ is )?", "", text)
+
+
+def _find_byte_faults(task: _ShardTask) -> Iterator[str]:
+    """Yield damage of the bytes, with its place."""
+    if not task.path.is_file():
+        yield "it is missing"
+    elif not is_inside(task.path):
+        yield "it is a link that leads out of the folder"
+    elif task.entry is not None:
+        found = fingerprint(task.path)
+        if (found["bytes"], found["sha256"]) == (task.entry["bytes"], task.entry["sha256"]):
+            return
+        content = memoryview(b"") if found["bytes"] == 0 else map_file(task.path)
+        places = [Envelope.from_entry(task.entry).fault_in(content)]
+        if task.index is not None:
+            broken = [row for row, span in enumerate(spans_of(task.index)) if span.fault_in(content)]
+            places += _by_cause(((row, "damaged") for row in broken), task.index.num_rows)
+        where = "; ".join(filter(None, places))
+        yield f"its bytes are not those that were written{f': {where}' if where else ''}"
+
+
+def _find_record_faults(
+    task: _ShardTask, shard: Shard, count: Callable[[int], None]
+) -> Iterator[tuple[int, str, bool]]:
+    """Yield row, fault, and whether damaged bytes are the cause."""
+    keys = shard.table(_KEY_COLUMNS).to_pylist()
+    for row, key in enumerate(keys):
+        try:
+            demo = shard[row]
+        except ShardError as error:
+            yield row, _bare_cause(error, shard.path), shard.info.images
+            continue
+        except OpenVimaError as error:  # the asset pack that its images need is not there
+            yield row, f"its images cannot be rendered: {error}", False
+            continue
+        # Rendered images were compared on reading.
+        if shard.info.images and demo.content_hash() != key["content_hash"]:
+            yield row, "its content hash is not that of its content", True
+        if demo.num_steps != key["steps"]:
+            yield row, "it does not have as many actions as steps", False
+        if task.config and demo.outcome.success == task.is_failed:
+            yield row, f"it is {'' if task.is_failed else 'not '}solved", False
+        if task.config and row and key["seed"] <= keys[row - 1]["seed"]:
+            yield row, "its seed does not follow that of the record before", False
+        yield from ((row, fault, False) for fault in find_faults(demo))
+        count(row + 1)
+
+
+def _find_setting_faults(task: _ShardTask, info: ShardInfo) -> Iterator[str]:
+    """Yield contradictions between a generated shard and the manifest."""
+    if not task.config:
+        return
+    settings = {"prompts": MULTIMODAL, "task_options": "", "control": PRIMITIVES, **task.config}
+    for name in ("level", "domain", *ENV_SETTINGS, "compression", "images"):
+        if name in settings and getattr(info, name) != settings[name]:
+            there, stated = str(getattr(info, name)) or "none", str(settings[name]) or "none"
+            yield f"{name} is {there}, in the manifest {stated}"
+    if info.versions != task.versions:
+        yield f"it was written by {info.versions}, says the manifest {task.versions}"
+    if task.path.name != info.file_name:
+        yield f"it says that it is {info.file_name}"
+
+
+def _find_summary_faults(task: _ShardTask, summary: ShardSummary) -> Iterator[str]:
+    """Yield contradictions of manifest and index with the shard."""
+    entry = task.entry or {}
+    if names := [key for key, value in entry.items() if summary.entry.get(key) != value]:
+        yield f"the manifest says otherwise of its {', '.join(names)}"
+    if task.index is not None:
+        here, there = summary.index.to_pydict(), task.index.to_pydict()
+        if names := [name for name in here if here[name] != there[name]]:
+            yield f"the index says otherwise of its {', '.join(names)}"
+
+
+def find_faults(demo: Demonstration) -> Iterator[str]:
+    """Yield violated invariants of a demonstration, wherever it comes from.
+
+    Args:
+        demo: The demonstration, with its images.
+    """
+    yield from _find_image_faults(demo)
+    yield from _find_action_faults(demo)
+    yield from _find_object_faults(demo)
+    yield from _find_scene_faults(demo)
+    if demo.end_effector not in END_EFFECTORS:
+        yield f"the end effector {demo.end_effector!r} does not exist"
+    if demo.outcome.success and demo.outcome.failure:
+        yield "it is both a success and a failure"
+    if demo.num_steps > demo.max_steps:
+        yield "it has more actions than steps are allowed"
+
+
+def _find_image_faults(demo: Demonstration) -> Iterator[str]:
+    num_seen = demo.num_steps + 1
+    first = FIRST_OBJECT_ID.get(demo.end_effector, 0)
+    known = {*range(first), BACKGROUND_ID, *(record.object_id for record in demo.objects)}
+    for view in VIEWS:
+        if demo.rgb[view].shape != (num_seen, 3, *IMAGE_SHAPE):
+            yield f"the {view} view does not have one image more than there are actions"
+        if demo.segm[view].shape != (num_seen, *IMAGE_SHAPE):
+            yield f"the {view} view does not have one segmentation more than there are actions"
+        counts = np.bincount(demo.segm[view].reshape(-1), minlength=1)
+        if not known.issuperset(np.flatnonzero(counts).tolist()):
+            yield f"the segmentation of the {view} view shows an object that is not in the scene"
+
+
+def _find_action_faults(demo: Demonstration) -> Iterator[str]:
+    low, high = (np.array(corner, np.float32) for corner in (WORKSPACE_LOW, WORKSPACE_HIGH))
+    for key in ACTION_SHAPES:
+        values = np.array([getattr(action, key) for action in demo.actions])
+        if not np.isfinite(values).all():
+            yield f"{key} is not a number"
+        elif demo.domain == _PUBLISHED or not len(values):
+            continue
+        elif key.endswith("position"):
+            if (values < low).any() or (values > high).any():
+                yield f"{key} lies outside the workspace"
+        elif (np.abs(np.linalg.norm(values, axis=-1) - 1) > _UNIT_TOLERANCE).any():
+            yield f"{key} is no unit quaternion"
+
+
+def _find_object_faults(demo: Demonstration) -> Iterator[str]:
+    ids = [record.object_id for record in demo.objects]
+    if len(set(ids)) < len(ids):
+        yield "two objects have the same id"
+    for name, own in (("pick_ids", {*ids, UNKNOWN_ID}), ("place_ids", {*ids, UNKNOWN_ID, TIED_TO_TABLE})):
+        values = getattr(demo, name)
+        if len(values) != demo.num_steps:
+            yield f"{name} does not have one id an action"
+        if not own.issuperset(values):
+            yield f"{name} names an object that is not in the scene"
+
+
+def _find_scene_faults(demo: Demonstration) -> Iterator[str]:
+    if demo.scenes and len(demo.scenes) != demo.num_steps + 1:
+        yield "the objects do not have one pose more than there are actions"
+    poses = [[*p.pose.position, *p.pose.quaternion] for scene in demo.scenes for p in scene.placements]
+    if not np.isfinite(np.array(poses)).all():
+        yield "a pose is not a number"
+    if demo.joint_paths and len(demo.joint_paths) != demo.num_steps:
+        yield "the arm does not have one path an action"
+    if not all(np.isfinite(path).all() for path in demo.joint_paths):
+        yield "a path of the arm is not a number"
+
+
+def _notes_on_origin(checked: Mapping[str, _Checked]) -> Iterator[str]:
+    infos = [(found.info, found.num_episodes) for found in checked.values() if found.info is not None]
+    if imported := sum(num for info, num in infos if info.domain == _PUBLISHED):
+        yield f"{imported} episodes are imported ones; these cannot be replayed."
+    others = {_other_versions(info) for info, _ in infos if info.domain != _PUBLISHED} - {""}
+    installed = ", ".join(f"{name} {version}" for name, version in package_versions().items())
+    for versions in sorted(others):
+        yield f"Written by {versions}; installed are {installed}. Only equal versions promise equal episodes."
+
+
+def _other_versions(info: ShardInfo) -> str:
+    """Name the versions that wrote a shard; empty if they are installed."""
+    wrote = info.versions
+    # The version of pyarrow decides bytes of files, not of episodes.
+    if all(wrote.get(name) == version for name, version in package_versions().items() if name != "pyarrow"):
+        return ""
+    return ", ".join(f"{name} {version}" for name, version in wrote.items())
+
+
+@dataclass(frozen=True, slots=True)
+class _CacheTask:
+    """A file of the object cache, the shard it was made from, and the joint hash of that shard's episodes."""
+
+    path: Path
+    shard: Path
+    content_hash: str
+
+
+def check_cache_file(task: _CacheTask, count: Callable[[int], None]) -> list[str] | None:
+    """Compare a cache file with what its shard gives now.
+
+    Detectors do not run again. Of what they found, only the fields that depend on no detector are compared.
+
+    Args:
+        task: The file.
+        count: Called with the number of episodes compared so far.
+
+    Returns:
+        Problems; None if the file is outdated, for then it is replaced before it is used.
+    """
+    try:
+        cached = CacheFile(task.path)
+    except ShardError as error:
+        return [str(error).removeprefix(f"{task.path} ").split(". ")[0]]
+    if cached.source != task.content_hash:
+        return None
+    shard = Shard(task.shard)
+    if len(cached) != len(shard):
+        return [f"it has {len(cached)} of {len(shard)} episodes"]
+    return _by_cause(_find_cache_differences(cached, shard, count), len(shard))
+
+
+def _find_cache_differences(
+    cached: CacheFile, shard: Shard, count: Callable[[int], None]
+) -> Iterator[tuple[int, str]]:
+    names = _IN_ANY_CACHE if cached.variant else [f.name for f in fields(PreprocessedEpisode)]
+    for row in range(len(shard)):
+        try:
+            ours, theirs = cached[row], preprocess(shard[row], cached.kind)
+        except OpenVimaError as error:
+            yield row, f"it cannot be compared: {error}"
+            continue
+        is_left_out = cached.variant and not ours.num_steps
+        is_equal = ours.prompt.text == theirs.prompt.text and _are_equal(ours, theirs, names)
+        if not is_left_out and not is_equal:
+            yield row, "it differs from the demonstration"
+        count(row + 1)
+
+
+def _are_equal(ours: Any, theirs: Any, names: Iterable[str]) -> bool:
+    """Compare some fields of two records, nested records field by field."""
+    pairs = [(getattr(ours, name), getattr(theirs, name)) for name in names]
+    return all(
+        _are_equal(a, b, [f.name for f in fields(a)]) if is_dataclass(a) else np.array_equal(a, b)
+        for a, b in pairs
+    )
+
+
+def _by_cause(faults: Iterable[tuple[int, str]], num_rows: int) -> list[str]:
+    """Group faults of records by cause: one text per cause, with the rows."""
+    rows: dict[str, list[int]] = {}
+    for row, cause in faults:
+        rows.setdefault(cause, []).append(row)
+    return [f"{cause} ({_list_rows(found)} of {num_rows})" for cause, found in rows.items()]
+
+
+def _list_rows(rows: list[int]) -> str:
+    shown = ", ".join(map(str, rows[:_MAX_ROWS_NAMED]))
+    more = f" and {len(rows) - _MAX_ROWS_NAMED} more" if len(rows) > _MAX_ROWS_NAMED else ""
+    return f"record{'s' if len(rows) > 1 else ''} {shown}{more}"
