@@ -291,7 +291,6 @@ CASES = (
         before=("generate --tasks rotate --episodes 1 --shard-size 2 --out out --keep-failed",),
     ),
     Case("data info demos --html out.html --appearance out.json", ("demos",)),
-    Case("data verify demos --repair", ("damaged",), named=("demos",)),
     Case("data merge demos others out", ("demos", "others")),
     Case("data merge demos others out --force", ("demos", "others"), before=("data merge demos out",)),
     Case("data sample demos out --fraction 0.5", ("demos",)),
