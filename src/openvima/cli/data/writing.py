@@ -1,0 +1,339 @@
+"""`openvima data merge`, `sample`, `split`, `import`, `preprocess`, `export-lerobot` and `push-to-hub`."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from openvima.cli.terminal import parse_list, parse_tasks, print_files, progress_bar
+
+Compression = Literal["lz4", "zstd"]
+
+
+def sample(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    *,
+    fraction: float | None = None,
+    episodes: int | None = None,
+    tasks: str = "all",
+    seed: int = 0,
+    compression: Compression | None = None,
+    workers: int = 1,
+    force: bool = False,
+) -> int:
+    """Sample a fraction, or a number, of the demonstrations of each task.
+
+    Samples of one seed are nested: the 1 % sample is a subset of the 10 % sample. Nothing in a demonstration
+    is changed.
+
+    Example: openvima data sample demos demos-1-percent --fraction 0.01
+
+    Args:
+        folder: The source.
+        out: Folder to write to.
+        fraction: Above 0, at most 1; at least one episode of each task is taken.
+        episodes: Instead of a fraction: so many episodes of each task, or all that it has.
+        tasks: Comma-separated names of tasks, or "all".
+        seed: Seed of the sample.
+        compression: Codec of the new files; by default that of the source.
+        workers: Number of processes.
+        force: Replace a data set in the folder.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.subsets import SubsetConfig
+    from openvima.data.subsets import sample as write_sample
+
+    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
+    with progress_bar("demonstrations") as report:
+        print(write_sample(config, fraction, episodes=episodes, report=report))
+    return 0
+
+
+def split(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    *,
+    splits: str,
+    tasks: str = "all",
+    seed: int = 0,
+    compression: Compression | None = None,
+    workers: int = 1,
+    force: bool = False,
+) -> int:
+    """Divide demonstrations into splits, such as for training and validation.
+
+    Each episode is assigned to one split by a hash and stays there when episodes are added. Sizes therefore
+    match the fractions approximately.
+
+    Example: openvima data split demos divided --splits training=0.923,validation=0.077
+
+    Args:
+        folder: The source.
+        out: Folder to write to, with one data set per split.
+        splits: Comma-separated NAME=FRACTION pairs; the fractions add up to 1.
+        tasks: Comma-separated names of tasks, or "all".
+        seed: Seed of the assignment.
+        compression: Codec of the new files; by default that of the source.
+        workers: Number of processes.
+        force: Replace data sets in the folder.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.subsets import SubsetConfig, parse_splits
+    from openvima.data.subsets import split as write_split
+
+    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
+    fractions = parse_splits(splits)
+    with progress_bar("demonstrations") as report:
+        written = write_split(config, fractions, report=report)
+    for name in fractions.fractions:
+        print(written / name)
+    return 0
+
+
+def merge(
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER… OUT")],
+    *,
+    tasks: str = "all",
+    duplicates: Literal["refuse", "skip"] = "refuse",
+    compression: Compression | None = None,
+    workers: int = 1,
+    force: bool = False,
+) -> int:
+    """Merge data sets, whatever their tasks, levels, settings and versions.
+
+    Files are copied byte for byte unless another compression is asked for or episodes are skipped.
+
+    Example: openvima data merge rotations stacks all-demos
+
+    Args:
+        folders: The sources, and last the folder to write to.
+        tasks: Comma-separated names of tasks, or "all".
+        duplicates: Refuse episodes that several sources contain, or skip all but one.
+        compression: Codec of the new files; by default those of the sources.
+        workers: Number of processes.
+        force: Replace a data set in the folder.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.subsets import MergeConfig
+    from openvima.data.subsets import merge as write_merged
+    from openvima.errors import ConfigError
+
+    if len(folders) < 2:
+        raise ConfigError("give at least two folders: what to merge, and last where to write it.")
+    config = MergeConfig(
+        folders[:-1], folders[-1], parse_tasks(tasks), duplicates, compression, workers, force
+    )
+    with progress_bar("demonstrations") as report:
+        print(write_merged(config, report=report))
+    return 0
+
+
+def import_published(
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    *,
+    tasks: str = "all",
+    split: Literal["all", "train", "validation"] = "all",
+    episodes: int | None = None,
+    compression: Literal["lz4", "zstd"] = "zstd",
+    workers: int = 1,
+    force: bool = False,
+) -> int:
+    """Convert the demonstrations that the benchmark's authors published; docs/published_data.md says how.
+
+    The zip archive is read where it is, without unpacking it, and nothing in it is run. Broken episodes are
+    left out and named in OUT/broken.json. Repeating a command that was interrupted continues it.
+
+    Example: openvima data import vima.zip published --workers 2
+
+    Args:
+        source: The zip archive, or a folder with unpacked episodes.
+        out: Folder to write to.
+        tasks: Old or new names of tasks with commas between them, or "all".
+        split: All episodes, or one of two splits: train (twelve thirteenths) or validation.
+        episodes: At most so many episodes of each task, the first ones; by default all.
+        compression: Codec of the files; lz4 takes twice the space and is read faster.
+        workers: Number of processes.
+        force: Delete the data set that is in OUT.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.manifest import BROKEN_NAME
+    from openvima.data.published import ImportConfig
+    from openvima.data.published import import_published as convert
+
+    config = ImportConfig(
+        source=source,
+        out=out,
+        tasks=parse_list(tasks),
+        split=split,
+        episodes=episodes,
+        compression=compression,
+        workers=workers,
+        force=force,
+    )
+    with progress_bar("episodes") as report:
+        folder = convert(config, report)
+    if (folder / BROKEN_NAME).is_file():
+        first, *others = json.loads((folder / BROKEN_NAME).read_text(encoding="utf-8"))
+        print(
+            f"{1 + len(others)} left out, see {folder / BROKEN_NAME}; "
+            f"first {first['member']}: {first['reason']}",
+            file=sys.stderr,
+        )
+    print(folder)
+    return 0
+
+
+def export_lerobot(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    *,
+    tasks: str = "all",
+    fps: int | None = None,
+    pixels: Literal["yuv444p", "yuv420p"] = "yuv444p",
+    data_file_mb: int = 100,
+    video_file_mb: int = 200,
+    force: bool = False,
+) -> int:
+    """Export demonstrations to the LeRobotDataset v3.0 format; docs/lerobot.md says what is in it.
+
+    Example: openvima data export-lerobot demos demos_lerobot --tasks rotate,twist
+
+    Args:
+        folder: Folder of demonstrations.
+        out: Folder of the export.
+        tasks: Names of tasks with commas between them, or "all".
+        fps: Frames a second, a power of two, by default 1; a frame is a step, which has no fixed duration of
+            its own. Demonstrations of low-level control have 10, their true rate, with a frame a command.
+        pixels: yuv444p keeps colours within 2 of 255 levels; yuv420p is what browsers and graphics cards
+            play, at half the resolution of colours.
+        data_file_mb: Size in MB below which the Parquet files stay.
+        video_file_mb: Size in MB below which the videos stay.
+        force: Replace the export that is in OUT.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.lerobot import LerobotConfig, export_lerobot
+
+    config = LerobotConfig(
+        data=folder,
+        out=out,
+        tasks=parse_tasks(tasks),
+        fps=fps,
+        pixels=pixels,
+        data_file_mb=data_file_mb,
+        video_file_mb=video_file_mb,
+        force=force,
+    )
+    with progress_bar("export") as report:
+        export_lerobot(config, report)
+    print(f'LeRobotDataset("local/{out.name}", root="{out}") opens it in LeRobot.', file=sys.stderr)
+    print(out)
+    return 0
+
+
+def preprocess(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    *,
+    kind: Literal["objects", "frames"] = "objects",
+    boxes: str | None = None,
+    fraction: float = 1.0,
+    rerendered: int | None = None,
+    out: Path | None = None,
+    workers: int = 1,
+) -> int:
+    """Write the object cache of a folder of demonstrations, or the shards that it lacks.
+
+    The cache holds the inputs of policies: crops and boxes of all objects, or whole frames at half the size.
+    `openvima train` writes it when it is missing; beforehand, several processes can share the work. It may be
+    deleted at any time. An interrupted command resumes after the last whole shard.
+
+    Example: openvima data preprocess demos --workers 2
+
+    Args:
+        folder: Folder of demonstrations.
+        kind: objects for presets with object tokens, frames for gato, flamingo and gpt.
+        boxes: Detector that extracts the objects, for `openvima train --loader.boxes`: "detector" for the
+            bundled one, detector=FOLDER for one trained with `openvima detector train`, or MODULE:FUNCTION or
+            FILE.py:FUNCTION, which returns an ObjectExtractor. Default: the segmentation.
+        fraction: Fraction of the demonstrations in which `boxes` detects objects, for `openvima train
+            --loader.detected-fraction`.
+        rerendered: Number of a random appearance, from 0, to render the demonstrations again with, for
+            `openvima train --loader.rerendered-prob`. Default: as they are stored.
+        out: Folder of the cache; default: "object_cache" in the folder of demonstrations.
+        workers: Number of processes.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.object_cache import open_object_cache
+    from openvima.data.reader import Dataset
+    from openvima.detector.plugins import detected_object_cache, plugged_boxes
+    from openvima.errors import ConfigError
+
+    if boxes is not None and kind == "frames":
+        raise ConfigError(f"boxes is {boxes!r}, but whole frames have none; leave --boxes or --kind out.")
+    if rerendered is not None and (boxes is not None or rerendered < 0):
+        raise ConfigError(f"rerendered is {rerendered}; it must be 0 or more, and without --boxes.")
+    if not 0 <= fraction <= 1 or (fraction < 1 and boxes is None):
+        raise ConfigError(
+            f"fraction is {fraction:g}; it must lie between 0 and 1, and needs --boxes below 1."
+        )
+    dataset = Dataset(folder)
+    with progress_bar("object cache") as report:
+        if boxes is None:
+            cache = open_object_cache(
+                dataset, kind, folder=out, appearance=rerendered, workers=workers, report=report
+            )
+        else:
+            cache = detected_object_cache(
+                dataset, plugged_boxes(boxes, fraction=fraction), folder=out, workers=workers, report=report
+            )
+    print(f"the object cache of {len(cache):,} demonstrations is ready.", file=sys.stderr)
+    print(cache.folder)
+    return 0
+
+
+def push_to_hub(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OWNER/NAME")],
+    *,
+    private: bool = False,
+    message: str = "",
+    dry_run: bool = False,
+) -> int:
+    """Push demonstrations to the Hugging Face Hub, with a generated dataset card.
+
+    The token is that of `hf auth login` or HF_TOKEN. Failed episodes and object caches are not pushed.
+
+    Example: openvima data push-to-hub demos owner/demos
+
+    Args:
+        folder: Folder of demonstrations.
+        name: The repository, as OWNER/NAME or OWNER/NAME@BRANCH; it is created if there is none.
+        private: Make a new repository private.
+        message: Of the commit.
+        dry_run: Print the card and list the files; nothing is sent.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.publishing.demonstrations import demonstrations_files, push_demonstrations
+
+    if dry_run:
+        print_files(demonstrations_files(folder, name))
+    else:
+        print(f"hf://{push_demonstrations(folder, name, private=private, message=message)}")
+    return 0
