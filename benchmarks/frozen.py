@@ -52,7 +52,8 @@ _FLOAT = re.compile(r"-?\d+\.\d+(?:e[+-]?\d+)?")
 def names(_: argparse.Namespace) -> dict[str, list[str]]:
     """Return the public names by package."""
     packages = [each.name for each in pkgutil.walk_packages(openvima.__path__, "openvima.") if each.ispkg]
-    modules = map(importlib.import_module, ["openvima", *packages])
+    recorded = json.loads(RECORD.read_text())["names"]  # some packages have become modules
+    modules = map(importlib.import_module, dict.fromkeys(["openvima", *packages, *recorded]))
     return {each.__name__: sorted(each.__all__) for each in modules if hasattr(each, "__all__")}
 
 

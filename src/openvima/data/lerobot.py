@@ -28,6 +28,8 @@ from openvima.multiprocess import Report
 from openvima.scene.command import CONTROL_HZ, END_EFFECTOR, PRIMITIVES
 from openvima.video.encoder import import_av
 
+__all__ = ["LerobotConfig", "export_lerobot", "frame_layout"]
+
 RATES = (1, 2, 4, 8, 16, 32, 64)
 
 

@@ -20,6 +20,8 @@ from openvima.render.camera import CAMERAS, View, project
 from openvima.scene import BACKGROUND_ID, Action, PromptImage
 from openvima.video.clips import png
 
+__all__ = ["write_page"]
+
 MAX_SAMPLES = 50  # of each task; a page with more is too large for a browser
 
 

@@ -28,6 +28,8 @@ from openvima.input_files import as_path, names_of, settle
 from openvima.multiprocess import MAX_WORKERS, Counts, Report, imap_with_progress
 from openvima.tasks import list_tasks, task_spec
 
+__all__ = ["Broken", "EpisodeKey", "ImportConfig", "PublishedData", "import_published"]
+
 Split = Literal["train", "validation"]
 
 # Folder names of the published files and of older ones, and what the tasks are called today.

@@ -27,6 +27,8 @@ from openvima.input_files import as_path, names_of, settle
 from openvima.multiprocess import Report
 from openvima.tasks.prompts import MULTIMODAL
 
+__all__ = ["MergeConfig", "Splits", "SubsetConfig", "merge", "parse_splits", "sample", "split"]
+
 Duplicates = Literal["refuse", "skip"]
 
 _SPLIT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")

@@ -59,6 +59,8 @@ from openvima.tasks.oracle import TIED_TO_TABLE
 from openvima.tasks.prompts import MULTIMODAL
 from openvima.user_code import is_code
 
+__all__ = ["Problem", "Verification", "VerifyConfig", "verify"]
+
 _PUBLISHED = "published"  # domain of imported demonstrations
 _MAX_ROWS_NAMED = 8
 _UNIT_TOLERANCE = 1e-3  # float32 quaternions of published data are off by up to 1e-7
