@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from openvima.data.hash_split import split_hashes
-from openvima.data.reader import Dataset
+from openvima.data.reader import Dataset, split_hashes
 from openvima.detector.checkpoint import load_detectron2, load_network, load_weights, write_network
 from openvima.detector.config import detector_config
 from openvima.detector.frames import Frame, FrameSampler, augment_frame, held_out_frames
