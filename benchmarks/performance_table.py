@@ -15,12 +15,13 @@ command: The command that measures it.
 commit:  The commit that was measured.
 against: Only for a ratio of two commits: the commit before, measured in the same run.
 
-The date is that of the file's name. Rows are in the order of the files, then of their entries.
+The date is that of the file's name. Rows are in the order of the files, then of their entries. Figures whose
+script no longer exists are left out.
 """
 
 import argparse
 import json
-from collections.abc import Callable
+import re
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -94,18 +95,23 @@ def _row(entry: dict, file: Path) -> Row:
 
 def page(results: Path) -> str:
     """Return docs/performance.md."""
-    return HEAD + "".join(f"{row.cells(file)}\n" for row, file in read_rows(results).values())
+    rows = [(row, file) for row, file in read_rows(results).values() if _can_be_repeated(row)]
+    return HEAD + "".join(f"{row.cells(file)}\n" for row, file in rows)
 
 
-def write_page(about: str | None, page: Callable[[Path], str], out: Path) -> None:
-    """Run a command that writes a page which is made from a folder of results."""
+def _can_be_repeated(row: Row) -> bool:
+    return all((ROOT / script).exists() for script in re.findall(r"benchmarks/\w+\.py", row.command))
+
+
+def main() -> None:
+    """Write the page."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=about, formatter_class=raw)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--results", type=Path, default=ROOT / "results", help="folder of results")
-    parser.add_argument("--out", type=Path, default=out, help="file to write")
+    parser.add_argument("--out", type=Path, default=PAGE, help="file to write")
     options = parser.parse_args()
     options.out.write_text(page(options.results), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    write_page(__doc__, page, PAGE)
+    main()

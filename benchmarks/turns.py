@@ -1,7 +1,7 @@
 """How much faster this commit is than another: both do the same work in turns, each in a process of its own.
 
     python benchmarks/turns.py --base CHECKOUT [--base-python PYTHON] [--seeds N] [--repeats N] [--json FILE]
-    python benchmarks/turns.py --base CHECKOUT --data DIR [--repeats N] [--json FILE]
+    python benchmarks/turns.py --base CHECKOUT --data DIR [--presets NAME,…] [--repeats N] [--json FILE]
 
 CHECKOUT is another work tree of the repository, PYTHON an interpreter with its dependencies.
 `sim`: an oracle episode of a task with all images; `decisions`: prompt and observations of such an episode,
@@ -9,6 +9,7 @@ given to `openvima-small`.
 With a folder of demonstrations: `batches`, all of its object cache as padded batches of 128 with images, and
 `batches_without_images`; `writing`, a shard of its first 100 demonstrations; `opening`, the first episodes of
 up to 100 shards, the index read before; `reading`, the next ones of the same shards.
+With `--presets`: training steps of 64 of these demonstrations, forward, backward and AdamW.
 After every piece of work of one process comes the same piece in the other, so that the load of the machine
 hits both. Times are CPU time, the shortest of all repeats of a piece; ratios are time before over time now,
 above 1 if this commit is faster.
@@ -119,6 +120,41 @@ for line in sys.stdin:
                 dataset.read(both[kind == "reading"], columns)
         print(time.process_time() - start, flush=True)
 """
+# A piece is ten steps of behaviour cloning.
+TRAINING_WORKER = """
+import sys, time
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+from openvima.data.object_cache.cache import open_object_cache
+from openvima.data.reader import Dataset
+from openvima.training.behaviour_cloning import BehaviourCloning
+from openvima.training.building import build_learner, resolved
+from openvima.training.config import TrainingConfig
+from openvima.training.parallel import ONE_PROCESS
+from openvima.training.source import split_examples
+from openvima.training.vocabulary import training_texts
+data, preset, steps = Path(sys.argv[1]), sys.argv[2], 10
+settings = {"data": data, "out": Path("run"), "preset": preset, "optimizer.learning_rate": 3e-4}
+if preset == "small":
+    settings["pretraining.attribute_loss_weight"] = 0.5
+config, dataset = resolved(TrainingConfig.of(settings)), Dataset(data)
+learner = build_learner(config, training_texts(dataset, config.augmentation, with_captions=preset == "small"))
+training, validation = split_examples(
+    open_object_cache(dataset), validation_fraction=0.02, validation_episodes=64)
+stage = BehaviourCloning(learner, learner, config, training, validation, ONE_PROCESS)
+optimizer = torch.optim.AdamW(stage.parameters, lr=3e-4, fused=True)
+learner.train()
+number = 0
+for line in sys.stdin:
+    start = time.process_time()
+    for _ in range(steps):
+        optimizer.zero_grad()
+        stage.backward(number)
+        optimizer.step()
+        number += 1
+    print((time.process_time() - start) / steps, flush=True)
+"""
 DATA_KINDS = ("batches", "batches_without_images", "writing", "opening", "reading")
 
 
@@ -167,6 +203,21 @@ def data_ratios(pythons: tuple[str, str], roots: tuple[Path, Path], folder: Path
     return {"data": ratios}
 
 
+def training_ratios(
+    pythons: tuple[str, str], roots: tuple[Path, Path], folder: Path, presets: Sequence[str], repeats: int
+) -> Ratios:
+    """Compare training steps, preset by preset."""
+    ratios = {}
+    for preset in presets:
+        first, second = (
+            Checkout(python, root, TRAINING_WORKER, str(folder), preset)
+            for python, root in zip(pythons, roots, strict=True)
+        )
+        ratios[preset] = round(ratio((first, second), ["go"], repeats), 3)
+        print(f"{preset:28}{ratios[preset]:.2f}", flush=True)
+    return {"training": ratios}
+
+
 def task_ratios(
     pythons: tuple[str, str], roots: tuple[Path, Path], tasks: Sequence[str], seeds: range, repeats: int
 ) -> Ratios:
@@ -194,12 +245,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=6, help="episodes of a task")
     parser.add_argument("--repeats", type=int, default=5, help="of each piece of work")
     parser.add_argument("--data", type=Path, help="folder of demonstrations: compare data, not tasks")
+    parser.add_argument("--presets", help="names with commas between them: compare training steps on --data")
     parser.add_argument("--json", type=Path, help="file to write")
     given = parser.parse_args()
     tasks = list_tasks() if given.tasks == "all" else given.tasks.split(",")
     seeds = range(FIRST_SEED, FIRST_SEED + given.seeds)
     pythons, roots = (given.base_python, sys.executable), (given.base.resolve(), ROOT)
-    if given.data:
+    if given.presets:
+        presets = given.presets.split(",")
+        found = training_ratios(pythons, roots, given.data.resolve(), presets, given.repeats)
+    elif given.data:
         found = data_ratios(pythons, roots, given.data.resolve(), given.repeats)
     else:
         found = task_ratios(pythons, roots, tasks, seeds, given.repeats)

@@ -14,7 +14,7 @@ import openvima
 from full_repr import full_repr
 from openvima.env import make_vec
 from openvima.tasks import list_tasks
-from soak import random_action
+from playing import random_action
 
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 

@@ -1,16 +1,17 @@
 """Episodes as files: nothing is lost, and what is hostile is refused."""
 
+import os
 import random
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 import openvima
-from compose import answer_to, hostile_file, valid_files
-from openvima.errors import ConfigError, InputFileError, SceneError
+from openvima.errors import ConfigError, InputFileError, OpenVimaError, SceneError
 from openvima.evaluation import play
 from openvima.scene import PhotoImage, Pose, Prompt, Scene
 from openvima.tasks import list_tasks, sample_episode, task_spec
@@ -180,9 +181,67 @@ def test_the_message_names_the_field(tmp_path: Path) -> None:
         openvima.load_episode(path)
 
 
-def test_hostile_files_are_refused(tmp_path: Path) -> None:
-    rng, files = random.Random(5), valid_files()
-    (tmp_path / "inside").mkdir()
-    for _ in range(12):
-        attack, path = hostile_file(files, rng, tmp_path / "inside")
-        assert answer_to(path) == "refused", (attack, path.read_bytes()[:2000])
+def saved(task: str, folder: Path) -> dict:
+    path = openvima.save_episode(sample_episode(task, seed=0), folder / "saved.yaml")
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]\n" + HAND_WRITTEN.encode(),
+        HAND_WRITTEN.replace("prompt:", "prompt: !!python/object/apply:os.system ['true']\nother:").encode(),
+        (HAND_WRITTEN + "deep: " + "[" * 4000 + "]" * 4000).encode(),
+        HAND_WRITTEN[: len(HAND_WRITTEN) // 3].encode(),
+        HAND_WRITTEN.encode("utf-16"),
+        HAND_WRITTEN.encode() + b"\n# " + b"x" * 2**20,
+        b"",
+        HAND_WRITTEN.encode() + b"\n---\n" + HAND_WRITTEN.encode(),
+        b"{" * 100_000,
+        (HAND_WRITTEN + "? [1, 2]\n: 3\n").encode(),
+        (HAND_WRITTEN + "2020-01-01: 3\n").encode(),
+        random.Random(5).randbytes(2000),
+    ],
+)
+def test_files_that_are_no_episodes_are_refused(tmp_path: Path, content: bytes) -> None:
+    assert_refused(tmp_path, content)
+
+
+@pytest.mark.parametrize("task", ["rotate", "follow_motion", "sweep_without_touching"])
+@pytest.mark.parametrize("wrong", [float("nan"), 1e308, 10**30, "x" * 5000, {"x": 1}, [[0.0] * 9] * 300])
+def test_episodes_with_an_impossible_value_are_refused(tmp_path: Path, task: str, wrong: object) -> None:
+    for *path, last in (
+        ("seed",),
+        ("max_steps",),
+        ("problem", "scene", "placements", 0, "pose", "position"),
+        ("problem", "scene", "placements", 0, "object"),
+        ("problem", "scene", "placements", 0, "import"),
+    ):
+        values = holder = saved(task, tmp_path)
+        for key in path:
+            holder = holder[key]
+        holder[last] = wrong
+        assert_refused(tmp_path, yaml.safe_dump(values).encode())
+
+
+@pytest.mark.parametrize(
+    "name", ["../outside.png", "link.png", "pipe.png", "folder.png", "cut.png", "/dev/zero.png"]
+)
+def test_photos_that_must_not_be_read_are_refused(tmp_path: Path, name: str) -> None:
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    Image.new("RGB", (9, 9), "red").save(tmp_path / "outside.png")
+    (inside / "link.png").symlink_to(tmp_path / "outside.png")
+    os.mkfifo(inside / "pipe.png")
+    (inside / "folder.png").mkdir()
+    (inside / "cut.png").write_bytes((tmp_path / "outside.png").read_bytes()[:40])
+    assert_refused(inside, HAND_WRITTEN.replace("block.png", name).encode())
+
+
+def assert_refused(folder: Path, content: bytes) -> None:
+    Image.new("RGB", (9, 9), "red").save(folder / "block.png")
+    path = folder / "scene.yaml"
+    path.write_bytes(content)
+    with pytest.raises(OpenVimaError) as caught:
+        openvima.load_episode(path)
+    assert len(str(caught.value)) < 1000 and "\n" not in str(caught.value)

@@ -1,12 +1,69 @@
-"""A little of `benchmarks/explore.py`: low-level control takes any commands, and the benchmark sees harm."""
+"""Low-level control takes any commands, those against every bound of the workspace and the reach included."""
+
+import traceback
+from contextlib import suppress
 
 import numpy as np
 import pytest
 
 import openvima
-from explore import FIRST_SEED, explore
-from openvima.errors import ReachError
+from openvima.env import TabletopEnv
+from openvima.errors import OracleError, ReachError, SamplingError
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
+from openvima.scene.command import COMMAND_HIGH, COMMAND_LOW, HIGHEST_TIP_Z_M
 from openvima.sim.tool_world import ToolWorld
+
+FIRST_SEED = 3_000_000
+LONGEST_HOLD = 12  # steps
+ORACLE_PROB = 0.2
+BEYOND_M = 0.02 + 1e-6  # by which the tool may leave the workspace; observations are float32
+
+
+def explore(env: TabletopEnv, seed: int, *, steps: int) -> list[str]:
+    """Explore one episode; return what went wrong, at most one line for each step."""
+    rng = np.random.default_rng(seed)
+    try:
+        observation, _ = env.reset(seed=seed)
+    except SamplingError:
+        return []
+    problems = problems_of(env, observation)
+    held, left = np.zeros(5, np.float32), 0
+    for step in range(steps):
+        if left == 0:
+            held, left = random_command(rng), int(rng.integers(1, LONGEST_HOLD + 1))
+        left -= 1
+        command = held
+        if rng.random() < ORACLE_PROB:
+            with suppress(OracleError):  # it has no action: nothing is left to do
+                command = env.oracle_command().to_array()
+        try:
+            observation, _, terminated, truncated, _ = env.step(command)
+        except Exception as error:
+            place = traceback.extract_tb(error.__traceback__)[-1].name
+            return [*problems, f"step {step}: {type(error).__name__} in {place}: {error}"]
+        problems += [f"step {step}: {problem}" for problem in problems_of(env, observation)]
+        if terminated or truncated:
+            break
+    return problems
+
+
+def random_command(rng: np.random.Generator) -> np.ndarray:
+    """Draw a command, half of its numbers at a bound: exploration ends at walls."""
+    low, high = np.array(COMMAND_LOW), np.array(COMMAND_HIGH)
+    values = rng.uniform(low, high)
+    at_bound = rng.random(5) < 0.5
+    return np.where(at_bound, np.where(rng.random(5) < 0.5, low, high), values).astype(np.float32)
+
+
+def problems_of(env: TabletopEnv, observation: dict) -> list[str]:
+    """Look for what an observation must not hold."""
+    x, y, z = observation["tool"][:3].tolist()
+    problems = [] if env.observation_space.contains(observation) else ["the observation is not in its space"]
+    (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
+    is_inside = low_x - BEYOND_M <= x <= high_x + BEYOND_M and low_y - BEYOND_M <= y <= high_y + BEYOND_M
+    if not is_inside or not 0 <= z <= HIGHEST_TIP_Z_M + 1e-6:
+        problems.append(f"the tool is at ({x:.4f}, {y:.4f}, {z:.4f}) m")
+    return problems
 
 
 def make(task: str) -> openvima.TabletopEnv:

@@ -17,7 +17,7 @@ from openvima.env.sub_environments import SubEnvironments
 from openvima.errors import ConfigError, SamplingError
 from openvima.scene import RenderedPrompt
 from openvima.tasks import list_tasks, sample_episode
-from soak import random_action
+from playing import random_action
 
 SLOW_TASKS = [pytest.param(task, marks=pytest.mark.slow) for task in list_tasks() if task != "rotate"]
 

@@ -1,68 +1,54 @@
-"""A little of `benchmarks/soak.py`: random actions over all tasks do no harm, and the benchmark sees harm."""
+"""Random valid actions over all tasks do no harm: finite poses, on the table, well-formed observations."""
 
+import itertools
 import math
-import re
 
+import numpy as np
 import pytest
 
+from openvima.catalog import Assets
 from openvima.env import TabletopEnv
-from openvima.errors import ReachError
-from openvima.scene import Pose
-from openvima.sim.world import World
-from openvima.tasks import list_tasks
-from soak import LIMIT_TICKS, observation_problems, scene_problems, soak
+from openvima.scene import Scene
+from openvima.sim.model import FLOOR_Z_M
+from openvima.tasks import list_tasks, task_spec
+from playing import random_action
 
-ACTIONS = 9  # of each task
-
-
-@pytest.mark.parametrize("task", list_tasks())
-def test_random_actions_do_no_harm(task: str) -> None:
-    findings = soak(task, ACTIONS)
-    assert findings.problems == []
-    assert findings.actions == ACTIONS
-    assert findings.episodes > 0
+SINKING_M = 0.002  # by which the lowest corner may be below the floor: contacts are springs
+FARTHEST_M = 3.0  # from the robot; nothing slides that far
 
 
-def test_the_actions_are_reproducible_and_move_something() -> None:
-    runs = [soak("rotate", 20, seed=1) for _ in range(2)]
-    for findings in runs:
-        findings.slowest_step_s = 0.0
-    assert runs[0] == runs[1]
-    assert runs[0].moved > 5
+def assert_possible(scene: Scene, assets: Assets) -> None:
+    for placement in scene.placements:
+        pose = placement.pose
+        assert np.isfinite([*pose.position, *pose.quaternion]).all()
+        assert math.hypot(*pose.quaternion) == pytest.approx(1, abs=1e-6)
+        geometry = assets.geometry(placement.object, placement.size, placement.scale)
+        corners = pose.transform(geometry.visual.vertices.reshape(-1, 3))
+        assert corners[:, 2].min() - FLOOR_Z_M > -SINKING_M
+        assert math.hypot(pose.x, pose.y) < FARTHEST_M
 
 
 @pytest.mark.parametrize(
-    ("pose", "message"),
+    ("task", "num_actions"),
     [
-        (Pose((0.5, 0.0, math.nan)), r"object \d \(.*\) has pose"),
-        (Pose((0.5, 0.0, -0.1)), "mm below the floor"),
-        (Pose((5.0, 0.0, 0.1)), r"5\.0 m away"),
-        (Pose((0.5, 0.0, 0.1), (0.0, 0.0, 0.0, 2.0)), "has quaternion"),
+        *((task, 9) for task in list_tasks()),
+        *(pytest.param(task, 300, marks=pytest.mark.slow) for task in list_tasks()),
     ],
 )
-def test_a_pose_that_cannot_be_is_found(pose: Pose, message: str) -> None:
-    env = TabletopEnv("rotate")
-    env.reset(seed=0)
-    assert scene_problems(env.scene, env.assets)[0] == []
-    misplaced = env.scene.with_poses({env.scene.placements[0].id: pose})
-    (problem,), _, _ = scene_problems(misplaced, env.assets)
-    assert re.search(message, problem)
-
-
-def test_an_id_that_no_object_has_is_found() -> None:
-    env = TabletopEnv("rotate")
-    observation, _ = env.reset(seed=0)
-    assert observation_problems(env, observation) == []
-    observation["segm"]["top"][0, 0] = 99
-    assert observation_problems(env, observation) == ["the top view shows ids [99] that no object has"]
-
-
-def test_an_error_and_too_many_ticks_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(LIMIT_TICKS, "suction", -1)
-    assert "ticks" in soak("rotate", 1).problems[0]
-
-    def fail(*args: object, **options: object) -> None:
-        raise ReachError("too far")
-
-    monkeypatch.setattr(World, "execute", fail)
-    assert "ReachError: too far" in soak("rotate", 1).problems[0]
+def test_random_actions_do_no_harm(task: str, num_actions: int) -> None:
+    rng, left = np.random.default_rng([*task.encode()]), num_actions
+    envs = itertools.cycle(TabletopEnv(task, level=level) for level in task_spec(task).levels)
+    for seed, env in enumerate(envs, 2_000_000):
+        env.reset(seed=seed)
+        is_over = False
+        while left and not is_over:
+            left -= 1
+            observation, reward, terminated, truncated, info = env.step(random_action(rng, env.scene))
+            assert_possible(env.scene, env.assets)
+            assert observation in env.observation_space
+            allowed = {0, 1, 255, *(placement.id for placement in env.scene.placements)}
+            assert all(set(np.unique(segm).tolist()) <= allowed for segm in observation["segm"].values())
+            assert (reward, terminated) == (float(info["success"]), info["success"] or info["failure"])
+            is_over = terminated or truncated
+        if not left:
+            return

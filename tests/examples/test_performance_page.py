@@ -11,7 +11,7 @@ ENTRY = {
     "what": "decision",
     "value": 12.5,
     "unit": "ms",
-    "command": "python benchmarks/x.py",
+    "command": "python benchmarks/sim.py",
     "commit": "abc",
 }
 
@@ -26,10 +26,11 @@ def test_the_page_is_made_from_the_results() -> None:
 
 
 def test_a_newer_result_replaces_the_row(tmp_path: Path) -> None:
-    record(tmp_path, "2026-01-01_a.json", ENTRY, ENTRY | {"what": "other", "value": "9 to 27"})
+    gone = {"what": "gone", "command": "python benchmarks/that_is_gone.py"}
+    record(tmp_path, "2026-01-01_a.json", ENTRY, ENTRY | {"what": "other", "value": "9 to 27"}, ENTRY | gone)
     record(tmp_path, "2026-01-02_b.json", ENTRY | {"value": 1.5, "unit": "×", "against": "def"})
     rows = page(tmp_path).splitlines()[-2:]
-    command = "`python benchmarks/x.py`"
+    command = "`python benchmarks/sim.py`"
     assert rows == [
         f"| other | 9 to 27 ms | {command} | `abc` | 2026-01-01 | [a](../results/2026-01-01_a.md) |",
         f"| decision | 1.5× | {command} | `abc` / `def` | 2026-01-02 | [b](../results/2026-01-02_b.md) |",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from golden_episodes import StepDifference, read_steps, replay, summary
+from dynamics import StepDifference, read_steps, replay, summary
 from openvima.catalog.original import OriginalAssets
 
 FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "dynamics"

@@ -12,8 +12,8 @@ import pytest
 
 import dynamics
 import fidelity
-from golden_episodes import read_steps
-from golden_scenes import RecordingError, ious, read_scene, scene_files
+from dynamics import read_steps
+from fidelity import RecordingError, ious, read_scene, scene_files
 
 
 @pytest.fixture

@@ -13,9 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fidelity import object_image, prompt_image
-from golden_recovery import FIRST_ID, recover_scene
-from golden_scenes import GoldenScene, interpenetrating, ious, mean_colour_error, read_scene
+from fidelity import (
+    FIRST_ID,
+    GoldenScene,
+    interpenetrating,
+    ious,
+    mean_colour_error,
+    object_image,
+    prompt_image,
+    read_scene,
+    recover_scene,
+)
 from openvima.catalog.original import OriginalAssets
 from openvima.render import VIEWS, Rasteriser
 from openvima.scene import FIRST_OBJECT_ID, SceneImage

@@ -6,17 +6,18 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from random import Random
+from typing import Any
 from urllib.parse import urlsplit
 
+import msgpack
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect
 
-from fuzz_server import Fuzzer
 from openvima.errors import ServerError
 from openvima.serving import RemotePolicy, serve_in_thread
 from openvima.serving.protocol import encode_observation, encode_prompt, pack, unpack
@@ -25,6 +26,93 @@ from served_policies import ForMany, made_up_observation, made_up_prompt, told
 SETTINGS = {"max_message_bytes": 2**18}
 IDLE_S = 0.3  # where silence is the subject; on a busy machine it would end other connections
 NUM_MALFORMED = 1000
+
+
+KEYS = (
+    "type",
+    "prompts",
+    "observations",
+    "text",
+    "images",
+    "rgb",
+    "ee",
+    "top",
+    b"data",
+    "prompt",
+    "protocol",
+)
+PLAIN = (None, True, -1, 2**64 - 1, 1e300, float("nan"), "text", b"bytes", "", [], {})
+
+
+class Fuzzer:
+    """Makes malformed messages.
+
+    Args:
+        good: Proper messages, to damage.
+        random: Source of randomness.
+    """
+
+    def __init__(self, good: Sequence[bytes], random: Random) -> None:
+        self._good = good
+        self._random = random
+
+    def message(self) -> bytes | str:
+        """Return one of the ways in which a message can be wrong."""
+        random = self._random
+        ways = (
+            lambda: random.randbytes(random.randrange(300)),
+            self._cut,
+            self._garbled,
+            lambda: _packed(["type", self._junk()]),
+            lambda: _packed(
+                {"type": random.choice(["reset", "act", "", None, 3, "x" * 9999]), "rows": self._junk()}
+            ),
+            lambda: _packed({"type": "reset", "prompts": [self._junk()]}),
+            lambda: _packed({"type": "act", "observations": [self._junk()] * 3}),  # and out of order
+            lambda: _packed({"prompt": self._junk(), "rgb": self._array(), "ee": self._junk(1)}),
+            lambda: bytes([random.choice(b"\x91\x81\xdc\xdd")]) * random.randrange(1, 5000),
+            lambda: (
+                random.choice([b"\xdd", b"\xdf", b"\xc6", b"\xdb", b"\xc9"]) + b"\xff" * random.randrange(9)
+            ),
+            lambda: "text " * random.randrange(9),
+        )
+        return random.choice(ways)()
+
+    def _cut(self) -> bytes:
+        good = self._random.choice(self._good)
+        return good[: self._random.randrange(len(good))]
+
+    def _garbled(self) -> bytes:
+        bad = bytearray(self._random.choice(self._good))
+        for _ in range(self._random.randrange(1, 9)):
+            bad[self._random.randrange(min(200, len(bad)))] = self._random.randrange(256)
+        return bytes(bad) + b"!"
+
+    def _junk(self, depth: int = 3) -> Any:  # Any: whatever can be packed
+        random = self._random
+        kind = random.randrange(4) if depth else 0
+        if kind == 1:
+            return [self._junk(depth - 1) for _ in range(random.randrange(4))]
+        if kind == 2:
+            return {random.choice(KEYS): self._junk(depth - 1) for _ in range(random.randrange(4))}
+        return self._array() if kind == 3 else random.choice(PLAIN)
+
+    def _array(self) -> dict[bytes, Any]:  # Any: right or wrong
+        random = self._random
+        dtypes = ["|O", "O", "<U9", "|V8", "<c16", "<M8[s]", "|S4", "u1,f8", "<f8", "|u1", "x" * 999, 7, None]
+        lengths = [0, 1, -1, 3, 2**31, 2**62, -(2**40), 1.5, "3", True, None]
+        return {
+            b"__ndarray__": True,
+            b"data": random.randbytes(random.randrange(9)),
+            b"dtype": random.choice(dtypes),
+            b"shape": [random.choice(lengths) for _ in range(random.randrange(12))],
+        }
+
+
+def _packed(message: object) -> bytes:
+    packed = msgpack.packb(message)
+    assert packed is not None
+    return packed
 
 
 @pytest.fixture
