@@ -120,40 +120,20 @@ for line in sys.stdin:
                 dataset.read(both[kind == "reading"], columns)
         print(time.process_time() - start, flush=True)
 """
-# A piece is ten steps of behaviour cloning.
+# Likewise, for training: a piece is 60 steps, of which the last 40 count.
 TRAINING_WORKER = """
-import sys, time
+import json, sys, tempfile
 from pathlib import Path
-import torch
-torch.set_num_threads(1)
-from openvima.data.object_cache.cache import open_object_cache
-from openvima.data.reader import Dataset
-from openvima.training.behaviour_cloning import BehaviourCloning
-from openvima.training.building import build_learner, resolved
-from openvima.training.config import TrainingConfig
-from openvima.training.parallel import ONE_PROCESS
-from openvima.training.source import split_examples
-from openvima.training.vocabulary import training_texts
-data, preset, steps = Path(sys.argv[1]), sys.argv[2], 10
-settings = {"data": data, "out": Path("run"), "preset": preset, "optimizer.learning_rate": 3e-4}
-if preset == "small":
-    settings["pretraining.attribute_loss_weight"] = 0.5
-config, dataset = resolved(TrainingConfig.of(settings)), Dataset(data)
-learner = build_learner(config, training_texts(dataset, config.augmentation, with_captions=preset == "small"))
-training, validation = split_examples(
-    open_object_cache(dataset), validation_fraction=0.02, validation_episodes=64)
-stage = BehaviourCloning(learner, learner, config, training, validation, ONE_PROCESS)
-optimizer = torch.optim.AdamW(stage.parameters, lr=3e-4, fused=True)
-learner.train()
-number = 0
+from openvima.training import TrainingConfig, train
+data, preset = sys.argv[1:]
+settings = {"data": Path(data), "preset": preset, "schedule.steps": 60, "pretraining.steps": 0,
+            "optimizer.learning_rate": 3e-4, "loader.batch_size": 64, "runtime.threads": 1}
 for line in sys.stdin:
-    start = time.process_time()
-    for _ in range(steps):
-        optimizer.zero_grad()
-        stage.backward(number)
-        optimizer.step()
-        number += 1
-    print((time.process_time() - start) / steps, flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        train(TrainingConfig.of({**settings, "out": Path(folder) / "run"}))
+        lines = Path(folder, "run", "timings_log.jsonl").read_text().splitlines()
+    seconds = {each["step"]: each["cpu_seconds_since_start"] for each in map(json.loads, lines)}
+    print((seconds[60] - seconds[20]) / 40, flush=True)
 """
 DATA_KINDS = ("batches", "batches_without_images", "writing", "opening", "reading")
 
