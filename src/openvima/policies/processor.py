@@ -43,7 +43,7 @@ MAX_LAYOUTS = 2**16  # token layouts of prompts to keep
 # A token takes a character at least, and 16 are more than any word of the vocabularies has on average.
 PROMPT_LIMITS = PromptLimits(16 * MAX_PROMPT_POSITIONS, objects=MAX_PROMPT_POSITIONS)
 
-_LayoutKey = tuple[str, tuple[int, ...], tuple[int, ...]]
+_LayoutKey = tuple[str, tuple[int, ...], bytes]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,17 +165,19 @@ class Processor:
             prompts: The prompts.
             first_images: Images of the stack before those of each prompt; None where there is one stack.
         """
-        layouts, tables, masks = zip(*map(self._token_sequence, prompts), strict=True)
+        layouts = [self._layout_of(prompt) for prompt in prompts]
         # All tokens, and where they stand in the padded arrays.
-        word, row, part = np.concatenate([layout.tokens for layout in layouts]).T
+        word, row, part, is_valid = np.concatenate([layout.tokens for layout in layouts]).T
         lengths = np.array([len(layout.tokens) for layout in layouts])
         place = _rows_and_slots(lengths)
         shape = (len(prompts), int(lengths.max(initial=0)))
         # All objects that they stand for; an image that is named twice has its objects twice.
         counts = np.array([len(layout.rows) for layout in layouts])
-        image_index, image, own_row = np.concatenate([layout.rows for layout in layouts]).T
         b = np.repeat(np.arange(len(prompts)), counts)
-        objects = ObjectTable.concatenate(tables).select(own_row + _starts(list(map(len, tables)))[b])
+        image_index, image, *own_rows = np.concatenate([layout.rows for layout in layouts]).T
+        rows = np.stack(own_rows, axis=1)
+        rows += np.where(rows >= 0, _starts([len(prompt.objects) for prompt in prompts])[b][:, None], 0)
+        objects = _select_views(ObjectTable.concatenate([prompt.objects for prompt in prompts]), rows)
         if first_images is not None:
             objects = objects.with_image_offset(first_images[b][:, None])
         in_scene = np.concatenate([prompt.is_scene for prompt in prompts])
@@ -184,7 +186,7 @@ class Processor:
         mask_BL = np.zeros(shape, np.bool_)
         word_ids_BL[place] = word
         object_index_BL[place] = np.where(row == WORD, WORD, row + part * len(b) + _starts(counts)[place[0]])
-        mask_BL[place] = np.concatenate(masks)
+        mask_BL[place] = is_valid
         arrays = (
             word_ids_BL,
             object_index_BL,
@@ -326,78 +328,72 @@ class Processor:
         crop_index = offset_index(crop_index, offsets[:, None])
         return FalsePositiveBatch(*(steps.pad(column) for column in (crop_index, boxes, points)))
 
-    def _token_sequence(self, prompt: PreprocessedPrompt) -> tuple["_Layout", ObjectTable, np.ndarray]:
-        """Return the tokens of a prompt, its objects, and which tokens are valid.
-
-        Tokens are words, and one or more for each object of an image. With layout "views" the visible objects
-        of each view come first, and every image is padded to the slots of the prompt's largest one, as in the
-        published evaluation, where this affects T5's relative positions.
-        """
-        counts = prompt.objects_per_image
-        if self.layout != "views":
-            layout = self._layout_of(prompt.text, tuple(counts.tolist()), ())
-            return layout, prompt.objects, np.ones(len(layout.tokens), np.bool_)
-        in_text = [piece for piece in split_prompt(prompt.text) if isinstance(piece, int)]
-        ends = np.cumsum(counts)
-        rows = [np.arange(ends[number] - counts[number], ends[number]) for number in in_text]
-        image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
-        ordered = prompt.objects.select(np.concatenate([np.zeros(0, np.int64), *rows]))
-        objects, slots = _compact(ordered, image, len(rows))
-        layout = self._layout_of(prompt.text, tuple(counts.tolist()), slots)
-        _, entries, parts = layout.tokens.T
-        mask = (entries == WORD) | bool(self.tokens_per_image)
-        mask[~mask] = objects.masks[entries[~mask], parts[~mask]]
-        return layout, objects, mask
-
-    def _layout_of(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
-        """Return the cached layout of a text, given the number of objects per image."""
-        key = (text, counts, slots)
+    def _layout_of(self, prompt: PreprocessedPrompt) -> "_Layout":
+        """Return the layout of a prompt, cached by its text and by what decides the objects of its images."""
+        masks = prompt.objects.masks if self.layout == "views" else np.zeros((0, len(VIEWS)), np.bool_)
+        key = (prompt.text, tuple(prompt.objects_per_image.tolist()), masks.tobytes())
         if key not in self._layouts:
             if len(self._layouts) >= MAX_LAYOUTS:
                 self._layouts.clear()
-            self._layouts[key] = self._lay_out(text, counts, slots)
+            self._layouts[key] = self._lay_out(prompt.text, key[1], masks)
         return self._layouts[key]
 
-    def _lay_out(self, text: str, counts: Sequence[int], slots: tuple[int, ...]) -> "_Layout":
-        tokens: list[tuple[int, int, int]] = []  # word, entry, part
-        starts, order, count = np.cumsum([0, *counts]), [], 0
-        sizes: list[int] = []  # rows of each image
+    def _lay_out(self, text: str, counts: tuple[int, ...], masks: np.ndarray) -> "_Layout":
+        """Lay out words, and one or more tokens for each object of an image.
+
+        With layout "views" the visible objects of each view come first, and every image is padded to the
+        slots of the prompt's largest one, as in the published evaluation, where this affects T5's relative
+        positions.
+        """
         pieces = split_prompt(text)
         # Warns once of all unknown words.
         self.tokenizer.encode(" ".join(piece for piece in pieces if isinstance(piece, str)))
+        in_text = [piece for piece in pieces if isinstance(piece, int)]
+        starts = _starts(counts)
+        # Rows of the table that fill the slots of each image, by view.
+        rows = [[np.arange(starts[n], starts[n] + counts[n])] * len(VIEWS) for n in in_text]
+        if self.layout == "views":
+            rows = [[own[masks[own, v]] for v, own in enumerate(image)] for image in rows]
+        slots = [max((len(image[v]) for image in rows), default=0) for v in range(len(VIEWS))]
+        if self.layout == "views":
+            rows = [
+                [np.pad(own, (0, max(slots) - len(own)), constant_values=-1) for own in image]
+                for image in rows
+            ]
+        shown = [np.stack(image, axis=1) for image in rows]
+        tokens: list[tuple[int, int, int, bool]] = []  # word, row, part, whether it is valid
+        count, unread = 0, iter(shown)
         for piece in pieces:
             if isinstance(piece, str):
-                tokens += [(word, WORD, 0) for word in self.tokenizer.encode(piece)]
+                tokens += [(word, WORD, 0, True) for word in self.tokenizer.encode(piece)]
                 continue
-            order += range(starts[piece], starts[piece + 1])
-            sizes.append({"views": max(slots, default=0), "frames": 1, "objects": counts[piece]}[self.layout])
+            own = next(unread)
             if self.tokens_per_image:
-                parts = self.tokens_per_image if sizes[-1] else 0  # of the first object
-                tokens += [(PADDING_ID, count, part) for part in range(parts)]
+                parts = self.tokens_per_image if len(own) else 0  # of the first object
+                tokens += [(PADDING_ID, count, part, True) for part in range(parts)]
             elif self.layout == "views":
-                tokens += [(PADDING_ID, count + k, v) for v, size in enumerate(slots) for k in range(size)]
+                places = [(k, v) for v, size in enumerate(slots) for k in range(size)]
+                tokens += [(PADDING_ID, count + k, v, own[k, v] >= 0) for k, v in places]
             else:
-                tokens += [(PADDING_ID, count + k, 0) for k in range(counts[piece])]
-            count += sizes[-1]
-        tokens.append((self.tokenizer.end_id, WORD, 0))
-        check_length(
-            len(tokens), MAX_PROMPT_POSITIONS, "the prompt"
-        )  # before the encoder, whose cost is quadratic
-        in_text = [piece for piece in split_prompt(text) if isinstance(piece, int)]
-        rows = [
-            np.repeat(np.arange(len(sizes)), sizes),
-            np.repeat(np.array(in_text, np.int64), sizes),
-            np.arange(count) if self.layout == "views" else np.array(order, np.int64),
-        ]
-        return _Layout(np.array(tokens), np.stack(rows, axis=1))
+                tokens += [(PADDING_ID, count + k, 0, True) for k in range(len(own))]
+            count += len(own)
+        tokens.append((self.tokenizer.end_id, WORD, 0, True))
+        # Before the encoder, whose cost is quadratic.
+        check_length(len(tokens), MAX_PROMPT_POSITIONS, "the prompt")
+        sizes = [len(own) for own in shown]
+        numbers = np.array([range(len(sizes)), in_text], np.int64).repeat(sizes, axis=1).T
+        none = np.zeros((0, len(VIEWS)), np.int64)
+        return _Layout(np.array(tokens), np.concatenate([numbers, np.concatenate([none, *shown])], axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """The tokens of a prompt, (L, 3): word, row of its object or `WORD`, and part of that.
+    """The tokens of a prompt, and the objects that they stand for.
 
-    `rows` (R, 3) has for each row the image, counted in reading order, its number in the prompt, and the row
-    in the table of objects, which may be in another order.
+    Args:
+        tokens: Word, row of its object below or `WORD`, part of that, and whether it is valid, shape (L, 4).
+        rows: Image of the object, counted in reading order, number of that image in the prompt, and rows in
+            the prompt's table, of each view, -1 for an empty slot, shape (R, 4).
     """
 
     tokens: np.ndarray
@@ -455,35 +451,11 @@ def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
     """Sort the objects of each step separately in each view: visible ones first, then by id."""
     masks = objects.masks
     order = np.stack([np.lexsort((objects.ids, ~masks[:, v], step)) for v in (FRONT, TOP)], axis=1)
-    return _reorder_views(objects, order)
+    return _select_views(objects, order)
 
 
-def _compact(objects: ObjectTable, image: np.ndarray, num_images: int) -> tuple[ObjectTable, tuple[int, ...]]:
-    """Move the visible objects of each image to the front of each view, in equally many slots.
-
-    Returns:
-        Slots of all images, and the maximum number per image in each view.
-    """
-    rows = [np.flatnonzero(visible) for visible in objects.masks.T]
-    counts = [np.bincount(image[of_view], minlength=num_images) for of_view in rows]
-    slots = tuple(int(count.max(initial=0)) for count in counts)
-    columns = (objects.crop_index, objects.boxes, objects.grasps)
-    size = num_images * max(slots)
-    compact = [np.zeros((size, *column.shape[1:]), column.dtype) for column in columns]
-    for v, (of_view, count) in enumerate(zip(rows, counts, strict=True)):
-        rank = np.arange(len(of_view)) - (np.cumsum(count) - count)[image[of_view]]
-        slot = image[of_view] * max(slots) + rank
-        for new, old in zip(compact, columns, strict=True):
-            new[slot, v] = old[of_view, v]
-    return ObjectTable(np.full(size, -1), *compact), slots
-
-
-def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:
-    """Reorder each view separately, order (N, 2); afterwards a row may mix objects."""
-    views = np.arange(len(VIEWS))
-    return ObjectTable(
-        np.full(len(order), -1),
-        objects.crop_index[order, views],
-        objects.boxes[order, views],
-        objects.grasps[order, views],
-    )
+def _select_views(objects: ObjectTable, rows: np.ndarray) -> ObjectTable:
+    """Select rows of each view separately, (N, 2), of nothing where it is -1; a row may then mix objects."""
+    views, exists = np.arange(len(VIEWS)), rows >= 0
+    columns = (column[rows, views] for column in (objects.crop_index, objects.boxes, objects.grasps))
+    return ObjectTable(np.full(len(rows), -1), *(np.where(exists.T, column.T, 0).T for column in columns))
