@@ -175,10 +175,11 @@ def test_any_tool_that_reads_arrow_reads_a_file(demos: Path) -> None:
     table = pa.ipc.open_file(cache.folder / "rotate-train-00000.arrow").read_all()
     row, episode = table.slice(1, 1).to_pylist()[0], cache[1]
     assert (row["task"], row["seed"], row["text"]) == ("rotate", episode.seed, episode.prompt.text)
-    assert row["objects.ids"] == episode.objects.ids.tolist()
-    boxes = np.array(row["objects.boxes"]).reshape(-1, 2, 4)
+    assert [each["objects.ids"] for each in row["objects"]] == episode.objects.ids.tolist()
+    boxes = np.array([each["objects.boxes"] for each in row["objects"]]).reshape(-1, 2, 4)
     assert np.array_equal(boxes, episode.objects.boxes)
-    assert np.array_equal(np.array(row["images"]).reshape(-1, 3, 32, 32), episode.images)
+    images = np.array([each["images"] for each in row["images"]]).reshape(-1, 3, 32, 32)
+    assert np.array_equal(images, episode.images)
 
 
 def test_a_prompt_is_split_into_texts_and_images() -> None:

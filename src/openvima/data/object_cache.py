@@ -6,7 +6,7 @@ row per demonstration, uncompressed and memory-mapped: a demonstration that is r
 
 import shlex
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -42,24 +42,29 @@ from openvima.scene import COMPOSED
 Report = Callable[[int, int, str], None]
 CACHE_VERSION = 7  # grows whenever the same demonstration gives another row
 _RERENDERED = "rerendered-v"  # in front of version and number of a random appearance
-_OBJECT_TABLES = ("prompt.objects", "objects", "final")
-_OBJECT_COLUMNS = {
+# Columns of lists, one record for each object, step or image: Arrow type of a number and shape of each field,
+# which has the name that it has in `PreprocessedEpisode`.
+_Fields = dict[str, tuple[pa.DataType, tuple[int, ...]]]
+_OBJECT: _Fields = {
     "ids": (pa.int16(), ()),
     "crop_index": (pa.int32(), (2,)),
     "boxes": (pa.int16(), (2, 4)),
     "grasps": (pa.int16(), (2, 2)),
 }
-# Arrays of a demonstration: Arrow type of a number, and shape of a row. Names are those of the fields.
-_ARRAYS = {
-    **{f"{table}.{name}": type_ for table in _OBJECT_TABLES for name, type_ in _OBJECT_COLUMNS.items()},
-    "prompt.objects_per_image": (pa.int16(), ()),
-    "prompt.is_scene": (pa.bool_(), ()),
-    "objects_per_step": (pa.int16(), ()),
-    "pick_ids": (pa.int16(), ()),
-    "place_ids": (pa.int16(), ()),
-    "false_positives.crop_index": (pa.int32(), (2,)),
-    "false_positives.boxes": (pa.int16(), (2, 4)),
-    "actions": (pa.float32(), (12,)),
+_LISTS: dict[str, _Fields] = {
+    "prompt_images": {"prompt.objects_per_image": (pa.int16(), ()), "prompt.is_scene": (pa.bool_(), ())},
+    **{
+        column: {f"{path}.{name}": type_ for name, type_ in _OBJECT.items()}
+        for column, path in (("prompt_objects", "prompt.objects"), ("objects", "objects"), ("final", "final"))
+    },
+    "steps": {
+        "objects_per_step": (pa.int16(), ()),
+        "pick_ids": (pa.int16(), ()),
+        "place_ids": (pa.int16(), ()),
+        "false_positives.crop_index": (pa.int32(), (2,)),
+        "false_positives.boxes": (pa.int16(), (2, 4)),
+        "actions": (pa.float32(), (12,)),
+    },
 }
 _SCALARS = {
     "task": pa.string(),
@@ -126,28 +131,33 @@ class CacheFile:
         try:
             reader = pa.ipc.open_file(pa.py_buffer(map_file(path)))
             about = _read_about(reader.schema)
-            self._rows = reader.get_batch(0)
-            self._rows.validate(full=True)  # no list reaches beyond its numbers
-            self._arrays = {
-                name: _unpack(self._rows.column(name), shape)
-                for name, (_, shape) in _arrays(about["kind"]).items()
+            rows = reader.get_batch(0)
+            rows.validate(full=True)  # no list reaches beyond its records
+            self._lists = {
+                name: _unpack(rows.column(name), fields) for name, fields in _lists(about["kind"]).items()
             }
+            self._scalars = {name: rows.column(name) for name in _SCALARS}
+            self._checksums = rows.column(_CHECKSUM)
         except DAMAGE_ERRORS as error:
             raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
         self.kind: InputKind = about["kind"]
         self.source, self.variant = about["source"], about["variant"]
 
     def __len__(self) -> int:
-        return self._rows.num_rows
+        return len(self._checksums)
 
     def __getitem__(self, row: int) -> PreprocessedEpisode:
-        arrays = {name: flat[ends[row] : ends[row + 1]] for name, (ends, flat) in self._arrays.items()}
-        scalars = tuple(self._rows.column(name)[row].as_py() for name in _SCALARS)
-        if _checksum(scalars, arrays.values()) != self._rows.column(_CHECKSUM)[row].as_py():
+        arrays = {}
+        for ends, fields in self._lists.values():
+            span = slice(int(ends[row]), int(ends[row + 1]))
+            arrays |= {name: flat[span] for name, flat in fields.items()}
+        scalars = tuple(column[row].as_py() for column in self._scalars.values())
+        if _checksum(scalars, arrays.values()) != self._checksums[row].as_py():
             raise ShardError(_unfit(self.path, f"the checksum of row {row} of {len(self)} is wrong"))
         task, seed, end_effector, text, descriptions = scalars
         in_prompt, objects, final = (
-            ObjectTable(*(arrays[f"{table}.{name}"] for name in _OBJECT_COLUMNS)) for table in _OBJECT_TABLES
+            ObjectTable(*(arrays[f"{path}.{name}"] for name in _OBJECT))
+            for path in ("prompt.objects", "objects", "final")
         )
         return PreprocessedEpisode(
             task=task,
@@ -171,18 +181,19 @@ class CacheFile:
             },
         )
 
-    def counts(self, name: str) -> np.ndarray:
-        """Return the length of an array in each row, shape (N,), int64."""
-        return np.diff(self._arrays[name][0])
+    def counts(self, column: str) -> np.ndarray:
+        """Return the length of a list in each row, shape (N,), int64."""
+        return np.diff(self._lists[column][0])
 
-    def largest(self, name: str) -> np.ndarray:
-        """Return the largest number of an array in each row, 0 where it is empty, shape (N,), int64."""
-        ends, flat = self._arrays[name]
+    def largest(self, column: str, field_name: str) -> np.ndarray:
+        """Return the largest number of a field in each row, 0 where there is none, shape (N,), int64."""
+        ends, fields = self._lists[column]
+        flat = fields[field_name]
         return np.array([flat[start:end].max(initial=0) for start, end in pairwise(ends)], np.int64)
 
     def texts(self, name: str) -> set[str]:
         """Return the different texts of a column."""
-        column = self._rows.column(name)
+        column = self._scalars[name]
         return set((column if pa.types.is_string(column.type) else column.flatten()).unique().to_pylist())
 
 
@@ -201,24 +212,36 @@ def write_cache_file(
     schema = _schema(
         kind, {"version": str(CACHE_VERSION), "kind": kind, "source": source, "variant": variant}
     )
-    arrays = [[attrgetter(name)(episode) for episode in episodes] for name in _arrays(kind)]
     scalars = [_scalars(episode) for episode in episodes]
-    checksums = [_checksum(*row) for row in zip(scalars, zip(*arrays, strict=True), strict=True)]
-    columns = [_pack(column) for column in arrays]
+    lists = _lists(kind)
+    arrays = {
+        name: [np.ascontiguousarray(attrgetter(name)(episode)) for episode in episodes]
+        for fields in lists.values()
+        for name in fields
+    }
+    checksums = [_checksum(*row) for row in zip(scalars, zip(*arrays.values(), strict=True), strict=True)]
+    columns = [_pack({name: arrays[name] for name in fields}) for fields in lists.values()]
     columns += map(pa.array, zip(*scalars, strict=True), _SCALARS.values())
     columns.append(pa.array(checksums, pa.uint64()))
     with atomic_write(path) as file, pa.ipc.new_file(file, schema) as writer:
         writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
 
 
-def _arrays(kind: InputKind) -> dict[str, tuple[pa.DataType, tuple[int, ...]]]:
-    return {**_ARRAYS, "images": (pa.uint8(), (3, *IMAGE_SIZES[kind]))}
+def _lists(kind: InputKind) -> dict[str, _Fields]:
+    return {**_LISTS, "images": {"images": (pa.uint8(), (3, *IMAGE_SIZES[kind]))}}
 
 
 def _schema(kind: InputKind, about: dict[str, str] | None = None) -> pa.Schema:
     lists = {
-        name: pa.list_(pa.list_(number, prod(shape)) if shape else number)
-        for name, (number, shape) in _arrays(kind).items()
+        column: pa.list_(
+            pa.struct(
+                {
+                    name: pa.list_(number, prod(shape)) if shape else number
+                    for name, (number, shape) in fields.items()
+                }
+            )
+        )
+        for column, fields in _lists(kind).items()
     }
     return pa.schema({**lists, **_SCALARS, _CHECKSUM: pa.uint64()}, about)
 
@@ -233,19 +256,29 @@ def _read_about(schema: pa.Schema) -> dict[str, Any]:  # Any: the kind is an `In
     return about
 
 
-def _pack(arrays: Sequence[np.ndarray]) -> pa.Array:
-    """Put arrays of one shape but for the first axis into a column of lists."""
-    joined = np.concatenate(arrays)
-    numbers = pa.array(joined.reshape(-1))
-    if joined.ndim > 1:
-        numbers = pa.FixedSizeListArray.from_arrays(numbers, prod(joined.shape[1:]))
-    return pa.ListArray.from_arrays(pa.array(np.cumsum([0, *map(len, arrays)]), pa.int32()), numbers)
+def _pack(fields: Mapping[str, Sequence[np.ndarray]]) -> pa.Array:
+    """Put arrays of each row, which differ in length from row to row, into a column of lists of records."""
+    columns = []
+    for arrays in fields.values():
+        joined = np.concatenate(arrays)
+        numbers = pa.array(joined.reshape(-1))
+        is_flat = joined.ndim == 1
+        columns.append(
+            numbers if is_flat else pa.FixedSizeListArray.from_arrays(numbers, prod(joined.shape[1:]))
+        )
+    ends = np.cumsum([0, *map(len, next(iter(fields.values())))])
+    records = pa.StructArray.from_arrays(columns, [*fields])
+    return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), records)
 
 
-def _unpack(column: pa.Array, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the rows of a column begin and end, and all of them as one array, without a copy."""
-    numbers = column.values.values if shape else column.values
-    return column.offsets.to_numpy(), numbers.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+def _unpack(column: pa.Array, fields: _Fields) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return where the lists of a column begin and end, and all records, field by field, without a copy."""
+    flat = {}
+    for number, (name, (_, shape)) in enumerate(fields.items()):
+        values = column.values.field(number)
+        numbers = (values.values if shape else values).to_numpy(zero_copy_only=False)
+        flat[name] = numbers.reshape(-1, *shape)
+    return column.offsets.to_numpy(), flat
 
 
 def _scalars(episode: PreprocessedEpisode) -> tuple[object, ...]:
@@ -259,7 +292,7 @@ def _checksum(scalars: tuple[object, ...], arrays: Iterable[np.ndarray]) -> int:
     """Return the xxh3 of a row, 64 bits."""
     digest = xxh3_64(repr(scalars).encode())
     for array in arrays:
-        digest.update(np.ascontiguousarray(array))
+        digest.update(array)
     return digest.intdigest()
 
 
@@ -339,8 +372,9 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         """Return the most objects in a prompt image and in an observation, shape (N, 2), int64."""
 
         def most(file: CacheFile) -> np.ndarray:
-            in_view = np.maximum(file.largest("objects_per_step"), file.counts("final.ids"))
-            return np.stack([file.largest("prompt.objects_per_image"), in_view], axis=1)
+            in_prompt = file.largest("prompt_images", "prompt.objects_per_image")
+            in_view = np.maximum(file.largest("steps", "objects_per_step"), file.counts("final"))
+            return np.stack([in_prompt, in_view], axis=1)
 
         return self._gather(most)
 
