@@ -30,6 +30,7 @@ import torch
 
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.object_cache import ObjectCache, open_object_cache
+from openvima.data.preprocessed import number_images
 from openvima.policies.processor import Processor
 from openvima.tasks import list_tasks, task_spec
 from openvima.training.batches import BatchOrder
@@ -46,7 +47,7 @@ def ways_of(cache: ObjectCache, batch: int) -> dict[str, Callable[[], object]]:
     batches = [order.rows(number) for number in range(order.batches_per_epoch)]
 
     def read_batch(rows: np.ndarray, *, images: bool) -> int:
-        episodes = [cache[row] for row in rows.tolist()]
+        episodes = number_images([cache[row] for row in rows.tolist()])
         made = processor.collate(episodes)
         if images:
             made = made.with_images([episode.images for episode in episodes])

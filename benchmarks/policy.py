@@ -37,7 +37,7 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from openvima.data.preprocessed import preprocess
+from openvima.data.preprocessed import number_images, preprocess
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.policies import preset
@@ -152,7 +152,7 @@ class Training:
     def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
         self._network, self._device = network.to(device).train(), device
         processor = Processor.of(network.config.inputs, tokenizer_of(network))
-        episodes = [preprocess(demo, processor.input_kind) for demo in demos]
+        episodes = number_images([preprocess(demo, processor.input_kind) for demo in demos])
         images = [episode.images for episode in episodes]
         self._batch = processor.collate(episodes).with_images(images).to(device)
         trained = [p for p in network.parameters() if p.requires_grad]

@@ -70,6 +70,7 @@ from openvima.data import Dataset, ShardWriter
 from openvima.policies.processor import Processor
 try:
     from openvima.data.object_cache import open_object_cache
+    from openvima.data.preprocessed import number_images
     from openvima.training.batches import BatchOrder
 except ImportError:  # of an older checkout
     from openvima.data.batching import BatchOrder
@@ -94,7 +95,7 @@ def read_batch(indices, images):
         episodes = cache.batch(indices)
         own = episodes.images, episodes.num_images
     else:
-        episodes = [cache[row] for row in indices.tolist()]
+        episodes = number_images([cache[row] for row in indices.tolist()])
         own = ([episode.images for episode in episodes],)
     made = processor.collate(episodes)
     return len((made.with_images(*own) if images else made).targets.steps_BT)

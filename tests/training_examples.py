@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from openvima.data import Demonstration
-from openvima.data.preprocessed import PreprocessedEpisode, preprocess
+from openvima.data.preprocessed import PreprocessedEpisode, number_images, preprocess
 from openvima.policies.batch import Batch
 from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
-from openvima.training.batches import ExampleSource
-from openvima.training.dataset import Example
+from openvima.training.batches import Example, ExampleSource
 
 
 def stack_images(episodes: list[PreprocessedEpisode]) -> tuple[list[Example], torch.Tensor]:
@@ -43,7 +42,7 @@ def source_of_episodes(episodes: list[PreprocessedEpisode]) -> ExampleSource:
 def collate_examples(processor: Processor, examples: Iterable[Example]) -> Batch:
     """A batch whose images are numbered as in the examples' stack."""
     examples = list(examples)
-    return processor.collate([e.episode for e in examples], [e.base for e in examples])
+    return processor.collate(number_images([e.episode for e in examples], [e.base for e in examples]))
 
 
 def rngs_of(examples: list[Example], seed: int = 0) -> list[np.random.Generator]:

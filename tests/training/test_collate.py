@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
-from openvima.data.preprocessed import preprocess  # noqa: E402
+from openvima.data.preprocessed import number_images, preprocess  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
 from openvima.perception.preprocessing import ImageStack  # noqa: E402
@@ -127,7 +127,7 @@ def test_an_episode_without_visible_objects_is_named(demonstrations_of_several_s
 
 def test_a_batch_holds_each_image_in_use_once(demonstrations_of_several_steps):
     examples, stack = examples_of(demonstrations_of_several_steps, OBJECTS)
-    episodes = [example.episode for example in examples]
+    episodes = number_images([example.episode for example in examples])
     numbered = OBJECTS.collate(episodes)
     left_out = numbered.history.crop_index_BTVN[1].unique()[-3]  # as if augmentation had hidden an object
     history = replace(

@@ -27,9 +27,9 @@ from openvima.training.augmentation.prompts import (  # noqa: E402
     with_descriptions,
     with_synonyms,
 )
+from openvima.training.batches import Example  # noqa: E402
 from openvima.training.building import training_texts  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
-from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 
 TASKS = (
@@ -81,12 +81,12 @@ def test_each_image_is_replaced_with_that_probability_and_the_others_stay(demos)
 
 
 def test_whole_prompts_become_text_with_a_probability_of_their_own(demos) -> None:
-    example = Example(preprocess(demos["visual_manipulation"], "objects"))
+    episode = preprocess(demos["visual_manipulation"], "objects")
     augment, rng = DescribeObjects(0.25, prompt_prob=0.5), np.random.default_rng(0)
-    shown = [augment(example, rng).episode.prompt.image_names for _ in range(1000)]
+    shown = [augment(episode, rng).prompt.image_names for _ in range(1000)]
     assert 0.48 < np.mean([names == () for names in shown]) < 0.58  # 0.5 + 0.5 · 0.25²
     assert len(set(shown)) == 4  # the others one by one
-    assert DescribeObjects(0.0, prompt_prob=0.5).prob and not DescribeObjects(0.0).prob
+    assert DescribeObjects(0.0)(episode, rng) is episode
 
 
 def test_synonyms_are_aliases_of_the_catalogue(demos) -> None:

@@ -26,8 +26,7 @@ from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
 from openvima.training.augmentation.prompts import motion_prompt  # noqa: E402
-from openvima.training.batches import BatchMaker, ExampleSource  # noqa: E402
-from openvima.training.dataset import Example  # noqa: E402
+from openvima.training.batches import BatchMaker, Example, ExampleSource  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.source import alternative_source, split_examples  # noqa: E402
 from training_examples import train_until  # noqa: E402

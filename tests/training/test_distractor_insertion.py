@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from object_rows import rows_of  # noqa: E402
-from openvima.data.preprocessed import preprocess  # noqa: E402
+from openvima.data.preprocessed import number_images, preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
@@ -60,7 +60,8 @@ def test_distractors_overlap_nothing_at_any_step_and_nothing_else_changes(stacke
         for seed, other in enumerate(examples):
             if other is example:
                 continue
-            more = with_distractors(replace(example, other=other), np.random.default_rng(seed)).episode
+            numbered = number_images([example.episode, other.episode], [example.base, other.base])
+            more = with_distractors(*numbered, np.random.default_rng(seed))
             before, source = example.episode, other.episode
             first = source.objects.split(source.objects_per_step)[0]
             distractors = None
@@ -124,7 +125,8 @@ def test_a_batch_contains_the_same_images_with_either_indexing(with_images, stac
     for b, example in enumerate(borrowing):
         numbers = batch.history.crop_index_BTVN[b, 0]
         shown = {images[n].numpy().tobytes() for n in numbers.flatten().tolist() if n}
-        expected = with_distractors(example, rngs_of(borrowing)[b]).episode
+        numbered = number_images([example.episode, example.other.episode], [example.base, example.other.base])
+        expected = with_distractors(*numbered, rngs_of(borrowing)[b])
         first = expected.objects.split(expected.objects_per_step)[0]
         assert shown == {stack[n].numpy().tobytes() for n in first.crop_index.flatten() if n}
 

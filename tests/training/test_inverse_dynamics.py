@@ -20,9 +20,9 @@ from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
 from openvima.training.augmentation.prompts import motion_prompt, motion_text, with_motion_prompt  # noqa: E402
+from openvima.training.batches import Example  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
 from openvima.training.config import ModelConfig  # noqa: E402
-from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 

@@ -30,9 +30,9 @@ from openvima.training.augmentation.prompts import (  # noqa: E402
     with_motion_prompt,
     with_shuffled_prompt_objects,
 )
+from openvima.training.batches import Example  # noqa: E402
 from openvima.training.building import training_texts  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
-from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
@@ -75,11 +75,11 @@ def test_a_paraphrase_keeps_images_numbers_and_textures(task, episodes):
 
 
 def test_unknown_words_are_words_and_neither_images_nor_numbers(episodes):
-    example = Example(episodes["rotate"])
-    all_unknown = UnknownWords(1.0)(example, np.random.default_rng(0)).episode.prompt.text
+    episode = episodes["rotate"]
+    all_unknown = UnknownWords(1.0)(episode, np.random.default_rng(0)).prompt.text
     assert re.fullmatch(r"<unknown> <unknown> \{dragged_obj\} \d+ <unknown>\.", all_unknown)
-    assert UnknownWords(0.0)(example, np.random.default_rng(0)) is example
-    texts = [UnknownWords(0.3)(example, np.random.default_rng(k)).episode.prompt.text for k in range(200)]
+    assert UnknownWords(0.0)(episode, np.random.default_rng(0)) is episode
+    texts = [UnknownWords(0.3)(episode, np.random.default_rng(k)).prompt.text for k in range(200)]
     assert abs(np.mean([text.count("<unknown>") for text in texts]) - 0.9) < 0.2
 
 

@@ -364,9 +364,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
 
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the visible objects of all of them, shape (N, 2), int64."""
-        return self._gather(
-            lambda file: np.stack([file.counts("actions"), file.counts("objects.ids")], axis=1)
-        )
+        return self._gather(lambda file: np.stack([file.counts("steps"), file.counts("objects")], axis=1))
 
     def widths(self) -> np.ndarray:
         """Return the most objects in a prompt image and in an observation, shape (N, 2), int64."""

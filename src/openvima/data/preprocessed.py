@@ -1,6 +1,6 @@
 """One demonstration as a policy takes it: tables of objects, and the actions to learn."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -146,6 +146,20 @@ def preprocess(
         images=stack.images()[1:],
         descriptions=image_descriptions(demo.prompt),
     )
+
+
+def number_images(
+    episodes: Sequence[PreprocessedEpisode], first_images: Sequence[int] | None = None
+) -> list[PreprocessedEpisode]:
+    """Number the images of demonstrations through, as in one stack of all of them after a blank image.
+
+    Args:
+        episodes: The demonstrations, as `preprocess` numbers them.
+        first_images: Images before those of each, where the stack holds still more; None if it does not.
+    """
+    if first_images is None:
+        first_images = np.cumsum([0, *(len(episode.images) for episode in episodes)])[:-1].tolist()
+    return [episode.with_image_offset(first) for episode, first in zip(episodes, first_images, strict=True)]
 
 
 def left_out_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:

@@ -24,7 +24,6 @@ from openvima.perception.preprocessing import (
     PreprocessedPrompt,
     extract_ahead,
     extract_observation,
-    offset_index,
     preprocess_prompt,
     split_prompt,
 )
@@ -156,15 +155,8 @@ class Processor:
         slots_BT = self._num_slots(steps, counts, np.array(num_slots))
         return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors)), stack
 
-    def batch_prompts(
-        self, prompts: Sequence[PreprocessedPrompt], first_images: np.ndarray | None = None
-    ) -> PromptBatch:
-        """Pad prompts to equal length and number objects across the batch.
-
-        Args:
-            prompts: The prompts.
-            first_images: Images of the stack before those of each prompt; None where there is one stack.
-        """
+    def batch_prompts(self, prompts: Sequence[PreprocessedPrompt]) -> PromptBatch:
+        """Pad prompts to equal length and number objects across the batch."""
         layouts = [self._layout_of(prompt) for prompt in prompts]
         # All tokens, and where they stand in the padded arrays.
         word, row, part, is_valid = np.concatenate([layout.tokens for layout in layouts]).T
@@ -178,8 +170,6 @@ class Processor:
         rows = np.stack(own_rows, axis=1)
         rows += np.where(rows >= 0, _starts([len(prompt.objects) for prompt in prompts])[b][:, None], 0)
         objects = _select_views(ObjectTable.concatenate([prompt.objects for prompt in prompts]), rows)
-        if first_images is not None:
-            objects = objects.with_image_offset(first_images[b][:, None])
         in_scene = np.concatenate([prompt.is_scene for prompt in prompts])
         first_of = _starts([len(prompt.is_scene) for prompt in prompts])
         word_ids_BL, object_index_BL = np.full(shape, PADDING_ID), np.full(shape, WORD)
@@ -201,23 +191,16 @@ class Processor:
         )
         return PromptBatch(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
-    def collate(
-        self, episodes: "Sequence[PreprocessedEpisode]", first_images: Sequence[int] | None = None
-    ) -> Batch:
+    def collate(self, episodes: "Sequence[PreprocessedEpisode]") -> Batch:
         """Pad demonstrations to equal lengths.
 
         Args:
-            episodes: The demonstrations.
-            first_images: Images before those of each demonstration, in one stack of all after a blank image;
-                None stacks those of the batch.
+            episodes: The demonstrations, their images numbered in one stack, see `number_images`.
 
         Raises:
             DatasetError: A demonstration has a step without visible objects.
             PromptError: A prompt has a word that T5 lacks.
         """
-        if first_images is None:
-            first_images = _starts([len(episode.images) for episode in episodes])
-        offsets_B = np.array(first_images, np.int64)
         steps = _Steps.of([episode.num_steps for episode in episodes])
         counts = np.concatenate([episode.objects_per_step for episode in episodes]).astype(np.int64)
         slots_BT = self._num_slots(steps, counts, np.zeros(len(episodes), np.int64))
@@ -228,7 +211,7 @@ class Processor:
             )
         objects = ObjectTable.concatenate([episode.objects for episode in episodes])
         history = self._batch_history(
-            objects.with_image_offset(np.repeat(offsets_B[steps.b], counts)[:, None]),
+            objects,
             counts,
             steps,
             slots_BT,
@@ -245,10 +228,10 @@ class Processor:
             history.steps_BT,
         )
         return Batch(
-            self.batch_prompts([episode.prompt for episode in episodes], offsets_B),
+            self.batch_prompts([episode.prompt for episode in episodes]),
             history,
             targets,
-            self._batch_false_positives([e.false_positives for e in episodes], steps, offsets_B[steps.b]),
+            self._batch_false_positives([episode.false_positives for episode in episodes], steps),
         )
 
     def _batch_history(
@@ -317,15 +300,14 @@ class Processor:
             )
 
     def _batch_false_positives(
-        self, found: "Sequence[FalsePositives]", steps: "_Steps", offsets: np.ndarray
+        self, found: "Sequence[FalsePositives]", steps: "_Steps"
     ) -> FalsePositiveBatch:
-        crop_index = np.concatenate([each.crop_index for each in found])
+        crop_index = np.concatenate([each.crop_index for each in found]).astype(np.int64)
         boxes = np.concatenate([each.boxes for each in found]).astype(np.int64)
         points = np.zeros((*crop_index.shape, 2))
         if self.layout != "frames":
             for v, view in enumerate(VIEWS):
                 points[:, v] = unproject(boxes[:, v, :2], CAMERAS[view])
-        crop_index = offset_index(crop_index, offsets[:, None])
         return FalsePositiveBatch(*(steps.pad(column) for column in (crop_index, boxes, points)))
 
     def _layout_of(self, prompt: PreprocessedPrompt) -> "_Layout":

@@ -10,10 +10,29 @@ import torch
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from openvima.data.object_cache import ObjectCache
+from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.data.torch_dataset import send
 from openvima.errors import ConfigError
 from openvima.training.augmentation.demonstrations import allows_distractors
-from openvima.training.dataset import Example
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Example:
+    """One demonstration of a batch.
+
+    Args:
+        episode: The demonstration.
+        base: Images before its own in a stack of all that are trained on: its image n has index `base + n`
+            there.
+        row: Its number among all demonstrations.
+        other: Another one, from which objects may be inserted.
+    """
+
+    episode: PreprocessedEpisode
+    base: int = 0
+    row: int = 0
+    other: "Example | None" = None
+
 
 # From examples and, in training, one generator for each, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
@@ -259,7 +278,7 @@ def read_batches(
         >>> cache, processor = open_object_cache(Dataset("demos")), Processor("objects")
         >>> order = BatchOrder(len(cache), batch_size=64, seed=0, lengths=cache.lengths())
         >>> def make(rows, number):
-        ...     return processor.collate([cache[row] for row in rows])
+        ...     return processor.collate(number_images([cache[row] for row in rows]))
         >>> for batch in read_batches(order, make, num_workers=2): ...
     """
     # Batches come as they are made; without a generator of its own the loader would draw from the global one.

@@ -1,7 +1,6 @@
 """`Learner`, the trained module: it makes batches of demonstrations, and computes a loss."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from openvima.data.preprocessed import number_images
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import Policy
@@ -27,8 +27,7 @@ from openvima.training.augmentation.demonstrations import (
     DemonstrationAugmentation,
     augmented,
 )
-from openvima.training.batches import Collate
-from openvima.training.dataset import Example
+from openvima.training.batches import Collate, Example
 from openvima.user_code import call_function
 
 
@@ -198,15 +197,18 @@ class PolicyCollate:
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
     ) -> Batch:
         """Make a batch; see `Learner.collator`."""
-        images: list[np.ndarray] = []
-        if self._with_images:
-            examples, images = _stacked(examples)
-        drawn = [None] * len(examples) if rngs is None else rngs
-        examples = [self._augmentation(example, rng) for example, rng in zip(examples, drawn, strict=True)]
-        batch = self._processor.collate([e.episode for e in examples], [e.base for e in examples])
+        shown = [*examples, *(example.other for example in examples if example.other is not None)]
+        first_images = None if self._with_images else [example.base for example in shown]
+        numbered = number_images([example.episode for example in shown], first_images)
+        others = iter(numbered[len(examples) :])
+        episodes = [
+            self._augmentation(episode, rng, None if example.other is None else next(others))
+            for example, episode, rng in zip(examples, numbered, rngs or [None] * len(examples), strict=False)
+        ]
+        batch = self._processor.collate(episodes)
         if rngs is not None:
             batch = augmented(batch, self._processor.layout, probability=self._probability, rngs=rngs)
-        return batch.with_images(images) if self._with_images else batch
+        return batch.with_images([episode.images for episode in numbered]) if self._with_images else batch
 
 
 def make_learner(name: str) -> Learner:
@@ -222,15 +224,3 @@ def make_learner(name: str) -> Learner:
     if not isinstance(learner, Learner):
         raise ConfigError(f"{name} returned a {type(learner).__name__}; it must return a Learner.")
     return learner
-
-
-def _stacked(examples: Sequence[Example]) -> tuple[list[Example], list[np.ndarray]]:
-    """Number the images of demonstrations, and of the sources of their distractors, in one stack."""
-    others = [example.other for example in examples if example.other is not None]
-    images = [example.episode.images for example in (*examples, *others)]
-    bases = np.cumsum([0, *map(len, images)])[:-1].tolist()
-    behind = (replace(other, base=base) for other, base in zip(others, bases[len(examples) :], strict=True))
-    return [
-        replace(example, base=base, other=None if example.other is None else next(behind))
-        for example, base in zip(examples, bases[: len(examples)], strict=True)
-    ], images

@@ -242,7 +242,7 @@ def test_frames_of_motions_are_scenes(demos):
     processor = Processor("objects")
     examples, _ = examples_of(demos[:1], processor)
     motion = with_motion_prompt(preprocess(demos[0], "objects"))
-    batch = collate_examples(processor, [replace(examples[0], content=motion)])
+    batch = collate_examples(processor, [replace(examples[0], episode=motion)])
     assert batch.prompts.in_scene_S.all()
     assert batch.prompts.image_index_S.max() == demos[0].num_steps
 

@@ -28,7 +28,6 @@ from openvima.training.augmentation.prompts import (
     with_shuffled_prompt_objects,
 )
 from openvima.training.config import AugmentationConfig
-from openvima.training.dataset import Example
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +41,9 @@ class DropUnusedObjects:
 
     prob: float
 
-    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
         """Augment a demonstration."""
-        if not self.prob:
-            return example
-        return replace(example, content=without_unused_objects(example.episode, self.prob, rng))
+        return without_unused_objects(episode, self.prob, rng) if self.prob else episode
 
 
 def without_unused_objects(
@@ -88,27 +85,22 @@ def allows_distractors(task: str) -> bool:
         return False
 
 
-def with_distractors(example: Example, rng: np.random.Generator) -> Example:
+def with_distractors(
+    episode: PreprocessedEpisode, other: PreprocessedEpisode, rng: np.random.Generator
+) -> PreprocessedEpisode:
     """Insert up to three objects of another demonstration, where they are, at all steps.
 
     Their boxes overlap no other box of any step. Only table rows are copied, no images. In few episodes a
     distractor matches the prompt as well as the target does, which makes the prompt ambiguous.
 
     Args:
-        example: The demonstration. Distractors come from the first step of `example.other`, if the loader
-            supplied one; its images are part of the same stack.
+        episode: The demonstration.
+        other: Distractors come from its first step; the images of both are numbered in one stack.
         rng: Draws how many, and which.
-
-    Returns:
-        The demonstration with numbers of images that count through the whole stack.
     """
-    other = example.other
-    if other is None:
-        return example
-    episode = example.episode.with_image_offset(example.base)
     count = int(rng.integers(1, MAX_DISTRACTORS + 1))
-    there = other.episode.objects.select(slice(0, int(other.episode.objects_per_step[0])))
-    there = there.with_image_offset(other.base).select(rng.permutation(len(there)))
+    there = other.objects.select(slice(0, int(other.objects_per_step[0])))
+    there = there.select(rng.permutation(len(there)))
     there = there.select(np.asarray(there.masks.all(axis=1)))
     taken = box_iou(*_boxes_by_view(there), *_boxes_by_view(episode.objects)) > 0
     there = there.select(np.flatnonzero(~taken.any(axis=1))[:count])
@@ -116,9 +108,7 @@ def with_distractors(example: Example, rng: np.random.Generator) -> Example:
     steps = episode.objects.split(episode.objects_per_step)
     objects = ObjectTable.concatenate([table for step in steps for table in (step, there)])
     objects_per_step = episode.objects_per_step + len(there)
-    return replace(
-        example, content=replace(episode, objects=objects, objects_per_step=objects_per_step), base=0
-    )
+    return replace(episode, objects=objects, objects_per_step=objects_per_step)
 
 
 def _boxes_by_view(objects: ObjectTable) -> tuple[np.ndarray, np.ndarray]:
@@ -126,7 +116,7 @@ def _boxes_by_view(objects: ObjectTable) -> tuple[np.ndarray, np.ndarray]:
     return objects.boxes.swapaxes(0, 1), objects.masks.T
 
 
-Transform: TypeAlias = Callable[[Example, np.random.Generator], Example]
+Transform: TypeAlias = Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,13 +129,11 @@ class Randomly:
     """
 
     prob: float
-    augment: Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
+    augment: Transform
 
-    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
         """Augment a demonstration, or leave it as it is."""
-        if not self.prob or rng.random() >= self.prob:
-            return example
-        return replace(example, content=self.augment(example.episode, rng))
+        return self.augment(episode, rng) if self.prob and rng.random() < self.prob else episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,23 +143,36 @@ class DemonstrationAugmentation:
     Args:
         inverse_dynamics_prob: Probability of the inverse-dynamics prompt.
         of_inverse_dynamics: Transforms of demonstrations with that prompt.
-        of_tasks: Transforms of those with the prompt of their task.
+        of_tasks: Transforms of those with the prompt of their task, after distractors were inserted.
     """
 
     inverse_dynamics_prob: float = 0.0
     of_inverse_dynamics: tuple[Transform, ...] = ()
-    of_tasks: tuple[Transform, ...] = (with_distractors,)
+    of_tasks: tuple[Transform, ...] = ()
 
-    def __call__(self, example: Example, rng: np.random.Generator | None) -> Example:
-        """Augment a demonstration; without a generator, as in validation, only what is certain happens."""
+    def __call__(
+        self,
+        episode: PreprocessedEpisode,
+        rng: np.random.Generator | None,
+        other: PreprocessedEpisode | None = None,
+    ) -> PreprocessedEpisode:
+        """Augment a demonstration; without a generator, as in validation, only what is certain happens.
+
+        Args:
+            episode: The demonstration.
+            rng: Source of all draws.
+            other: A demonstration from which distractors are inserted; None inserts none.
+        """
         prob = self.inverse_dynamics_prob
         is_inverse = prob == 1 or (rng is not None and prob > 0 and rng.random() < prob)
         if is_inverse:
-            example = replace(example, content=with_motion_prompt(example.episode))
+            episode = with_motion_prompt(episode)
+        elif rng is not None and other is not None:
+            episode = with_distractors(episode, other, rng)
         if rng is not None:
             for transform in self.of_inverse_dynamics if is_inverse else self.of_tasks:
-                example = transform(example, rng)
-        return example
+                episode = transform(episode, rng)
+        return episode
 
 
 NO_AUGMENTATION = DemonstrationAugmentation()
@@ -184,7 +185,6 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
         config.inverse_dynamics_prob,
         of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob), shuffle_prompt_objects),
         of_tasks=(
-            with_distractors,  # acts where the loader supplies another demonstration
             Randomly(config.paraphrase_prob, paraphrased),  # before others change the text
             Randomly(config.rename_objects_prob, renamed),
             Randomly(config.shuffle_sentences_prob, shuffled),

@@ -20,7 +20,6 @@ from openvima.tasks.paraphrasing import rephrased, training_paraphrases
 from openvima.tasks.prompts import synonyms, with_phrases
 from openvima.tasks.registry import task_spec
 from openvima.tasks.sweep_table import NUMBER_WORDS
-from openvima.training.dataset import Example
 
 DEFINITION = "This is a {noun} {image}."  # as in `novel_noun`
 
@@ -167,20 +166,14 @@ class DescribeObjects:
     synonym_prob: float = 0.0
     prompt_prob: float = 0.0
 
-    @property
-    def prob(self) -> float:
-        """A probability that is 0 if nothing is ever replaced."""
-        return max(self.image_prob, self.prompt_prob)
-
-    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
         """Augment a demonstration."""
-        if not self.prob:
-            return example
+        if not (self.image_prob or self.prompt_prob):
+            return episode
         prob = 1.0 if self.prompt_prob and rng.random() < self.prompt_prob else self.image_prob
-        episode = example.episode
         if self.synonym_prob:
             episode = with_synonyms(episode, self.synonym_prob, rng)
-        return replace(example, content=with_descriptions(episode, prob, rng))
+        return with_descriptions(episode, prob, rng)
 
 
 def with_descriptions(
@@ -234,18 +227,17 @@ class UnknownWords:
 
     prob: float
 
-    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
         """Augment a demonstration."""
         if not self.prob:
-            return example
+            return episode
 
         def masked(found: re.Match[str]) -> str:
             is_word = found[0][0] != "{"
             return UNKNOWN if is_word and rng.random() < self.prob else found[0]
 
-        prompt = example.episode.prompt
-        prompt = replace(prompt, text=_SLOT_OR_WORD.sub(masked, prompt.text))
-        return replace(example, content=replace(example.episode, prompt=prompt))
+        text = _SLOT_OR_WORD.sub(masked, episode.prompt.text)
+        return replace(episode, prompt=replace(episode.prompt, text=text))
 
 
 def with_shuffled_prompt_objects(
