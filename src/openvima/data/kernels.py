@@ -1,4 +1,4 @@
-"""Compiled loops: colours of pixels joined and parted again, pieces of memory gathered."""
+"""Compiled loops: colours of pixels joined and parted again."""
 
 from openvima.compilation import njit
 
@@ -28,16 +28,3 @@ def part_colours(pixels, planes):
             given, plane = pixels[image], planes[image, colour]
             for pixel in range(planes.shape[2]):
                 plane[pixel] = given[3 * pixel + colour]
-
-
-@njit
-def gather(words, starts, sizes, gathered):
-    """Copy spans of `words` (W,), all int32, one after the other to `gathered`.
-
-    Span k has `sizes[k]` words from `starts[k]` on; both are int64, shape (K,).
-    """
-    end = 0
-    for k in range(len(starts)):
-        for word in range(starts[k], starts[k] + sizes[k]):
-            gathered[end] = words[word]
-            end += 1
