@@ -24,14 +24,14 @@ from openvima.catalog.partitions import TEXTURE_SETS, tasks_at
 from openvima.policies.checkpoint import load_network
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
-from openvima.training.augmentation.scenes import rearranged
+from openvima.training.augmentation.scenes import rearrange
 from openvima.training.pretraining.losses import retrieval_accuracy, rotation_accuracy
 from openvima.training.pretraining.pairs import (
     Pairs,
     SceneAugmentation,
     pairs_of_scene,
     render_pairs,
-    stacked,
+    stack_rows,
 )
 from sim import circumstances
 
@@ -58,8 +58,8 @@ def scenes_of(shape: str, num_scenes: int) -> Pairs:
                 for k, y in enumerate(POSITIONS_Y)
             )
         )
-        rows += pairs_of_scene(scene, {}, rasteriser, number, rearranged(scene, rng))
-    return stacked(rows)
+        rows += pairs_of_scene(scene, {}, rasteriser, number, rearrange(scene, rng))
+    return stack_rows(rows)
 
 
 def _lying(y: float, rng: np.random.Generator) -> Pose:

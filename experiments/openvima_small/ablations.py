@@ -36,8 +36,8 @@ from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import with_variant
 from openvima.report.typesetting import Estimate, Line, Table, markdown
 from openvima.training import TrainingConfig, train
-from openvima.training.recipes import overridden, recipe_settings
-from openvima.training.run_folder import logged_costs
+from openvima.training.recipes import override, recipe_settings
+from openvima.training.run_folder import read_costs
 
 _PRETRAINED = ("images.crop_encoder.", "images.appearance.", "images.rotation.", "attributes.")
 _SHORT_PRETRAINING = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000}
@@ -247,7 +247,7 @@ def settings_of(name: str, recipe: str) -> Settings:
     """Return the settings of a variant, without paths, seed and length."""
     alone = {"runtime.processes": 1, "runtime.tensorboard": False}  # several commands share the cores instead
     pretraining = {} if VARIANTS[name].has_own_crops else {"pretraining.steps": 0}
-    return overridden(recipe_settings(recipe), {**alone, **pretraining, **VARIANTS[name].settings})
+    return override(recipe_settings(recipe), {**alone, **pretraining, **VARIANTS[name].settings})
 
 
 def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:  # Any: plain JSON values
@@ -291,7 +291,7 @@ def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
         "seed": seed,
         "recipe": given.recipe,
         "parameters": sum(p.numel() for p in network.parameters()),
-        "minutes": round(logged_costs(run)["seconds"] / 60, 1),
+        "minutes": round(read_costs(run)["seconds"] / 60, 1),
         "first_episode": evaluation.seed,
         "solved": solved(results),
     }

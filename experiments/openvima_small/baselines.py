@@ -22,7 +22,7 @@ from openvima.data import Dataset
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
 from openvima.policies.naming import find_checkpoint
-from openvima.training.run_folder import TIMINGS_FILE, logged_costs, whole_lines
+from openvima.training.run_folder import TIMINGS_FILE, read_costs, whole_lines
 
 _TIMED_STEPS, _FIRST_STEPS = 100, 40  # the first ones load data and caches
 _COMMON = (
@@ -85,7 +85,7 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
         "steps": int(steps),
         "learning_rate": given.learning_rate,
         "parameters": policy_size(read_info(find_checkpoint(run)).config).parameters.total,
-        "minutes": round(logged_costs(run)["seconds"] / 60, 1),
+        "minutes": round(read_costs(run)["seconds"] / 60, 1),
         "evaluation": f"{name}/evaluation/results.json",
     }
 

@@ -23,10 +23,10 @@ from openvima.training.run_folder import (
     METRICS_FILE,
     SESSIONS_FILE,
     TIMINGS_FILE,
-    logged_costs,
+    read_costs,
     whole_lines,
 )
-from openvima.training.validation import flattened
+from openvima.training.validation import flatten
 
 RECORD = "training"  # folder beside the weights
 DATA = "training_data.json"
@@ -99,7 +99,7 @@ def shipped(folder: Path) -> Shipped | None:
     """Read the record of the bundled weights; None where it is absent."""
     if not (folder / RECORD / SESSIONS_FILE).is_file():
         return None
-    sessions, costs = _sessions(folder / RECORD), logged_costs(folder / RECORD)
+    sessions, costs = _sessions(folder / RECORD), read_costs(folder / RECORD)
     return Shipped(
         policy_size(read_info(folder).config).parameters.total,
         (folder / WEIGHTS_FILE).stat().st_size,
@@ -128,7 +128,7 @@ def facts(found: Shipped) -> list[tuple[str, str]]:
 
 def settings(folder: Path) -> list[tuple[str, str]]:
     """Return the settings of the shipped run that add or change data, where they are not zero."""
-    chosen = flattened(
+    chosen = flatten(
         yaml.safe_load((folder / RECORD / "config.yaml").read_text(encoding="utf-8"))["training"]
     )
     return [(name, f"{value:g}") for name, value in chosen.items() if _SETTING.search(name) and value]

@@ -21,7 +21,7 @@ from openvima.evaluation.statistics.proportions import mean_of_rates
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
 from openvima.policies.naming import find_checkpoint
-from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, logged_costs, whole_lines
+from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, read_costs, whole_lines
 
 LEVELS = ("L1", "L2", "L3", "L4")
 RANDOM_APPEARANCE = ("--loader.rerendered-prob", "0.3")
@@ -80,7 +80,7 @@ def record_of(what: str, run: Path, scores: Path, *, options: list[str]) -> dict
     results = json.loads((scores / "results.json").read_text("utf-8"))
     curve = [values for _, values in whole_lines(run / METRICS_FILE) if "validation_loss" in values]
     keys = ("step", "validation_loss", "validation_accuracy", "validation_pick_accuracy")
-    costs = logged_costs(run)
+    costs = read_costs(run)
     return {
         "what": what,
         "options": options,

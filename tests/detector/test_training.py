@@ -24,7 +24,7 @@ from openvima.training.config import RuntimeConfig, ScheduleConfig  # noqa: E402
 from openvima.training.detector import DetectorTrainingConfig, train_detector  # noqa: E402
 from openvima.training.detector.config import FrameLoaderConfig  # noqa: E402
 from openvima.training.detector.stage import split_episodes  # noqa: E402
-from openvima.training.validation import flattened  # noqa: E402
+from openvima.training.validation import flatten  # noqa: E402
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ train_detector(DetectorTrainingConfig.of(settings))
 def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(settings, tiny, tmp_path):
     plain = {
         name: str(value) if isinstance(value, Path) else value
-        for name, value in flattened(asdict(settings)).items()
+        for name, value in flatten(asdict(settings)).items()
     }
     argument = json.dumps([tiny.to_dict(), plain])
     killed = subprocess.run([sys.executable, "-c", TRAIN, argument], capture_output=True, check=False)

@@ -12,7 +12,7 @@ from openvima.policies.nn.action_head import ObservationTokens, pointing_loss
 from openvima.policies.nn.actions import PLACE_NEAR_M, ActionTargets
 from openvima.policies.presets import preset
 from openvima.training import TrainingConfig
-from openvima.training.building import build_learner, resolved
+from openvima.training.building import build_learner, resolve
 
 B, T, Q, D = 2, 3, 5, 8
 
@@ -68,7 +68,7 @@ def test_policies_without_a_token_for_each_object_refuse_it(name):
         {"data": Path("demos"), "out": Path("run"), "preset": name, "optimizer.pointing_loss_weight": 0.5}
     )
     with pytest.raises(ConfigError, match=f"pointing_loss_weight is 0.5, but preset '{name}'"):
-        resolved(config)
+        resolve(config)
 
 
 @pytest.mark.parametrize("name", ["vima-nano", "midas-nano", "nano-bins"])

@@ -20,7 +20,7 @@ from openvima.studies import (
     scale_named,
 )
 from openvima.studies.plan import plan_study
-from openvima.training.building import resolved
+from openvima.training.building import resolve
 
 INPUTS = StudyInputs(scale_named("nano"))
 OUT = Path("/study")
@@ -74,7 +74,7 @@ def test_every_study_can_be_planned_at_every_scale(name: str, scale: str) -> Non
     assert study.name == name
     assert plan.num_stages >= len(study.runs)
     for training in (*plan.initial, *plan.trainings):
-        resolved(training.config)
+        resolve(training.config)
 
 
 @pytest.mark.parametrize(

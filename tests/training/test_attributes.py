@@ -21,7 +21,7 @@ from openvima.scene.prompt import PLACEHOLDER  # noqa: E402
 from openvima.tasks import list_tasks, task_spec  # noqa: E402
 from openvima.tasks.paraphrasing import training_paraphrases  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.building import resolved  # noqa: E402
+from openvima.training.building import resolve  # noqa: E402
 from openvima.training.pretraining.losses import (  # noqa: E402
     _compare_attributes,
     _images,
@@ -219,12 +219,12 @@ def test_the_weight_needs_attributes_and_these_the_preset_small(tmp_path):
     settings = {"data": tmp_path, "out": tmp_path / "run", "preset": "small"}
     with pytest.raises(ConfigError, match=r"set model\.attributes, or"):
         wanted = {"model.attributes": False, "pretraining.attribute_loss_weight": 1}
-        resolved(TrainingConfig.of({**settings, **wanted}))
+        resolve(TrainingConfig.of({**settings, **wanted}))
     with pytest.raises(ConfigError, match=r"set model\.attributes to False"):
-        resolved(TrainingConfig.of({**settings, "pretraining.attribute_loss_weight": 0}))
+        resolve(TrainingConfig.of({**settings, "pretraining.attribute_loss_weight": 0}))
     with pytest.raises(ConfigError, match="preset small"):
-        resolved(TrainingConfig.of({**settings, "preset": "nano", "model.attributes": True}))
-    resolved(TrainingConfig.of({**recipe_settings("small"), "data": tmp_path, "out": tmp_path / "run"}))
+        resolve(TrainingConfig.of({**settings, "preset": "nano", "model.attributes": True}))
+    resolve(TrainingConfig.of({**recipe_settings("small"), "data": tmp_path, "out": tmp_path / "run"}))
 
 
 @pytest.mark.slow

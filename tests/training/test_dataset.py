@@ -18,10 +18,10 @@ from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
 from openvima.tasks.registry import held_out_tasks, list_tasks  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
-from openvima.training.augmentation.demonstrations import augmented  # noqa: E402
+from openvima.training.augmentation.demonstrations import add_false_positives  # noqa: E402
 from openvima.training.batches import ExampleSource  # noqa: E402
 from openvima.training.building import (  # noqa: E402
-    resolved,
+    resolve,
     training_texts,
 )
 from openvima.training.config import AugmentationConfig  # noqa: E402
@@ -110,7 +110,7 @@ def test_excluded_tasks_identify_a_run_in_any_order(settings):
         TrainingConfig.of({**settings, "loader.exclude_tasks": names})
         for names in ("rotate, follow_motion", "follow_motion,rotate,", "rotate")
     ]
-    first, second, third = (resolved(config).identity() for config in configs)
+    first, second, third = (resolve(config).identity() for config in configs)
     assert first == second != third
     assert first["loader"]["exclude_tasks"] == "follow_motion,rotate"
 
@@ -174,9 +174,11 @@ def test_augmentation_of_an_example_does_not_depend_on_its_batch(layout, demonst
     processor = Processor(layout)
     examples, _ = examples_of(demonstrations_of_several_steps, processor)
     collate, rngs = partial(collate_examples, processor), rngs_of(examples)
-    together = augmented(collate(examples), layout, probability=0.5, rngs=rngs)
+    together = add_false_positives(collate(examples), layout, probability=0.5, rngs=rngs)
     for b, example in enumerate(examples):
-        alone = augmented(collate([example]), layout, probability=0.5, rngs=rngs_of(examples)[b : b + 1])
+        alone = add_false_positives(
+            collate([example]), layout, probability=0.5, rngs=rngs_of(examples)[b : b + 1]
+        )
         for t in range(example.episode.num_steps):
             for v in range(2):
                 assert shown(together.history, b, t, v) == shown(alone.history, 0, t, v)
@@ -186,7 +188,7 @@ def test_augmentation_of_an_example_does_not_depend_on_its_batch(layout, demonst
 
 def test_targets_follow_their_objects_through_shuffling(examples):
     batch = collate_examples(OBJECTS, examples)
-    changed = augmented(batch, "objects", probability=0.5, rngs=rngs_of(examples))
+    changed = add_false_positives(batch, "objects", probability=0.5, rngs=rngs_of(examples))
     for b, t in np.argwhere(batch.targets.steps_BT.numpy()):
         for targets in ("pick_BT", "place_BT"):
             old, new = getattr(batch.targets, targets)[b, t], getattr(changed.targets, targets)[b, t]
@@ -204,7 +206,7 @@ def test_targets_follow_their_objects_through_shuffling(examples):
 def test_a_false_positive_is_in_one_view_only(examples):
     batch = collate_examples(OBJECTS, examples[:4])
     nothing = replace(batch.history, masks_BTVN=torch.zeros_like(batch.history.masks_BTVN))
-    changed = augmented(
+    changed = add_false_positives(
         replace(batch, history=nothing),
         "objects",
         probability=1.0,
@@ -230,7 +232,7 @@ def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
 
 def test_false_positives_come_anywhere_among_the_ordered_objects_of_a_view(views):
     batch = collate_examples(VIEWS, views[0])
-    changed = augmented(batch, "views", probability=0.5, rngs=rngs_of(views[0], 1))
+    changed = add_false_positives(batch, "views", probability=0.5, rngs=rngs_of(views[0], 1))
     before, after = batch.history, changed.history
     places = []
     for b, t, v in np.ndindex(*before.masks_BTVN.shape[:3]):
@@ -252,7 +254,7 @@ def test_false_positives_come_anywhere_among_the_ordered_objects_of_a_view(views
 
 def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
     batch = collate_examples(VIEWS, views[0])
-    after = augmented(batch, "views", probability=0.3, rngs=rngs_of(views[0], 1)).history
+    after = add_false_positives(batch, "views", probability=0.3, rngs=rngs_of(views[0], 1)).history
     visible_BTV = after.masks_BTVN.sum(dim=3)
     for b, t in np.argwhere(batch.history.steps_BT.numpy()):
         for v in range(2):  # visible ones first, then empty ones: black, without a box
@@ -269,7 +271,7 @@ def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
 
 def test_without_false_positives_views_are_unchanged(views):
     batch = collate_examples(VIEWS, views[0])
-    after = augmented(batch, "views", probability=0.0, rngs=rngs_of(views[0])).history
+    after = add_false_positives(batch, "views", probability=0.0, rngs=rngs_of(views[0])).history
     count = batch.history.masks_BTVN.shape[3]
     assert torch.equal(after.num_slots_BT, batch.history.num_slots_BT)
     assert torch.equal(after.crop_index_BTVN[..., :count], batch.history.crop_index_BTVN)
@@ -283,4 +285,4 @@ def test_whole_frames_get_no_false_positives_and_stay_uint8(demonstrations_of_se
     assert images.dtype == torch.uint8
     assert images.shape[1:] == (3, 64, 128)
     batch = collate_examples(processor, examples)
-    assert augmented(batch, "frames", probability=1.0, rngs=rngs_of(examples)) is batch
+    assert add_false_positives(batch, "frames", probability=1.0, rngs=rngs_of(examples)) is batch

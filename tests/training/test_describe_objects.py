@@ -22,7 +22,7 @@ from openvima.training import sequence_lengths  # noqa: E402
 from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
 from openvima.training.augmentation.prompts import (  # noqa: E402
     DescribeObjects,
-    renamed,
+    rename_objects,
     text_of,
     with_descriptions,
     with_synonyms,
@@ -123,7 +123,7 @@ def test_words_of_descriptions_are_in_the_vocabulary(data) -> None:
     augmentation = replace(ALWAYS, rename_objects_prob=1.0)
     tokenizer = WordTokenizer(Vocabulary().extended(training_texts(dataset, augmentation)))
     for episode in open_object_cache(dataset):
-        for changed in (episode, renamed(episode, np.random.default_rng(episode.seed))):
+        for changed in (episode, rename_objects(episode, np.random.default_rng(episode.seed))):
             text = with_descriptions(changed, 1.0, np.random.default_rng(0)).prompt.text
             for piece in split_prompt(text):
                 if isinstance(piece, str):

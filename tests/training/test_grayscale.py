@@ -17,13 +17,13 @@ from openvima.tasks.novel_words import gray_image  # noqa: E402
 from openvima.training import TrainingConfig, policy, train  # noqa: E402
 from openvima.training.augmentation.scenes import with_random_appearance  # noqa: E402
 from openvima.training.pretraining import losses  # noqa: E402
-from openvima.training.pretraining.losses import info_nce, matches, retrieval_accuracy  # noqa: E402
+from openvima.training.pretraining.losses import find_matches, info_nce, retrieval_accuracy  # noqa: E402
 from openvima.training.pretraining.pairs import (  # noqa: E402
     Pairs,
     SceneAugmentation,
     pairs_of_scene,
     render_pairs,
-    stacked,
+    stack_rows,
 )
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
@@ -40,7 +40,7 @@ def rasteriser() -> Rasteriser:
 
 
 def pairs_of(rasteriser: Rasteriser, *placements: Placement, is_grayscale=()) -> Pairs:
-    return stacked(pairs_of_scene(Scene(placements), {}, rasteriser, 0, is_grayscale=is_grayscale))
+    return stack_rows(pairs_of_scene(Scene(placements), {}, rasteriser, 0, is_grayscale=is_grayscale))
 
 
 def drawn(augmentation: SceneAugmentation, seed: int = 0) -> Pairs:
@@ -81,7 +81,7 @@ def test_a_grayscale_row_matches_its_shape_and_others_their_appearance(rasterise
     red_a = replace(RED_A, id=9, pose=Pose.planar(0.4, 0.3))
     placements = (RED_A, BLUE_A, HIGH_HEART, purple_a, red_a)
     pairs = pairs_of(rasteriser, *placements, is_grayscale=[True, False, True, False, False])
-    assert matches(pairs).int().tolist() == [
+    assert find_matches(pairs).int().tolist() == [
         [1, 1, 0, 1, 1],  # a grayscale A
         [0, 1, 0, 0, 0],
         [0, 0, 1, 0, 0],  # a grayscale heart
@@ -126,7 +126,7 @@ def test_a_grayscale_prompt_image_retrieves_any_object_of_its_shape(monkeypatch)
     def embedded(encoder, crops, masks):
         return torch.nn.functional.one_hot(crops[:, 0, 0, 0, 0].long(), 3).float()
 
-    monkeypatch.setattr(losses, "embedded", embedded)
+    monkeypatch.setattr(losses, "embed", embedded)
     assert retrieval_accuracy(None, pairs) == pytest.approx(1 / 3)  # the first; the last is no shape of 8
     assert retrieval_accuracy(None, replace(pairs, is_grayscale=~is_grayscale)) == pytest.approx(1 / 3)
     assert retrieval_accuracy(None, replace(pairs, is_grayscale=torch.zeros_like(is_grayscale))) == 0

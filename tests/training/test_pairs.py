@@ -11,7 +11,7 @@ from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
 from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.tasks import sample_episode  # noqa: E402
-from openvima.training.augmentation.crops import channel_mixing  # noqa: E402
+from openvima.training.augmentation.crops import draw_channel_mixing  # noqa: E402
 from openvima.training.augmentation.scenes import ShapeKinds, with_random_appearance  # noqa: E402
 from openvima.training.loop import step_generator  # noqa: E402
 from openvima.training.parallel import Parallel  # noqa: E402
@@ -95,7 +95,7 @@ def test_processes_share_the_scenes(monkeypatch):
 
 def test_channel_mixing_keeps_grey():
     generator = step_generator(0, "colours", 0)
-    mixings = torch.stack([channel_mixing(generator) for _ in range(50)])
+    mixings = torch.stack([draw_channel_mixing(generator) for _ in range(50)])
     torch.testing.assert_close(mixings.sum(dim=2), torch.ones(50, 3))
     assert (mixings >= 0).all()
     unchanged = (mixings == torch.eye(3)).all(dim=2).all(dim=1).float().mean()

@@ -19,8 +19,8 @@ from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.parallel import (  # noqa: E402
-    joined,
-    joined_by,
+    join_processes,
+    start_peers,
 )
 
 pytestmark = pytest.mark.slow
@@ -143,7 +143,7 @@ def test_processes_share_contrastive_pretraining(settings, tmp_path) -> None:
     settings["augmentation.text_description_prob"] = 1.0
     one = train(TrainingConfig.of({**settings, "out": tmp_path / "one"}))
     shared = {**settings, "out": tmp_path / "two"}
-    with joined_by(1, script_arguments(shared)):
+    with start_peers(1, script_arguments(shared)):
         two = train(TrainingConfig.of(shared))
     assert "WORLD_SIZE" not in os.environ
     pairs = [(a, b) for a, b in zip(losses(one), losses(two), strict=True) if a["name"] == "1-pretraining"]
@@ -221,5 +221,5 @@ def test_another_device_trains_equally(preset, bins, tmp_path, monkeypatch) -> N
 def test_a_missing_device_is_named() -> None:
     for device in ("gpu0", "meta", "cuda:99", *(() if torch.cuda.is_available() else ("cuda",))):
         message = f"device is '{device}'; it must be auto, cpu"
-        with pytest.raises(ConfigError, match=message), joined(device, "ddp"):
+        with pytest.raises(ConfigError, match=message), join_processes(device, "ddp"):
             pass

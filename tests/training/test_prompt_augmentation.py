@@ -20,15 +20,15 @@ from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import (  # noqa: E402
     DemonstrationAugmentation,
     Randomly,
-    without_unused_objects,
+    drop_unused_objects,
 )
 from openvima.training.augmentation.prompts import (  # noqa: E402
     UnknownWords,
-    paraphrased,
-    renamed,
-    shuffled,
+    paraphrase,
+    rename_objects,
+    shuffle_prompt_objects,
+    shuffle_sentences,
     with_motion_prompt,
-    with_shuffled_prompt_objects,
 )
 from openvima.training.batches import Example  # noqa: E402
 from openvima.training.building import training_texts  # noqa: E402
@@ -64,14 +64,14 @@ def _images(episode) -> dict[str, list]:
 def test_a_paraphrase_keeps_images_numbers_and_textures(task, episodes):
     episode, texts = episodes[task], set()
     for seed in range(20):
-        said = paraphrased(episode, np.random.default_rng(seed))
+        said = paraphrase(episode, np.random.default_rng(seed))
         assert _images(said) == _images(episode)
         assert re.findall(r"\b\d+", said.prompt.text) == re.findall(r"\b\d+", episode.prompt.text)
         texts.add(said.prompt.text)
     assert len(texts) > 3
     assert episode.prompt.text not in texts
     other = replace(episodes["rotate"], prompt=replace(episode.prompt, text="Spin it."))
-    assert paraphrased(other, np.random.default_rng(0)) is other
+    assert paraphrase(other, np.random.default_rng(0)) is other
 
 
 def test_unknown_words_are_words_and_neither_images_nor_numbers(episodes):
@@ -97,7 +97,7 @@ def test_the_vocabulary_has_the_words_of_paraphrases(tmp_path):
 def test_renamed_objects_keep_image_and_placeholder(task, episodes):
     episode, with_others = episodes[task], 0
     for seed in range(12):
-        named = renamed(episode, np.random.default_rng(seed))
+        named = rename_objects(episode, np.random.default_rng(seed))
         images = _images(named)
         others = [images.pop(name) for name in list(images) if name.startswith("other_")]
         assert images == _images(episode)
@@ -129,18 +129,18 @@ def test_a_renamed_object_has_no_article_beside_another_determiner(determiner, e
     text = f"Sweep {determiner} {{dragged_obj}} into {{base_obj}}."
     episode = replace(episode, prompt=replace(episode.prompt, text=text))
     for seed in range(12):
-        *_, rest = renamed(episode, np.random.default_rng(seed)).prompt.text.split(". ")
+        *_, rest = rename_objects(episode, np.random.default_rng(seed)).prompt.text.split(". ")
         assert re.fullmatch(rf"Sweep {determiner} ({{dragged_obj}}|\w+) into ({{base_obj}}|the \w+)\.", rest)
 
 
 @pytest.mark.parametrize("task", KEPT)
 def test_prompts_with_novel_words_or_without_single_objects_are_unchanged(task, episodes):
-    assert renamed(episodes[task], np.random.default_rng(0)) is episodes[task]
+    assert rename_objects(episodes[task], np.random.default_rng(0)) is episodes[task]
 
 
 def test_objects_are_renamed_in_training_and_not_in_validation(episodes):
     several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
-    naming = DemonstrationAugmentation(of_tasks=(Randomly(1.0, renamed),))
+    naming = DemonstrationAugmentation(of_tasks=(Randomly(1.0, rename_objects),))
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True, augmentation=naming)
     plain = PolicyCollate(Processor("objects"), 0.0, with_images=True)
     assert torch.equal(collate(several).prompts.word_ids_BL, plain(several).prompts.word_ids_BL)
@@ -153,8 +153,8 @@ def test_shuffled_sentences_keep_images_and_placeholders(task, episodes):
     seen, examples = set(), set()
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        before = renamed(episodes[task], rng)
-        after = shuffled(before, rng)
+        before = rename_objects(episodes[task], rng)
+        after = shuffle_sentences(before, rng)
         sentences, images = before.prompt.text.split(". "), _images(before)
         assert all(images[name] == rows for name, rows in _images(after).items())
         assert after.prompt.objects_per_image.sum() == len(after.prompt.objects)
@@ -173,13 +173,13 @@ def test_shuffled_sentences_keep_images_and_placeholders(task, episodes):
 @pytest.mark.parametrize("task", ["twist", "rearrange", "same_shape"])
 def test_prompts_without_definitions_stay_in_order(task, episodes):
     episode = episodes[task]
-    assert shuffled(episode, np.random.default_rng(0)) is episode
+    assert shuffle_sentences(episode, np.random.default_rng(0)) is episode
 
 
 def test_an_instruction_of_two_sentences_stays_in_one_piece(episodes):
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        text = shuffled(renamed(episodes["pick_in_order_then_restore"], rng), rng).prompt.text
+        text = shuffle_sentences(rename_objects(episodes["pick_in_order_then_restore"], rng), rng).prompt.text
         assert ". Finally restore it into its original container." in text
         assert text.index("Put ") < text.index("Finally")
 
@@ -192,7 +192,7 @@ def test_only_unused_objects_are_dropped_from_observations_or_prompt_frames(task
     assert bystanders
     unseen, unpictured = set(), set()
     for seed in range(20):
-        less = without_unused_objects(motion, 0.5, np.random.default_rng(seed))
+        less = drop_unused_objects(motion, 0.5, np.random.default_rng(seed))
         assert less.objects_per_step.sum() == len(less.objects)
         assert less.prompt.objects_per_image.sum() == len(less.prompt.objects)
         assert np.array_equal(less.pick_ids, motion.pick_ids)
@@ -211,7 +211,7 @@ def test_only_unused_objects_are_dropped_from_observations_or_prompt_frames(task
         unseen |= gone[0]
         unpictured |= gone[1]
     assert unseen == unpictured == bystanders
-    same = without_unused_objects(motion, 0.0, np.random.default_rng(0))
+    same = drop_unused_objects(motion, 0.0, np.random.default_rng(0))
     for ours, theirs in ((same.objects, motion.objects), (same.prompt.objects, motion.prompt.objects)):
         assert np.array_equal(rows_of(ours), rows_of(theirs))
 
@@ -237,7 +237,7 @@ def test_settings_that_need_objects_and_their_ids_say_so(settings, message, tmp_
 def test_each_prompt_image_lists_its_objects_in_an_order_of_its_own(task, episodes):
     episode, orders = episodes[task], set()
     for seed in range(5):
-        shuffled_episode = with_shuffled_prompt_objects(episode, np.random.default_rng(seed))
+        shuffled_episode = shuffle_prompt_objects(episode, np.random.default_rng(seed))
         before, after = _images(episode), _images(shuffled_episode)
         assert {name: sorted(rows) for name, rows in after.items()} == {
             k: sorted(v) for k, v in before.items()

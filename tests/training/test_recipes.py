@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 from openvima.cli.main import main
 from openvima.errors import ConfigError
 from openvima.training import TrainingConfig
-from openvima.training.building import resolved
+from openvima.training.building import resolve
 from openvima.training.recipes import (
     RECIPES,
     default_recipe,
@@ -31,7 +31,7 @@ def trained(monkeypatch) -> list[TrainingConfig]:
         return config.out
 
     monkeypatch.setattr("openvima.training.train", train)
-    monkeypatch.setattr("openvima.training.parallel.joined_by", lambda others, words: nullcontext())
+    monkeypatch.setattr("openvima.training.parallel.start_peers", lambda others, words: nullcontext())
     return configs
 
 
@@ -97,7 +97,7 @@ def test_the_small_policy_is_trained_by_one_command(trained) -> None:
         ["--recipe", "small", "--schedule.steps", "9"],
     ):
         assert main(["train", "--data", "demos", "--out", "run", *words]) == 0
-    first, second, third = (resolved(config) for config in trained)
+    first, second, third = (resolve(config) for config in trained)
     assert first == second == replace(third, schedule=first.schedule)
     assert (first.preset, first.pretraining.steps) == ("small", 4000)
     assert (first.schedule.steps, third.schedule.steps) == (3100, 9)
@@ -126,7 +126,7 @@ def test_init_from_disables_pretraining_unless_it_is_set(trained, tmp_path) -> N
         (["--preset", "small", "--init-from", "None"], 4000),
     ):
         assert main(["train", "--data", "demos", "--out", "run", *words]) == 0
-        assert resolved(trained[-1]).pretraining.steps == expected, words
+        assert resolve(trained[-1]).pretraining.steps == expected, words
 
 
 def test_the_settings_of_another_run_can_be_read(trained, tmp_path) -> None:

@@ -20,7 +20,7 @@ from openvima.training.augmentation.crops import (  # noqa: E402
     with_horizontal_flips,
 )
 from openvima.training.augmentation.scenes import (  # noqa: E402
-    rearranged,
+    rearrange,
     with_hard_negatives,
 )
 from openvima.training.loop import step_generator  # noqa: E402
@@ -35,7 +35,7 @@ from openvima.training.pretraining.pairs import (  # noqa: E402
     SceneAugmentation,
     pairs_of_scene,
     render_pairs,
-    stacked,
+    stack_rows,
 )
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
@@ -131,7 +131,7 @@ def test_rotations_are_those_between_the_headings():
     rng = np.random.default_rng(1)
     hearts = (Placement(k, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1 * k, k)) for k in (1, 2))
     scene = Scene(tuple(hearts))
-    again, rotations = rearranged(scene, rng)
+    again, rotations = rearrange(scene, rng)
     for before, after in zip(scene.placements, again.placements, strict=True):
         error = after.pose.yaw_rad - before.pose.yaw_rad - rotations[before.id]
         assert abs(math.remainder(error, 2 * math.pi)) < 1e-9
@@ -141,7 +141,7 @@ def test_without_rotation_prompt_image_and_scene_have_the_same_crop():
     scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, math.pi / 2)),))
     rasteriser = Rasteriser(load_assets("procedural"))
     rows = pairs_of_scene(scene, {}, rasteriser, 0, (scene, {5: 0.0}))
-    drawn = stacked(rows)
+    drawn = stack_rows(rows)
     assert drawn.second_view.rotations.tolist() == [[0.0, 0.0]]
     red = (drawn.prompt_crops[0, 1, 0] == 255) & (drawn.prompt_crops[0, 1, 1] == 87)
     also_red = (drawn.scene_crops[0, 1, 0] == 255) & (drawn.scene_crops[0, 1, 1] == 87)
@@ -151,7 +151,7 @@ def test_without_rotation_prompt_image_and_scene_have_the_same_crop():
 def test_rotations_from_prompt_images_follow_from_the_heading():
     scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, 2.0)),))
     rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), 0, (scene, {5: 0.5}))
-    np.testing.assert_allclose(stacked(rows).second_view.rotations[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(stack_rows(rows).second_view.rotations[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [0.4, 1.9])
@@ -162,7 +162,7 @@ def test_a_mirrored_image_is_that_of_a_mirrored_heading(yaw):
     for heading in (yaw, -yaw - math.pi):
         scene = Scene((Placement(5, "letter T", "red", (0, 0, 0), Pose.planar(0.5, 0.0, heading)),))
         rows = pairs_of_scene(scene, {}, rasteriser, 0)
-        crops.append(stacked(rows).scene_crops[0, :, 0].float())
+        crops.append(stack_rows(rows).scene_crops[0, :, 0].float())
     difference = (crops[0].flip(-1) - crops[1]).abs()
     assert difference.mean() < 0.35 * (crops[0] - crops[1]).abs().mean()
 
@@ -172,9 +172,9 @@ def test_objects_of_other_height_are_other_appearances():
     high = replace(low, id=6, scale=(1.0, 1.0, 2.0), pose=Pose.planar(0.5, -0.1))
     scene = Scene((low, high))
     rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), 0, (scene, {5: 0.0, 6: 0.0}))
-    first, second = stacked(rows).appearances.tolist()
+    first, second = stack_rows(rows).appearances.tolist()
     assert first != second
-    assert len(set(stacked(rows).shapes.tolist())) == 1
+    assert len(set(stack_rows(rows).shapes.tolist())) == 1
 
 
 def test_horizontal_flips_reverse_rotations(pairs):

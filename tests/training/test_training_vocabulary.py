@@ -22,7 +22,7 @@ from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benc
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import (  # noqa: E402
     build_learner,
-    resolved,
+    resolve,
     training_texts,
 )
 from small_networks import narrow_small  # noqa: E402
@@ -78,7 +78,7 @@ def test_the_vocabulary_is_that_of_the_prompts_and_is_compared_when_a_run_resume
 
 
 def test_fine_tuning_adds_new_words_to_those_of_the_checkpoint(settings, tmp_path: Path) -> None:
-    config = resolved(TrainingConfig.of({**settings, "pretraining.steps": 0, "schedule.steps": 2}))
+    config = resolve(TrainingConfig.of({**settings, "pretraining.steps": 0, "schedule.steps": 2}))
     first = build_learner(config, ["put the red bowl"])
     (tmp_path / "first").mkdir()
     first.write(tmp_path / "first", first.state_dict())
@@ -107,7 +107,7 @@ def test_fine_tuning_compares_attributes_as_the_checkpoint_does(
         own = replace(sizes, attributes=replace(sizes.attributes, exclusive=exclusive))
         monkeypatch.setitem(PRESETS, name, lambda own=own: own)
     steps = {"pretraining.steps": 0, "schedule.steps": 2}
-    config = resolved(TrainingConfig.of({**settings, **steps, "preset": "shared"}))
+    config = resolve(TrainingConfig.of({**settings, **steps, "preset": "shared"}))
     first = build_learner(config, ["put it there"])
     (tmp_path / "first").mkdir()
     first.write(tmp_path / "first", first.state_dict())

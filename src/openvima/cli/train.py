@@ -66,7 +66,7 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
 
     from openvima.multiprocess import num_cpus
     from openvima.training import TrainingConfig
-    from openvima.training.recipes import default_recipe, overridden, read_settings, recipe_settings
+    from openvima.training.recipes import default_recipe, override, read_settings, recipe_settings
 
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--recipe")
@@ -79,11 +79,11 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
     known, _ = peek.parse_known_args(rest)
     file = read_settings(chosen.config, trust_code=chosen.trust_code) if chosen.config else {}
     preset = known.preset or file.get("preset")
-    settings = overridden(recipe_settings(chosen.recipe or default_recipe(preset or "nano")), file)
+    settings = override(recipe_settings(chosen.recipe or default_recipe(preset or "nano")), file)
     if known.steps and not known.epochs:
         settings["schedule.epochs"] = None
     if known.init_from not in (None, "None"):
-        settings = overridden(settings, {"init_from": known.init_from})
+        settings = override(settings, {"init_from": known.init_from})
     if preset:
         settings["preset"] = preset  # so that the defaults are consistent before it is parsed again
     settings.setdefault("runtime.workers", num_cpus())
@@ -111,7 +111,7 @@ def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: st
         The run folder.
     """
     from openvima.training import train
-    from openvima.training.parallel import joined_by
+    from openvima.training.parallel import start_peers
 
     log = logging.getLogger("openvima.training")
     log.setLevel(logging.INFO)
@@ -120,7 +120,7 @@ def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: st
     is_first = os.environ.get("RANK", "0") == "0"
     others = _num_processes(config) - 1 if "WORLD_SIZE" not in os.environ else 0
     with (
-        joined_by(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
+        start_peers(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
         progress_bar(label) if is_first else nullcontext() as report,
     ):
         rollout = _rollout(config) if config.rollout.every else None

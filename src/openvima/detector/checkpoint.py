@@ -91,7 +91,7 @@ def load_network(path: str | Path) -> MaskRCNN:
     restore_folder(path)
     folder = checkpoint_folder(path)
     file = folder / WEIGHTS_FILE
-    return built(read_config(folder), read_safetensors(file), source=file)
+    return build_network(read_config(folder), read_safetensors(file), source=file)
 
 
 def read_config(folder: Path) -> DetectorConfig:
@@ -126,7 +126,7 @@ def load_weights(network: MaskRCNN, file: Path) -> None:
     network.load_state_dict(tensors, strict=False)
 
 
-def built(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *, source: Path) -> MaskRCNN:
+def build_network(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *, source: Path) -> MaskRCNN:
     """Build a network of weights, in evaluation mode.
 
     Raises:
@@ -244,7 +244,7 @@ def load_detectron2(file: str | Path) -> MaskRCNN:
         raise CheckpointError(f"{file} contains invalid settings: {error}") from error
     tensors = from_detectron2(weights)
     check_finite(tensors, file)
-    return built(config, tensors, source=file)
+    return build_network(config, tensors, source=file)
 
 
 def detectron2_config(
@@ -262,7 +262,9 @@ def detectron2_config(
     """
     if _CLASS_WEIGHTS not in weights:
         raise CheckpointError(f"there are no weights {_CLASS_WEIGHTS}; a Mask R-CNN of Detectron2 has them.")
-    config = replace(resnet50(), num_classes=len(weights[_CLASS_WEIGHTS]) - 1, **_chosen(settings or {}))
+    config = replace(
+        resnet50(), num_classes=len(weights[_CLASS_WEIGHTS]) - 1, **_translate_settings(settings or {})
+    )
     stored = {
         name: tuple(float(value) for value in weights[name].flatten())
         for name in ("pixel_mean", "pixel_std")
@@ -274,11 +276,13 @@ def detectron2_config(
 def from_detectron2(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Rename Detectron2's weights to ours; unknown names are kept."""
     return {
-        _own_name(name): tensor.float() for name, tensor in weights.items() if not _IGNORED.fullmatch(name)
+        _translate_name(name): tensor.float()
+        for name, tensor in weights.items()
+        if not _IGNORED.fullmatch(name)
     }
 
 
-def _chosen(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: as stored
+def _translate_settings(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: as stored
     """Translate Detectron2's settings to fields of `DetectorConfig`."""
     for path, expected in _FIXED.items():
         value = _setting(settings, path)
@@ -316,7 +320,7 @@ def _as_list(value: Any) -> Any:  # Any: as stored
     return [_as_list(part) for part in value] if isinstance(value, list | tuple) else value
 
 
-def _own_name(name: str) -> str:
+def _translate_name(name: str) -> str:
     for table, conv in ((_BOTTOM_UP, "conv."), (_OTHERS, "")):  # Detectron2 nests norms in convolutions
         for pattern, own in table:
             if match := re.fullmatch(pattern + r"\.(?P<tensor>(norm\.)?\w+)", name):

@@ -188,8 +188,8 @@ class RegionProposalNetwork(nn.Module):
         anchors = pyramid_anchors(self.config.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
         objectness, deltas = [], []
         # Both 1 × 1 convolutions as one matrix product, in the order of the anchors: (3 · 5, C)
-        weight = _interleaved(self.objectness.weight, self.deltas.weight)
-        bias = _interleaved(self.objectness.bias, self.deltas.bias)
+        weight = _interleave(self.objectness.weight, self.deltas.weight)
+        bias = _interleave(self.objectness.bias, self.deltas.bias)
         for level in levels:
             hidden = F.relu_(self.conv(level)).permute(0, 2, 3, 1)
             outputs = F.linear(hidden, weight, bias).reshape(len(level), -1, 5)  # (B, h · w · 3, 5)
@@ -255,7 +255,7 @@ class RegionProposalNetwork(nn.Module):
         return {"rpn_objectness": objectness_loss / count, "rpn_box": box_loss / count}
 
 
-def _interleaved(objectness: torch.Tensor | None, deltas: torch.Tensor | None) -> torch.Tensor:
+def _interleave(objectness: torch.Tensor | None, deltas: torch.Tensor | None) -> torch.Tensor:
     """Join parameters of both convolutions, anchor by anchor: shape (3 · 5, …) without the kernel's axes."""
     assert objectness is not None and deltas is not None  # both have a bias
     ratios = len(ASPECT_RATIOS)

@@ -117,9 +117,9 @@ class _Calibration:
 
     def _training(self, config: TrainingConfig) -> tuple[Path, float]:
         """Return a run folder of a short training, and the seconds of the whole one."""
-        from openvima.training.building import resolved
+        from openvima.training.building import resolve
 
-        config = resolved(config)
+        config = resolve(config)
         steps = config.pretraining.steps or 0
         settings = {**config.identity(), "seed": 0, "init_from": None, "pretraining": steps > 0}
         key = json.dumps({**settings, "schedule": None}, sort_keys=True)

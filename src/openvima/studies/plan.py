@@ -19,7 +19,7 @@ from openvima.errors import ConfigError
 from openvima.evaluation.config import EvaluationConfig
 from openvima.studies.study import Demonstrations, EvaluationSettings, Run, Settings, Study, StudyInputs
 from openvima.training.config import TrainingConfig
-from openvima.training.recipes import overridden, recipe_settings
+from openvima.training.recipes import override, recipe_settings
 
 COST_FILE = "cost.json"  # in the folder of a training that is done
 
@@ -175,7 +175,7 @@ class _Planner:
         scale, inputs = self.inputs.scale, self.inputs
         merged: dict[str, Any] = recipe_settings(scale.recipe)  # Any: values of settings
         for others in (scale.settings, self.study.settings, settings):
-            merged = overridden(merged, others)
+            merged = override(merged, others)
         paths = {"data": data, "out": out, "seed": seed, "assets": inputs.assets}
         device = {} if self.device is None else {"runtime.device": self.device}
         return TrainingConfig.of({**merged, **paths, **device})

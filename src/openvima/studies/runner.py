@@ -22,7 +22,7 @@ from openvima.studies.page import study_page
 from openvima.studies.plan import COST_FILE, Evaluation, Plan, Subset, Training, plan_study, record_of
 from openvima.studies.results import study_costs, study_points
 from openvima.studies.study import Demonstrations, Study, StudyInputs
-from openvima.training.validation import flattened
+from openvima.training.validation import flatten
 
 SETTINGS_FILE = "settings.json"
 RESULTS_FILE = "study.json"
@@ -147,10 +147,10 @@ def check_plan(plan: Plan, inputs: StudyInputs) -> None:
         _generate_config(demonstrations, out).resolved_tasks()
     if plan.trainings:
         require_torch("training")
-        from openvima.training.building import resolved
+        from openvima.training.building import resolve
 
         for training in (*plan.initial, *plan.trainings):
-            resolved(training.config)
+            resolve(training.config)
     for evaluation in plan.evaluations:
         if evaluation.run.policy is not None:
             prepare(evaluation.config)
@@ -169,10 +169,10 @@ def _claim(out: Path, record: dict[str, Any]) -> None:  # Any: JSON
         atomic_write_file(file, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
         return
     try:
-        there = flattened(read_json(file, max_bytes=_MAX_SETTINGS_BYTES))
+        there = flatten(read_json(file, max_bytes=_MAX_SETTINGS_BYTES))
     except (OSError, InputFileError) as error:
         raise ConfigError(f"{file} cannot be read ({error}); give another --out.") from None
-    here = flattened(record)
+    here = flatten(record)
     if differing := differences(there, here):
         shown, num_more = differing[:_MAX_DIFFERENCES], len(differing) - _MAX_DIFFERENCES
         more = f"; and {num_more} more" if num_more > 0 else ""
@@ -262,7 +262,7 @@ def _train(training: Training, report: Report) -> None:
     """Train, and note the costs, which also says that it is done."""
     from openvima.policies.checkpoint import load_network
     from openvima.training import train
-    from openvima.training.run_folder import logged_costs
+    from openvima.training.run_folder import read_costs
 
     config = training.config
     train(config, report)
@@ -270,7 +270,7 @@ def _train(training: Training, report: Report) -> None:
     costs = {
         "parameters": sum(p.numel() for p in network.parameters()),
         "demonstrations": len(Dataset(config.data)),
-        **logged_costs(config.out),
+        **read_costs(config.out),
     }
     atomic_write_file(config.out / COST_FILE, json.dumps(costs, indent=1) + "\n")
 

@@ -34,13 +34,13 @@ from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, Augmentat
 from openvima.training.learner import Learner, PolicyLearner, make_learner
 from openvima.training.loop import step_seed
 from openvima.training.pretraining.stage import caption_texts
-from openvima.training.validation import flattened
+from openvima.training.validation import flatten
 from openvima.user_code import with_absolute_path
 
 _FOR_OBJECTS = ("drop_unused_objects_prob", "rename_objects_prob", "distractor_prob")
 
 
-def resolved(config: TrainingConfig) -> TrainingConfig:
+def resolve(config: TrainingConfig) -> TrainingConfig:
     """Fill in settings that depend on the preset, and check them against it.
 
     Raises:
@@ -128,7 +128,7 @@ def _points(sizes: PolicyConfig) -> bool:
 
 
 def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
-    augmentation = {f"augmentation.{n}": v for n, v in flattened(config.identity()["augmentation"]).items()}
+    augmentation = {f"augmentation.{n}": v for n, v in flatten(config.identity()["augmentation"]).items()}
     augmentation.pop("augmentation.false_positive_prob")  # ignored unless its collator uses it
     given = {
         "pretraining.steps": config.pretraining.steps,
@@ -151,7 +151,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
     """Build the learner of a run, with fresh weights or those of `init_from`.
 
     Args:
-        config: All settings, `resolved`.
+        config: All settings, `resolve`.
         texts: Of the prompts. Their words are the vocabulary of networks without T5, or extend that of
             `init_from`.
 
@@ -171,7 +171,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
     sizes, initial, stored = _sizes(config), None, None
     if config.init_from:
         initial, stored = load_network(config.init_from)
-        sizes = _comparing_like(sizes, initial.config)
+        sizes = _compare_like(sizes, initial.config)
         _check_sizes(sizes, initial.config, config.init_from)
         sizes = replace(sizes, prompt=initial.config.prompt)
     if sizes.prompt.tokenizer == "t5":
@@ -207,7 +207,7 @@ def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | No
     return tokenizer_for(sizes.prompt, where)
 
 
-def _comparing_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
+def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
     """Compare attributes as the weights to begin with have learned to, which is no matter of size."""
     if not (isinstance(ours, PointerConfig) and isinstance(theirs, PointerConfig)):
         return ours
@@ -218,7 +218,7 @@ def _comparing_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
 
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     """Check that a network can begin with the weights of another, whose vocabulary may have another size."""
-    here, there = flattened(config_to_dict(ours)), flattened(config_to_dict(theirs))
+    here, there = flatten(config_to_dict(ours)), flatten(config_to_dict(theirs))
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")

@@ -25,7 +25,7 @@ from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.training.augmentation.demonstrations import (
     NO_AUGMENTATION,
     DemonstrationAugmentation,
-    augmented,
+    add_false_positives,
 )
 from openvima.training.batches import Collate, Example
 from openvima.user_code import call_function
@@ -207,7 +207,9 @@ class PolicyCollate:
         ]
         batch = self._processor.collate(episodes)
         if rngs is not None:
-            batch = augmented(batch, self._processor.layout, probability=self._probability, rngs=rngs)
+            batch = add_false_positives(
+                batch, self._processor.layout, probability=self._probability, rngs=rngs
+            )
         return batch.with_images([episode.images for episode in numbered]) if self._with_images else batch
 
 

@@ -68,7 +68,7 @@ def step_generator(seed: int, purpose: str, step: int) -> torch.Generator:
 
 
 @contextmanager
-def noted_sigterm() -> Iterator[Callable[[], bool]]:
+def note_sigterm() -> Iterator[Callable[[], bool]]:
     """Let SIGTERM end nothing within the block.
 
     Yields:
@@ -243,7 +243,7 @@ class Trainer:
         if self.progress.step:
             self._load_optimizer(optimizer)
         self._last = (self.progress.step, time.monotonic())
-        with noted_sigterm() as is_terminated:
+        with note_sigterm() as is_terminated:
             self._take_steps(stage, optimizer, num_steps, is_terminated)
 
     def _take_steps(
@@ -309,7 +309,7 @@ class Trainer:
         now, step = time.monotonic(), self.progress.step
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
-        self.report(f"{stage.name}: {_shown(metrics)}  {rate:.1f} steps/s")
+        self.report(f"{stage.name}: {_format(metrics)}  {rate:.1f} steps/s")
         self._training_score = metrics.get(self.learner.score, math.nan)
         if metrics.get("query_spread", 1.0) < COLLAPSED_SPREAD and self.parallel.is_first:
             logger.warning(
@@ -360,7 +360,7 @@ class Trainer:
             return
         step, name = self.progress.step, self.learner.score
         score = metrics.get(name, math.nan)
-        logger.info("%s, step %d, held out: %s", stage.name, step, _shown(metrics))
+        logger.info("%s, step %d, held out: %s", stage.name, step, _format(metrics))
         if self._training_score - score > OVERFIT_GAP:
             logger.warning(
                 "step %d: %s is %.0f%% in training and %.0f%% on held-out demonstrations: the network "
@@ -406,7 +406,7 @@ def _optimizer(learner: Learner, stage: Stage, weight_decay: float) -> torch.opt
     return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=weight_decay, fused=True)
 
 
-def _shown(metrics: Metrics) -> str:
+def _format(metrics: Metrics) -> str:
     shown = {label: metrics[name] for name, label in _LABELS.items() if name in metrics}
     return "  ".join(f"{n} {v:.2f}" if n == "loss" else f"{n} {v:.0%}" for n, v in shown.items())
 

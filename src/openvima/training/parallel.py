@@ -1,7 +1,7 @@
 """Distributed training: data parallel (DDP) or sharded (FSDP2), over the processes of `torchrun`.
 
-DDP replicates the network in every process. FSDP2 shards weights, gradients and optimizer state. `joined_by`
-starts the processes of one machine, with the environment in which `torchrun` starts them.
+DDP replicates the network in every process. FSDP2 shards weights, gradients and optimizer state.
+`start_peers` starts the processes of one machine, with the environment in which `torchrun` starts them.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ _NUM_NOTED = 2000  # characters
 
 
 @contextmanager
-def joined_by(others: int, arguments: Sequence[str]) -> Iterator[None]:
+def start_peers(others: int, arguments: Sequence[str]) -> Iterator[None]:
     """Start further processes, which are this one's peers within the block.
 
     They write nothing, since this process, the first one, fails as they do; if one fails by itself, the error
@@ -117,7 +117,7 @@ class Parallel:
         if self.num_ranks == 1:
             return module
         if self.is_sharded:
-            return _sharded(module, self.device)
+            return _shard(module, self.device)
         ids = [self.device.index] if self.device.type == "cuda" else None
         # Processes may call it different numbers of times; no buffer changes in training.
         with warnings.catch_warnings():
@@ -230,7 +230,7 @@ ONE_PROCESS = Parallel(0, 1, torch.device("cpu"))
 
 
 @contextlib.contextmanager
-def joined(device: str, sharding: Sharding) -> Iterator[Parallel]:
+def join_processes(device: str, sharding: Sharding) -> Iterator[Parallel]:
     """Join the process group of `torchrun`, if there is one.
 
     Args:
@@ -307,7 +307,7 @@ def set_whole_state(
     set_optimizer_state_dict(module, optimizer, whole, options=StateDictOptions(full_state_dict=True))
 
 
-def _sharded(module: nn.Module, device: torch.device) -> Any:  # Any: the module, of a class made for it
+def _shard(module: nn.Module, device: torch.device) -> Any:  # Any: the module, of a class made for it
     """Shard the layers of stacks one by one, and the rest together."""
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
@@ -345,14 +345,14 @@ def load_named_state(
     names = {id(parameter): name for name, parameter in module.named_parameters()}
     ordered = [p for group in optimizer.param_groups for p in group["params"]]
     values = {
-        number: {key: _like(parameter, value) for key, value in state[names[id(parameter)]].items()}
+        number: {key: _copy_layout(parameter, value) for key, value in state[names[id(parameter)]].items()}
         for number, parameter in enumerate(ordered)
         if names[id(parameter)] in state
     }
     optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
 
 
-def _like(parameter: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+def _copy_layout(parameter: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
     if value.shape != parameter.shape:
         return value  # the step count
     return torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)

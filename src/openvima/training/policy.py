@@ -22,11 +22,11 @@ from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.augmentation.prompts import MOTION_TEXT
 from openvima.training.batches import ExampleSource
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
-from openvima.training.building import build_learner, resolved, training_texts
+from openvima.training.building import build_learner, resolve, training_texts
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Animate, PlannedStage, Report, Rollout, Stage, Trainer, num_steps
-from openvima.training.parallel import Parallel, compile_layers, joined
+from openvima.training.parallel import Parallel, compile_layers, join_processes
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
 from openvima.training.recipes import command_going_on
@@ -77,7 +77,7 @@ def train(
         MissingExtraError: The preset encodes prompts with T5, or `runtime.wandb` names a project, and a
             package for that is not installed.
     """
-    config = resolved(config)
+    config = resolve(config)
     load_assets(config.assets)  # fails before there is a run folder
     dataset = open_demonstrations(
         config.data, config.loader.excluded_tasks, allow_heldout=config.allow_heldout
@@ -90,7 +90,7 @@ def train(
     runtime = config.runtime
     with (
         torch_threads(runtime.threads),
-        joined(runtime.device, runtime.sharding) as parallel,
+        join_processes(runtime.device, runtime.sharding) as parallel,
         run_lock(config.out, is_first=parallel.is_first),
     ):
         with_captions = config.pretraining.attribute_loss_weight > 0
@@ -164,7 +164,7 @@ class _Stages:
         return [PlannedStage(config.pretraining.steps, self._pretraining), cloning]
 
     def _pretraining(self) -> Stage:
-        assert isinstance(self.learner, PolicyLearner)  # `resolved` has checked it
+        assert isinstance(self.learner, PolicyLearner)  # `resolve` has checked it
         network, config = self.learner.network, self.config.pretraining
         with_attributes = config.attribute_loss_weight > 0
         pairs = render_pairs(

@@ -11,7 +11,7 @@ from openvima.errors import ConfigError, InputFileError, unknown_name
 from openvima.input_files import read_yaml
 from openvima.policies.naming import CONFIG_FILE
 from openvima.training.config import TrainingConfig
-from openvima.training.validation import converted, flattened, setting_types
+from openvima.training.validation import convert, flatten, setting_types
 
 # VIMA, Jiang et al. 2023, with what later re-implementations report where the paper is silent: AdamW without
 # decay, the rate falls to its end within the first half of the run.
@@ -170,7 +170,7 @@ def read_settings(file: Path, *, trust_code: bool = False) -> dict[str, Any]:
         values = values["training"]
     if not isinstance(values, dict):
         raise ConfigError(f"{file} must hold settings, one `name: value` a line.")
-    values, known = flattened(values), setting_types(TrainingConfig)
+    values, known = flatten(values), setting_types(TrainingConfig)
     if problems := [unknown_name(f"setting in {file} called", n, known) for n in values if n not in known]:
         raise ConfigError(" ".join(problems))
     code = [f"{name} {short(value)}" for name in _CODE if _is_code(value := values.get(name))]
@@ -179,12 +179,12 @@ def read_settings(file: Path, *, trust_code: bool = False) -> dict[str, Any]:
             f"{file} names code to run: {', '.join(code)}. Nothing was executed. If you trust the file, add "
             "--trust-code."
         )
-    return {name: converted(value, known[name]) for name, value in values.items()}
+    return {name: convert(value, known[name]) for name, value in values.items()}
 
 
 def command_going_on(config: TrainingConfig) -> str:
     """Return the command that trains on from the weights of a run in another folder, but for its steps."""
-    settings = flattened(config.identity())
+    settings = flatten(config.identity())
     trust = " --trust-code" if any(_is_code(settings[name]) for name in _CODE) else ""
     paths = (config.out / CONFIG_FILE, config.data, config.out, f"{config.out}-longer")
     file, data, run, out = (shlex.quote(str(path)) for path in paths)
@@ -196,7 +196,7 @@ def _is_code(value: object) -> bool:
     return ":" in str(value) and not str(value).startswith("detector=")
 
 
-def overridden(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
     """Override settings by others.
 
     Steps replace epochs. `init_from` comes with a trained crop encoder, so it resets pretraining to the

@@ -45,7 +45,7 @@ from openvima.policies.naming import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_o
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.learner import Learner
 from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER
-from openvima.training.validation import flattened
+from openvima.training.validation import flatten
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -256,12 +256,12 @@ class RunFolder:
             old = read_yaml(file)
         except InputFileError as error:
             return [str(error).rstrip(".")]
-        return differences(flattened(old), flattened(settings))
+        return differences(flatten(old), flatten(settings))
 
     def _further_steps(self, settings: dict[str, Any]) -> int:
         """Return how many steps are asked for beyond those of a finished run; 0 if more differs."""
         try:
-            old, new = flattened(read_yaml(self.path / CONFIG_FILE)), flattened(settings)
+            old, new = flatten(read_yaml(self.path / CONFIG_FILE)), flatten(settings)
             last = self.latest()
         except (OSError, InputFileError):
             return 0
@@ -379,7 +379,7 @@ def _versions() -> dict[str, str]:
 _TIMES = ("seconds_since_start", "cpu_seconds_since_start")
 
 
-def logged_costs(run: Path) -> dict[str, Any]:  # Any: JSON
+def read_costs(run: Path) -> dict[str, Any]:  # Any: JSON
     """Return steps, time and CPU time of a run.
 
     Work that was repeated after an interruption counts twice; what was lost after the last line of the log

@@ -49,13 +49,13 @@ def problems_of(settings: object, prefix: str = "") -> Iterator[str]:
             yield problem
 
 
-def flattened(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML values
+def flatten(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML values
     """Flatten nested settings; names are joined by dots."""
     if not isinstance(values, Mapping):
         return {prefix: values}
     result: dict[str, Any] = {}
     for name, value in values.items():
-        result |= flattened(value, f"{prefix}.{name}" if prefix else str(name))
+        result |= flatten(value, f"{prefix}.{name}" if prefix else str(name))
     return result
 
 
@@ -81,16 +81,16 @@ def from_settings(kind: type[Settings], settings: Mapping[str, Any]) -> Settings
     known = setting_types(kind)
     if problems := [unknown_name("setting", name, known) for name in settings if name not in known]:
         raise ConfigError(" ".join(problems))
-    return _nested(kind, settings, "")
+    return _build_nested(kind, settings, "")
 
 
-def _nested(kind: type[Settings], settings: Mapping[str, Any], prefix: str) -> Settings:
+def _build_nested(kind: type[Settings], settings: Mapping[str, Any], prefix: str) -> Settings:
     values = {}
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]  # a dataclass
     for name, hint in get_type_hints(kind).items():
         if _is_section(hint):
             default = {f"{prefix}{name}.{key}": v for key, v in _values(defaults[name]).items()}
-            values[name] = _nested(hint, {**default, **settings}, f"{prefix}{name}.")
+            values[name] = _build_nested(hint, {**default, **settings}, f"{prefix}{name}.")
         elif prefix + name in settings:
             values[name] = settings[prefix + name]
     return kind(**values)
@@ -104,7 +104,7 @@ def _values(section: Any) -> dict[str, Any]:  # Any: a dataclass
     return {field.name: getattr(section, field.name) for field in fields(section)}
 
 
-def converted(value: Any, hint: Any) -> Any:  # Any: what YAML holds, and types
+def convert(value: Any, hint: Any) -> Any:  # Any: what YAML holds, and types
     """Convert text to paths and numbers; YAML reads 1e-4, without a point, as text."""
     kinds = {_plain(option)[0] for option in _options(hint)}
     if not isinstance(value, str) or not {Path, float} & kinds:

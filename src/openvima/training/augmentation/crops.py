@@ -22,15 +22,15 @@ def with_horizontal_flips(pairs: Pairs, generator: torch.Generator) -> Pairs:
     assert view is not None, "only pairs with a second view are flipped"
     is_flipped = (torch.rand(len(pairs.scenes), generator=generator) < 0.5).to(pairs.scenes.device)
 
-    def flipped(crops: torch.Tensor) -> torch.Tensor:
+    def flip(crops: torch.Tensor) -> torch.Tensor:
         return torch.where(is_flipped[:, None, None, None, None], crops.flip(-1), crops)
 
     rotations = torch.where(is_flipped[:, None], -view.rotations, view.rotations)
     return replace(
         pairs,
-        prompt_crops=flipped(pairs.prompt_crops),
-        scene_crops=flipped(pairs.scene_crops),
-        second_view=SecondView(flipped(view.crops), view.masks, rotations),
+        prompt_crops=flip(pairs.prompt_crops),
+        scene_crops=flip(pairs.scene_crops),
+        second_view=SecondView(flip(view.crops), view.masks, rotations),
     )
 
 
@@ -55,7 +55,7 @@ def with_occlusion(pairs: Pairs, prob: float, generator: torch.Generator) -> Pai
     drawn_KD = torch.rand(count, 6, generator=generator)
     is_chosen_K = drawn_KD[:, 0] < prob
 
-    def occluded(crops: torch.Tensor, background: int) -> torch.Tensor:
+    def occlude(crops: torch.Tensor, background: int) -> torch.Tensor:
         crops = crops.float()
         is_occluded = _bars(drawn_KD, crops.shape[-1], generator) & is_chosen_K[:, None, None]
         return crops.masked_fill(is_occluded[:, None, None].to(device), background)
@@ -63,11 +63,11 @@ def with_occlusion(pairs: Pairs, prob: float, generator: torch.Generator) -> Pai
     view = pairs.second_view
     if view:
         rotations = view.rotations.masked_fill(is_chosen_K[:, None].to(device), math.nan)
-        view = SecondView(occluded(view.crops, _SCENE_BACKGROUND), view.masks, rotations)
+        view = SecondView(occlude(view.crops, _SCENE_BACKGROUND), view.masks, rotations)
     return replace(
         pairs,
-        prompt_crops=occluded(pairs.prompt_crops, _PROMPT_BACKGROUND),
-        scene_crops=occluded(pairs.scene_crops, _SCENE_BACKGROUND),
+        prompt_crops=occlude(pairs.prompt_crops, _PROMPT_BACKGROUND),
+        scene_crops=occlude(pairs.scene_crops, _SCENE_BACKGROUND),
         second_view=view,
     )
 
@@ -109,13 +109,13 @@ def with_box_jitter(pairs: Pairs, pixels: float, generator: torch.Generator) -> 
     view = pairs.second_view
     return replace(
         pairs,
-        prompt_crops=_jittered(pairs.prompt_crops, pixels, generator),
-        scene_crops=_jittered(pairs.scene_crops, pixels, generator),
-        second_view=replace(view, crops=_jittered(view.crops, pixels, generator)) if view else None,
+        prompt_crops=_jitter(pairs.prompt_crops, pixels, generator),
+        scene_crops=_jitter(pairs.scene_crops, pixels, generator),
+        second_view=replace(view, crops=_jitter(view.crops, pixels, generator)) if view else None,
     )
 
 
-def _jittered(crops: torch.Tensor, pixels: float, generator: torch.Generator) -> torch.Tensor:
+def _jitter(crops: torch.Tensor, pixels: float, generator: torch.Generator) -> torch.Tensor:
     flat = crops.flatten(0, -4).float()
     draws = (2 * torch.rand(len(flat), 3, generator=generator) - 1).to(flat.device)
     draws *= 2 * pixels / _CROP_PX  # the borders are at −1 and 1
@@ -127,7 +127,7 @@ def _jittered(crops: torch.Tensor, pixels: float, generator: torch.Generator) ->
     return sampled.unflatten(0, crops.shape[:-3])
 
 
-def channel_mixing(generator: torch.Generator) -> torch.Tensor:
+def draw_channel_mixing(generator: torch.Generator) -> torch.Tensor:
     """Draw a (3, 3) matrix that mixes R, G and B: half of the time the identity, else a blended permutation.
 
     Rows sum to 1, so that white, grey and black stay what they are.

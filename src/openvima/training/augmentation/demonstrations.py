@@ -21,11 +21,11 @@ from openvima.tasks.registry import task_spec
 from openvima.training.augmentation.prompts import (
     DescribeObjects,
     UnknownWords,
-    paraphrased,
-    renamed,
-    shuffled,
+    paraphrase,
+    rename_objects,
+    shuffle_prompt_objects,
+    shuffle_sentences,
     with_motion_prompt,
-    with_shuffled_prompt_objects,
 )
 from openvima.training.config import AugmentationConfig
 
@@ -43,10 +43,10 @@ class DropUnusedObjects:
 
     def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
         """Augment a demonstration."""
-        return without_unused_objects(episode, self.prob, rng) if self.prob else episode
+        return drop_unused_objects(episode, self.prob, rng) if self.prob else episode
 
 
-def without_unused_objects(
+def drop_unused_objects(
     episode: PreprocessedEpisode, prob: float, rng: np.random.Generator
 ) -> PreprocessedEpisode:
     """Drop unused objects from the observations, and others from the prompt frames."""
@@ -58,16 +58,16 @@ def without_unused_objects(
     return replace(
         episode,
         objects=episode.objects.select(observed),
-        objects_per_step=_counted(episode.objects_per_step, observed),
+        objects_per_step=_count_kept(episode.objects_per_step, observed),
         prompt=replace(
             prompt,
             objects=prompt.objects.select(prompted),
-            objects_per_image=_counted(prompt.objects_per_image, prompted),
+            objects_per_image=_count_kept(prompt.objects_per_image, prompted),
         ),
     )
 
 
-def _counted(counts: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def _count_kept(counts: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Count the kept rows of each group."""
     group = np.repeat(np.arange(len(counts)), counts)
     return np.bincount(group[kept], minlength=len(counts)).astype(counts.dtype)
@@ -180,18 +180,18 @@ NO_AUGMENTATION = DemonstrationAugmentation()
 
 def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugmentation:
     """Return the transforms that the settings ask for."""
-    shuffle_prompt_objects = Randomly(config.shuffle_prompt_objects_prob, with_shuffled_prompt_objects)
+    shuffle = Randomly(config.shuffle_prompt_objects_prob, shuffle_prompt_objects)
     return DemonstrationAugmentation(
         config.inverse_dynamics_prob,
-        of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob), shuffle_prompt_objects),
+        of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob), shuffle),
         of_tasks=(
-            Randomly(config.paraphrase_prob, paraphrased),  # before others change the text
-            Randomly(config.rename_objects_prob, renamed),
-            Randomly(config.shuffle_sentences_prob, shuffled),
+            Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
+            Randomly(config.rename_objects_prob, rename_objects),
+            Randomly(config.shuffle_sentences_prob, shuffle_sentences),
             # after those that look for images
             DescribeObjects(config.text_description_prob, config.synonym_prob, config.text_prompt_prob),
             UnknownWords(config.unknown_word_prob),
-            shuffle_prompt_objects,
+            shuffle,
         ),
     )
 
@@ -201,7 +201,7 @@ MOST_SLOTS = 256  # numbers drawn for a step; more than there are ids
 _LAST = 1e6  # sorts after every slot
 
 
-def augmented(
+def add_false_positives(
     batch: Batch,
     layout: Literal["objects", "views", "frames"],
     *,
@@ -223,7 +223,7 @@ def augmented(
     """
     if layout == "frames":
         return batch
-    drawn = _drawn(batch.history, rngs)
+    drawn = _draw_numbers(batch.history, rngs)
     shows_BTV = drawn[..., :NUM_VIEWS] < probability
     shows_BTV &= batch.history.steps_BT[..., None]
     if layout == "views":
@@ -233,10 +233,10 @@ def augmented(
     keys_BTN = torch.cat(  # padding of the batch stays at the end
         [torch.where(is_slot, drawn[..., 2 * NUM_VIEWS :], _LAST), drawn[..., NUM_VIEWS : 2 * NUM_VIEWS]], -1
     )
-    return _shuffled(replace(batch, history=_with_spurious_objects(batch, shows_BTV)), keys_BTN)
+    return _shuffle_slots(replace(batch, history=_with_spurious_objects(batch, shows_BTV)), keys_BTN)
 
 
-def _drawn(history: HistoryBatch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
+def _draw_numbers(history: HistoryBatch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
     """Numbers from 0 to 1 for all views and slots of each step, shape (B, T, 2 V + N), float32."""
     num_steps, num_slots = history.steps_BT.shape[1], history.positions_BTN2.shape[2]
     drawn = np.zeros((len(rngs), num_steps, 2 * NUM_VIEWS + num_slots), np.float32)
@@ -281,17 +281,17 @@ def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, drawn_BTV: to
     )
     num_slots_BT = (batch.history.num_slots_BT + shows_BTV.sum(dim=2)).cummax(dim=1).values
     num_slots_BT = torch.where(history.steps_BT, num_slots_BT, 0)
-    views = _in_order(history, rank_BTVN.argsort(dim=3))
+    views = _reorder(history, rank_BTVN.argsort(dim=3))
     return replace(batch, history=replace(views, num_slots_BT=num_slots_BT))
 
 
-def _shuffled(batch: Batch, keys_BTN: torch.Tensor) -> Batch:
+def _shuffle_slots(batch: Batch, keys_BTN: torch.Tensor) -> Batch:
     """Put the objects of every step into the order of numbers drawn for them."""
     history = batch.history
     order_BTN = keys_BTN.argsort(dim=-1, stable=True)
     place_BTN = order_BTN.argsort(dim=-1)  # where each old slot has gone
     order_BTN2 = order_BTN[..., None].expand_as(history.positions_BTN2)
-    views = _in_order(history, order_BTN[:, :, None].expand_as(history.crop_index_BTVN))
+    views = _reorder(history, order_BTN[:, :, None].expand_as(history.crop_index_BTVN))
     moved = replace(
         views,
         positions_BTN2=history.positions_BTN2.gather(2, order_BTN2),
@@ -299,13 +299,13 @@ def _shuffled(batch: Batch, keys_BTN: torch.Tensor) -> Batch:
     )
     targets = replace(
         batch.targets,
-        pick_BT=_moved(batch.targets.pick_BT, place_BTN),
-        place_BT=_moved(batch.targets.place_BT, place_BTN),
+        pick_BT=_follow_slots(batch.targets.pick_BT, place_BTN),
+        place_BT=_follow_slots(batch.targets.place_BT, place_BTN),
     )
     return replace(batch, history=moved, targets=targets)
 
 
-def _in_order(history: HistoryBatch, order_BTVN: torch.Tensor) -> HistoryBatch:
+def _reorder(history: HistoryBatch, order_BTVN: torch.Tensor) -> HistoryBatch:
     """Reorder what views show of the objects."""
     return replace(
         history,
@@ -315,6 +315,6 @@ def _in_order(history: HistoryBatch, order_BTVN: torch.Tensor) -> HistoryBatch:
     )
 
 
-def _moved(slot_BT: torch.Tensor, place_BTN: torch.Tensor) -> torch.Tensor:
+def _follow_slots(slot_BT: torch.Tensor, place_BTN: torch.Tensor) -> torch.Tensor:
     new_BT = place_BTN.gather(2, slot_BT.clamp(min=0)[..., None]).squeeze(2)
     return torch.where(slot_BT >= 0, new_BT, slot_BT)

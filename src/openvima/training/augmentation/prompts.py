@@ -51,7 +51,7 @@ _NOVEL_WORD = re.compile(rf"\b({'|'.join(NOUNS + ADJECTIVES)})\b")
 _DETERMINERS = ("the", "same", "any", "all", *NUMBER_WORDS)  # words after which a noun needs no article
 
 
-def renamed(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
+def rename_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Name one or two single objects of a prompt by novel nouns.
 
     Half of these prompts also define nouns of unused objects in view, so that nouns have to be read. Only
@@ -107,7 +107,7 @@ _SENTENCE_END = re.compile(r"(?<=\.) ")
 _IS_COMPARISON = re.compile(r"\} is \w+ than \{")
 
 
-def shuffled(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
+def shuffle_sentences(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Shuffle definitions, comparisons ("{a} is kobar than {b}.") and the instruction.
 
     At least one of several comparisons is kept. The purpose of an image then follows from the words around it
@@ -131,7 +131,7 @@ def shuffled(episode: PreprocessedEpisode, rng: np.random.Generator) -> Preproce
     return with_prompt(episode, text, images_by_name(episode.prompt))
 
 
-def paraphrased(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
+def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Put a paraphrase in place of a prompt; tasks without any, and prompts of other forms, are unchanged.
 
     Args:
@@ -232,17 +232,15 @@ class UnknownWords:
         if not self.prob:
             return episode
 
-        def masked(found: re.Match[str]) -> str:
+        def mask(found: re.Match[str]) -> str:
             is_word = found[0][0] != "{"
             return UNKNOWN if is_word and rng.random() < self.prob else found[0]
 
-        text = _SLOT_OR_WORD.sub(masked, episode.prompt.text)
+        text = _SLOT_OR_WORD.sub(mask, episode.prompt.text)
         return replace(episode, prompt=replace(episode.prompt, text=text))
 
 
-def with_shuffled_prompt_objects(
-    episode: PreprocessedEpisode, rng: np.random.Generator
-) -> PreprocessedEpisode:
+def shuffle_prompt_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Permute the objects of each prompt image, independently."""
     counts = episode.prompt.objects_per_image.astype(np.int64)
     firsts = np.cumsum(counts) - counts

@@ -33,15 +33,15 @@ class ShapeKinds:
 
     def of_movable(self, rng: np.random.Generator) -> str:
         """Draw the kind of a movable shape."""
-        if not _happens(self.ring_and_block_prob, rng):
+        if not _draw(self.ring_and_block_prob, rng):
             return "shape"
         return "ring" if rng.random() < 0.5 else "block"
 
     def of_container(self, rng: np.random.Generator) -> str:
         """Draw the kind of a container."""
-        if _happens(self.grating_prob, rng):
+        if _draw(self.grating_prob, rng):
             return "grating"
-        return "eared container" if _happens(self.eared_prob, rng) else "container"
+        return "eared container" if _draw(self.eared_prob, rng) else "container"
 
 
 def with_random_appearance(
@@ -92,7 +92,7 @@ def _with_random_shape(
     return at_rest(replace(placement, object=name), assets)
 
 
-def _happens(prob: float, rng: np.random.Generator) -> bool:
+def _draw(prob: float, rng: np.random.Generator) -> bool:
     return bool(prob) and bool(rng.random() < prob)  # draws nothing at 0, so that other draws stay
 
 
@@ -100,7 +100,7 @@ EDGE_M = 0.06  # from the edge of the workspace to the middle of an object
 _JITTER_M = 0.02
 
 
-def rearranged(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int, float]]:
+def rearrange(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int, float]]:
     """Rotate each object by a random angle; in half of the scenes movable objects also swap positions.
 
     Returns:
@@ -152,14 +152,14 @@ def with_hard_negatives(
             continue
         position = _free_position(placements, rng)
         kind = _KINDS[int(rng.integers(len(_KINDS)))]
-        negative = _changed(original, kind, scene.placements, shades, assets, rng)
+        negative = _change(original, kind, scene.placements, shades, assets, rng)
         if position and negative:
             pose = Pose.planar(*position, rng.uniform(0, 2 * math.pi), z=negative.pose.z)
             placements.append(replace(negative, id=placements[-1].id + 1, pose=pose))
     return replace(scene, placements=tuple(placements))
 
 
-def _changed(
+def _change(
     original: Placement,
     kind: str,
     others: Sequence[Placement],
@@ -213,6 +213,6 @@ def draw_grayscale(count: int, prob: float, rng: np.random.Generator) -> np.ndar
     return rng.random(count) < prob
 
 
-def grayscale(placement: Placement) -> Placement:
+def to_grayscale(placement: Placement) -> Placement:
     """Return an object as a grayscale prompt image shows it: neutral texture, no scale."""
     return replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE)

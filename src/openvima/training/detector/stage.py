@@ -28,7 +28,7 @@ from openvima.training.loop import (
     step_generator,
     step_seed,
 )
-from openvima.training.parallel import Parallel, compile_layers, joined
+from openvima.training.parallel import Parallel, compile_layers, join_processes
 from openvima.training.run_folder import held_out_demonstrations, run_lock
 from openvima.training.source import check_scenes, open_demonstrations
 
@@ -151,7 +151,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
     runtime = config.runtime
     with (
         torch_threads(runtime.threads),
-        joined(runtime.device, runtime.sharding) as parallel,
+        join_processes(runtime.device, runtime.sharding) as parallel,
         run_lock(config.out, is_first=parallel.is_first),
     ):
         if parallel.num_ranks > 1:

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.pointer.words import Attributes
-from openvima.training.augmentation.crops import channel_mixing
+from openvima.training.augmentation.crops import draw_channel_mixing
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.pairs import AttributeLabels, Pairs
 
@@ -49,13 +49,13 @@ def contrastive_loss(
 
     Source: InfoNCE (van den Oord et al. 2018), symmetric as in CLIP.
     """
-    mixing = channel_mixing(generator).to(pairs.scene_crops.device)
+    mixing = draw_channel_mixing(generator).to(pairs.scene_crops.device)
     if pairs.second_view is not None:
         return _two_view_loss(encoder, pairs, mixing, temperature, attributes, attribute_weight, parallel)
-    features = _encoded(encoder, torch.stack([pairs.prompt_crops, pairs.scene_crops]), mixing, parallel)
+    features = _encode(encoder, torch.stack([pairs.prompt_crops, pairs.scene_crops]), mixing, parallel)
     masks = torch.stack([pairs.prompt_masks, pairs.scene_masks]).transpose(1, 2)
     prompt, scene = encoder.embed_appearance(features, masks)
-    loss, accuracy = info_nce(prompt, scene, matches(pairs), temperature=temperature)
+    loss, accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
     return loss, {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
 
 
@@ -71,12 +71,12 @@ def _two_view_loss(
     view = pairs.second_view
     assert view is not None
     crops = torch.stack([pairs.prompt_crops, pairs.scene_crops, view.crops])
-    features = _encoded(encoder, crops, mixing, parallel)
+    features = _encode(encoder, crops, mixing, parallel)
     masks = torch.stack([pairs.prompt_masks, pairs.scene_masks, view.masks]).transpose(1, 2)
     prompt, scene, second = encoder.embed_appearance(features, masks)
     rows = view.masks.any(dim=1)
     is_same = pairs.appearances[rows, None] == pairs.appearances[None, rows]
-    prompt_loss, prompt_accuracy = info_nce(prompt, scene, matches(pairs), temperature=temperature)
+    prompt_loss, prompt_accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
     view_loss, view_accuracy = info_nce(second[rows], scene[rows], is_same, temperature=temperature)
     loss = (prompt_loss + view_loss) / 2
     metrics = {
@@ -96,7 +96,7 @@ def _two_view_loss(
     return loss, metrics
 
 
-def _encoded(
+def _encode(
     encoder: ObjectEncoder, crops_SKVCYX: torch.Tensor, mixing: torch.Tensor, parallel: Parallel
 ) -> torch.Tensor:
     """Encode crops of S images of K objects, with mixed channels, to features (S, V, K, F)."""
@@ -105,7 +105,7 @@ def _encoded(
     return features_NF.unflatten(0, crops_SKVCYX.shape[:3]).transpose(1, 2)
 
 
-def matches(pairs: Pairs) -> torch.Tensor:
+def find_matches(pairs: Pairs) -> torch.Tensor:
     """Return which prompt image (row) matches which object (column) of a batch, (K, K), bool.
 
     A coloured one matches objects of its appearance, a grayscale one those of its shape.
@@ -141,8 +141,8 @@ def retrieval_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256
     """Fraction of prompt images whose nearest object of the scene is a match."""
     rows = torch.arange(len(pairs.scenes), device=pairs.scenes.device).split(chunk)
     parts = [pairs.select(row) for row in rows]
-    prompt = torch.cat([embedded(encoder, p.prompt_crops, p.prompt_masks) for p in parts])
-    scene = torch.cat([embedded(encoder, p.scene_crops, p.scene_masks) for p in parts])
+    prompt = torch.cat([embed(encoder, p.prompt_crops, p.prompt_masks) for p in parts])
+    scene = torch.cat([embed(encoder, p.scene_crops, p.scene_masks) for p in parts])
     is_other_scene = pairs.scenes[:, None] != pairs.scenes[None, :]
     nearest = (prompt @ scene.T).masked_fill(is_other_scene, -2.0).argmax(1)
     is_correct = pairs.appearances[nearest] == pairs.appearances
@@ -150,7 +150,7 @@ def retrieval_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256
     return float(is_correct.double().mean())
 
 
-def embedded(encoder: ObjectEncoder, crops: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
+def embed(encoder: ObjectEncoder, crops: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
     """Embed K objects; crops (K, 2, 3, 32, 32), masks (K, 2)."""
     return encoder.embed_appearance(encoder.encode_images(crops).transpose(0, 1), masks.T)
 

@@ -29,8 +29,8 @@ from openvima.tasks import sample_episode, task_spec
 from openvima.training.augmentation.scenes import (
     ShapeKinds,
     draw_grayscale,
-    grayscale,
-    rearranged,
+    rearrange,
+    to_grayscale,
     with_hard_negatives,
     with_random_appearance,
 )
@@ -308,11 +308,11 @@ def _columns_of_scenes(
         task = tasks[number % len(tasks)]
         episode_seed = step_seed(seed, "pretraining scene", number)
         episode = sample_episode(task, level="train", seed=episode_seed, domain=_DOMAIN, assets=pack)
-        scene = _retextured(episode.problem.scene, pools[task], np.random.default_rng(episode_seed))
+        scene = _retexture(episode.problem.scene, pools[task], np.random.default_rng(episode_seed))
         # A generator of its own, so that the scenes below are the same with any augmentation.
         rng = np.random.default_rng([episode_seed, 1])
         scene = augmentation(scene, shades, rasteriser.assets, rng)
-        view = rearranged(scene, rng) if augmentation.second_view else None
+        view = rearrange(scene, rng) if augmentation.second_view else None
         is_grayscale = draw_grayscale(len(scene.placements), augmentation.grayscale_prob, rng)
         rows += pairs_of_scene(
             scene,
@@ -327,7 +327,7 @@ def _columns_of_scenes(
     return [np.stack(column) for column in zip(*rows, strict=True)]
 
 
-def stacked(rows: Sequence[tuple]) -> Pairs:
+def stack_rows(rows: Sequence[tuple]) -> Pairs:
     """Stack the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
     return _record([torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)])
 
@@ -367,15 +367,15 @@ def pairs_of_scene(
         For each visible object the fields of `Pairs`, and those of `SecondView` and `AttributeLabels` if
         there are any.
     """
-    seen = _seen(scene, rasteriser)
-    seen_again = _seen(second_view[0], rasteriser) if second_view else None
+    seen = _observe(scene, rasteriser)
+    seen_again = _observe(second_view[0], rasteriser) if second_view else None
     pairs = []
     for slot, placement in enumerate(scene.placements):
         if not seen.masks[:, slot].any():
             continue
         is_gray = bool(len(is_grayscale)) and bool(is_grayscale[slot])
         shown, magnification = (
-            grayscale(placement) if is_gray else placement,
+            to_grayscale(placement) if is_gray else placement,
             magnifications.get(placement.object, 1.0),
         )
         prompt = _prompt_image(shown, magnification, rasteriser)
@@ -408,7 +408,7 @@ def _rotations(placement: Placement, to_second_view: float) -> np.ndarray:
     return rotations if has_visible_heading(placement.object) else np.full_like(rotations, np.nan)
 
 
-def _retextured(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
+def _retexture(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
     """Give every object a training texture; few different ones, so that many differ in shape alone.
 
     Movable objects get textures of dragged objects and fixed ones those of bases, so that the combinations
@@ -432,7 +432,7 @@ def _magnifications(episode: Episode) -> dict[str, float]:
     return {image.placement.object: image.magnification for image in images}
 
 
-def _seen(scene: Scene, rasteriser: Rasteriser) -> ObjectViews:
+def _observe(scene: Scene, rasteriser: Rasteriser) -> ObjectViews:
     views = rasteriser.scene(scene)
     rgb = {name: image.rgb for name, image in views.items()}
     segm = {name: image.segm for name, image in views.items()}
