@@ -2,6 +2,9 @@
 
 What a prompt allows is read from its text and images; no task is named. `demonstrations.py` lists the
 functions, in the order of their draws.
+
+Source of inverse dynamics, whose prompt consists of the frames of the demonstration, and of descriptions in
+place of object images: MIDAS (Li et al. 2023).
 """
 
 import re
@@ -53,6 +56,8 @@ _DETERMINERS = ("the", "same", "any", "all", *NUMBER_WORDS)  # words after which
 
 def rename_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Name one or two single objects of a prompt by novel nouns.
+
+    "Put the {a} into the {b}."    "This is a wug {b}. This is a dax {a}. Put the dax into the wug."
 
     Half of these prompts also define nouns of unused objects in view, so that nouns have to be read. Only
     table rows are copied, no images. Prompts with novel words of their own or without single objects are
@@ -156,6 +161,8 @@ _FORMS = "all {x}. {x}. is a zup {x}"  # plural, articles and colon, which descr
 class DescribeObjects:
     """Replaces object images of task prompts by texture and name of the object.
 
+    "Put the {a} into the {b}."    "Put the red swirl letter A into the {b}."
+
     Args:
         image_prob: Probability for each image.
         synonym_prob: Probability that a description names the object by an alias of the catalogue.
@@ -241,7 +248,11 @@ class UnknownWords:
 
 
 def shuffle_prompt_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
-    """Permute the objects of each prompt image, independently."""
+    """Permute the objects of each prompt image, independently.
+
+    Generated demonstrations list an object at the same position in all frames of a prompt, which tells what
+    moved without looking. Neither detectors nor VIMA-Bench's `follow_order` do.
+    """
     counts = episode.prompt.objects_per_image.astype(np.int64)
     firsts = np.cumsum(counts) - counts
     rows = [first + rng.permutation(count) for first, count in zip(firsts, counts, strict=True)]
@@ -253,10 +264,10 @@ MOTION_TEXT = "Follow this motion: {frames}."
 
 
 def with_motion_prompt(episode: PreprocessedEpisode) -> PreprocessedEpisode:
-    """Replace the prompt by the frames of the demonstration.
+    """Replace the prompt by the frames of the demonstration: "Follow this motion: {frame_0} … {frame_T}.".
 
-    Only table rows are copied: the prompt refers to the images of the history. Nothing is left of the task's
-    own prompt.
+    The frames are the observations before each action and after the last, whatever the task. Only table rows
+    are copied: the prompt refers to the images of the history. Nothing is left of the task's own prompt.
 
     Args:
         episode: The demonstration. In a prompt image its objects are ordered by id, as in the scenes of task
