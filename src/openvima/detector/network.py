@@ -28,7 +28,7 @@ from openvima.detector.layers import (
 from openvima.detector.roi_align import is_cpu_inference, normalise, paste_masks, pyramid_align
 from openvima.errors import ShapeError
 from openvima.policies.base import usable_device
-from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.nn.layers import TensorRecord
 
 FOREGROUND_IOU = 0.5  # proposals from it on are foreground
 POSITIVE_FRACTION = 0.25  # of the proposals in the losses of the heads

@@ -16,7 +16,7 @@ import torch
 
 from openvima.perception.kernels import CROP_SIZE
 from openvima.policies.nn.actions import ActionTargets
-from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.nn.layers import TensorRecord
 
 WORD = -1  # object index at a position that holds a word
 

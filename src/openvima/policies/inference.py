@@ -14,11 +14,8 @@ from openvima.errors import PolicyError
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import ImageStack
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash, usable_device
-from openvima.policies.batch import HistoryBatch
 from openvima.policies.checkpoint import load_network, save_checkpoint
-from openvima.policies.episodes import Episodes, JointAct, JointCall, JointReset
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
-from openvima.policies.nn.decoder import MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import PROMPT_LIMITS, Processor
 from openvima.policies.t5 import tokenizer_for
@@ -37,15 +34,48 @@ NEAR_TIE = 1e-4  # difference of two logits below which float32 rounding may swa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _StepInputs:
-    """What a step is decoded from: arguments of `decode_step`; slots and features as in `Episodes`."""
+class _Episodes:
+    """The running episodes of a batch; never changed in place.
 
-    history: HistoryBatch
-    features_KF: torch.Tensor
-    previous_B1C: torch.Tensor
-    has_previous_B1: torch.Tensor
+    Args:
+        indices: Index of each episode in the batch that `reset` began.
+        num_slots: Object slots of each episode, see `Processor.encode_observations`.
+        generators: One for each episode, to sample actions.
+        prompt: Encoded prompts.
+        state: Decoding state.
+        actions_BC: Last actions, metres and quaternions, float32; zero before the first step.
+        has_acted: Whether each episode has made a step.
+        margins_B: Smallest difference between the best and second-best logit over the components of the last
+            action; None before the first step.
+        features: Features of the images of the last step, or of the prompts, by digest.
+    """
+
+    indices: tuple[int, ...]
     num_slots: tuple[int, ...]
+    generators: tuple[torch.Generator, ...]
+    prompt: Any  # the network's own record
+    state: Any  # likewise
+    actions_BC: torch.Tensor
+    has_acted: tuple[bool, ...]
+    margins_B: torch.Tensor | None
     features: Mapping[bytes, torch.Tensor]
+
+    def select(self, indices: Sequence[int]) -> "_Episodes":
+        """Return the episodes with these indices in the batch."""
+        rows = [self.indices.index(index) for index in indices]
+        if len(rows) == len(self.indices):
+            return self
+        return _Episodes(
+            tuple(indices),
+            tuple(self.num_slots[row] for row in rows),
+            tuple(self.generators[row] for row in rows),
+            self.prompt.select(rows),
+            self.state.select(rows),
+            self.actions_BC[rows],
+            tuple(self.has_acted[row] for row in rows),
+            None if self.margins_B is None else self.margins_B[rows],
+            self.features,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +88,7 @@ class _LastStep:
         choices: Class indices that were decoded, (B, 1) each, in order.
     """
 
-    episodes: Episodes
+    episodes: _Episodes
     observations: tuple[Mapping, ...]
     choices: tuple[torch.Tensor, ...]
 
@@ -119,9 +149,8 @@ class NetworkPolicy(Policy):
         self._temperature = temperature
         self._seed = generator.initial_seed() if generator else 0
         self._is_bounded = False  # batches of one's own may be as large as the memory allows
-        self._num_prompts = 0
         self._prompts: tuple[RenderedPrompt, ...] = ()
-        self._episodes: Episodes | None = None
+        self._episodes: _Episodes | None = None
         self._last_step: _LastStep | None = None
 
     @torch.inference_mode()
@@ -133,7 +162,33 @@ class NetworkPolicy(Policy):
             PromptError: A prompt is empty, T5 lacks a word, or placeholders and images do not match.
             ShapeError: An image has another shape or dtype.
         """
-        self.begin(prompts, self.start_episodes(prompts))
+        if isinstance(prompts, RenderedPrompt) or not all(isinstance(p, RenderedPrompt) for p in prompts):
+            raise PolicyError("reset takes a list of rendered prompts, such as [env.prompt].")
+        if not prompts:
+            raise PolicyError("reset got no prompts; give one for each episode.")
+        batch, stack = self.processor.encode_prompts(prompts)
+        count, length = batch.word_ids_BL.shape
+        if self._is_bounded and count * length**2 > MAX_PROMPT_PAIRS:
+            raise PolicyError(
+                f"{count} prompts of up to {length} tokens are too many at once; this policy takes "
+                f"{MAX_PROMPT_PAIRS // length**2} of that length. Reset with fewer episodes (--batch)."
+            )
+        features_KF, features = self._encode(stack, {})
+        prompt = self.network.encode_prompt(batch.to(self.device), features_KF)
+        # Without sampling no generator is used, and hashing images takes 3 % of an evaluation.
+        seeds = [self._seed ^ prompt_hash(prompt) if self._temperature else 0 for prompt in prompts]
+        self._episodes = _Episodes(
+            indices=tuple(range(count)),
+            num_slots=(0,) * count,
+            generators=tuple(torch.Generator().manual_seed(seed & (2**63 - 1)) for seed in seeds),
+            prompt=prompt,
+            state=self.network.init_cache(prompt),
+            actions_BC=torch.zeros(count, ACTION_WIDTH, device=self.device),
+            has_acted=(False,) * count,
+            margins_B=None,
+            features=features,
+        )
+        self._prompts, self._last_step = tuple(prompts), None
 
     @torch.inference_mode()
     def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
@@ -150,14 +205,18 @@ class NetworkPolicy(Policy):
                 end of its episode; no object is visible; or a history is too long.
             ShapeError: An image has another shape or dtype.
         """
-        before = episodes = self.episodes_to_step(observations)
+        before = episodes = self._running_episodes(observations)
         running = [each for each in observations if each is not None]
         choices: list[torch.Tensor] = []
         if running:
-            episodes = self.step_episodes(before, running, choices)
+            episodes = self._step(before, running, choices)
         if self.network.explains and not self._is_bounded:  # the caches before a step take memory
             self._last_step = _LastStep(before, tuple(running), tuple(choices))
-        return self.go_on(episodes)
+        self._episodes = episodes
+        actions: list[dict[str, np.ndarray] | None] = [None] * len(self._prompts)
+        for index, array_C in zip(episodes.indices, episodes.actions_BC.cpu().numpy(), strict=True):
+            actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
+        return actions
 
     @torch.inference_mode()
     def explain(self) -> list[Explanation | None]:
@@ -176,22 +235,14 @@ class NetworkPolicy(Policy):
             raise PolicyError(
                 "there is no action to explain; call act first. Sessions of a server keep none."
             )
-        explanations: list[Explanation | None] = [None] * self._num_prompts
+        explanations: list[Explanation | None] = [None] * len(self._prompts)
         last = self._last_step
         if not last.observations:
             return explanations
         from openvima.policies.explaining import explain_row
 
-        step = self._step_inputs(last.episodes, last.observations)
-        trace = self.network.explain_step(
-            last.episodes.prompt,
-            last.episodes.state,
-            step.history,
-            step.features_KF,
-            step.previous_B1C,
-            step.has_previous_B1,
-            last.choices,
-        )
+        inputs, _, _ = self._step_inputs(last.episodes, last.observations)
+        trace = self.network.explain_step(*inputs, last.choices)
         actions_BC = self._episodes.actions_BC.cpu().numpy()
         for row, index in enumerate(last.episodes.indices):
             explanations[index] = explain_row(
@@ -211,27 +262,8 @@ class NetworkPolicy(Policy):
         other = copy(self)
         other._is_bounded = True
         # Never changed in place, so nothing else is shared.
-        other._num_prompts, other._episodes, other._last_step = 0, None, None
+        other._prompts, other._episodes, other._last_step = (), None, None
         return other
-
-    @torch.inference_mode()
-    def joint_call(self, kind: str, inputs: Sequence[Any]) -> JointCall | None:
-        """Return `reset` or `act` as a call that is computed together with those of other sessions.
-
-        Args:
-            kind: "reset" or "act".
-            inputs: Prompts or observations.
-
-        Returns:
-            The call; None where rounding could change actions (below float64), or samples could be drawn
-            twice.
-
-        Raises:
-            PolicyError: As `reset` and `act`.
-        """
-        if self.dtype != torch.float64 or self._temperature:
-            return None
-        return JointReset(self, inputs) if kind == "reset" else JointAct(self, inputs)
 
     @property
     def near_ties(self) -> list[bool]:
@@ -239,7 +271,7 @@ class NetworkPolicy(Policy):
 
         That is the case if the two best logits of a component differ by less than `NEAR_TIE`.
         """
-        near = [False] * self._num_prompts
+        near = [False] * len(self._prompts)
         if self._episodes is not None and self._episodes.margins_B is not None:
             margins = self._episodes.margins_B.tolist()
             for index, margin in zip(self._episodes.indices, margins, strict=True):
@@ -279,62 +311,15 @@ class NetworkPolicy(Policy):
         """
         save_checkpoint(self.network, folder, self.processor.tokenizer, dtype=dtype)
 
-    def start_episodes(self, prompts: Sequence[RenderedPrompt]) -> Episodes:
-        """Encode prompts of new episodes; the policy does not change. Raises as `reset`."""
-        if isinstance(prompts, RenderedPrompt) or not all(isinstance(p, RenderedPrompt) for p in prompts):
-            raise PolicyError("reset takes a list of rendered prompts, such as [env.prompt].")
-        if not prompts:
-            raise PolicyError("reset got no prompts; give one for each episode.")
-        batch, stack = self.processor.encode_prompts(prompts)
-        self._check_pairs(*batch.word_ids_BL.shape)
-        features_KF, features = self._encode(stack, {})
-        prompt = self.network.encode_prompt(batch.to(self.device), features_KF)
-        # Without sampling no generator is used, and hashing images takes 3 % of an evaluation.
-        seeds = [self._seed ^ prompt_hash(prompt) if self._temperature else 0 for prompt in prompts]
-        return Episodes(
-            indices=tuple(range(len(prompts))),
-            num_slots=(0,) * len(prompts),
-            generators=tuple(torch.Generator().manual_seed(seed & (2**63 - 1)) for seed in seeds),
-            prompt=prompt,
-            state=self.network.init_cache(prompt),
-            actions_BC=torch.zeros(len(prompts), ACTION_WIDTH, device=self.device),
-            has_acted=(False,) * len(prompts),
-            margins_B=None,
-            features=features,
-        )
-
-    def check_prompts(self, prompts: Sequence[RenderedPrompt]) -> None:
-        """Check prompts that are encoded in pieces as `start_episodes` checks those that are not.
-
-        Raises:
-            PolicyError: The batch is empty, or a session's batch is too large for it.
-        """
-        if not prompts:
-            raise PolicyError("reset got no prompts; give one for each episode.")
-        if self._is_bounded and len(prompts) * MAX_PROMPT_POSITIONS**2 > MAX_PROMPT_PAIRS:
-            self._check_pairs(*self.processor.encode_prompts(prompts)[0].word_ids_BL.shape)
-
-    def _check_pairs(self, count: int, length: int) -> None:
-        if self._is_bounded and count * length**2 > MAX_PROMPT_PAIRS:
-            raise PolicyError(
-                f"{count} prompts of up to {length} tokens are too many at once; this policy takes "
-                f"{MAX_PROMPT_PAIRS // length**2} of that length. Reset with fewer episodes (--batch)."
-            )
-
-    def begin(self, prompts: Sequence[RenderedPrompt], episodes: Episodes) -> None:
-        """Make episodes those of the policy."""
-        self._episodes = episodes
-        self._num_prompts, self._prompts, self._last_step = len(prompts), tuple(prompts), None
-
-    def episodes_to_step(self, observations: Sequence[Mapping | None]) -> Episodes:
-        """Return the episodes that have an observation; the policy does not change. Raises as `act`."""
+    def _running_episodes(self, observations: Sequence[Mapping | None]) -> _Episodes:
+        """Return the episodes that have an observation."""
         if self._episodes is None:
             raise PolicyError("there are no prompts yet; call reset with one for each episode first.")
         if isinstance(observations, Mapping):
             raise PolicyError("act takes a list of observations, one for each prompt, such as [observation].")
-        if len(observations) != self._num_prompts:
+        if len(observations) != len(self._prompts):
             raise PolicyError(
-                f"got {len(observations)} observations for {self._num_prompts} prompts; give one for each, "
+                f"got {len(observations)} observations for {len(self._prompts)} prompts; give one for each, "
                 "and None for episodes that have ended."
             )
         running = [index for index, each in enumerate(observations) if each is not None]
@@ -344,7 +329,7 @@ class NetworkPolicy(Policy):
                 f"episode {', '.join(map(str, ended))} ended with a None before; call reset to start again."
             )
         episodes = self._episodes.select(running)
-        cached = episodes.cache.mask_BS
+        cached = getattr(episodes.state, "cache", episodes.state).mask_BS  # of keys and values
         if self._is_bounded and cached.numel() > MAX_CACHED_TOKENS:
             raise PolicyError(
                 f"the histories of {len(cached)} episodes have {cached.shape[1]} tokens each, padded; this "
@@ -352,58 +337,42 @@ class NetworkPolicy(Policy):
             )
         return episodes
 
-    def step_episodes(
-        self, episodes: Episodes, observations: Sequence[Mapping], choices: list[torch.Tensor]
-    ) -> Episodes:
-        """Decode one action for every episode, and append the classes that were chosen.
-
-        The policy does not change. Raises as `act`.
-        """
-        step = self._step_inputs(episodes, observations)
+    def _step(
+        self, episodes: _Episodes, observations: Sequence[Mapping], choices: list[torch.Tensor]
+    ) -> _Episodes:
+        """Decode one action for every episode, and append the classes that were chosen."""
+        inputs, num_slots, features = self._step_inputs(episodes, observations)
         strategy = sampling(episodes.generators, self._temperature) if self._temperature else greedy
         margins: list[torch.Tensor] = []
-        actions_B1C, state = self.network.decode_step(
-            episodes.prompt,
-            episodes.state,
-            step.history,
-            step.features_KF,
-            step.previous_B1C,
-            step.has_previous_B1,
-            _recording(strategy, margins, choices),
-        )
+        actions_B1C, state = self.network.decode_step(*inputs, _record(strategy, margins, choices))
         return replace(
             episodes,
-            num_slots=step.num_slots,
+            num_slots=num_slots,
             state=state,
             actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as returned
-            has_acted=(True,) * len(episodes),
+            has_acted=(True,) * len(observations),
             margins_B=torch.stack(margins).amin(0) if margins else None,
-            features=step.features,
+            features=features,
         )
 
-    def go_on(self, episodes: Episodes) -> list[dict[str, np.ndarray] | None]:
-        """Make episodes that were stepped those of the policy, and return their actions, as `act` does."""
-        self._episodes = episodes
-        actions: list[dict[str, np.ndarray] | None] = [None] * self._num_prompts
-        for index, array_C in zip(episodes.indices, episodes.actions_BC.cpu().numpy(), strict=True):
-            actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
-        return actions
-
-    def _step_inputs(self, episodes: Episodes, observations: Sequence[Mapping]) -> _StepInputs:
-        """Encode observations and previous actions."""
+    def _step_inputs(
+        self, episodes: _Episodes, observations: Sequence[Mapping]
+    ) -> tuple[tuple[Any, ...], tuple[int, ...], dict[bytes, torch.Tensor]]:
+        """Return the arguments of `decode_step`, and slots and features as in `_Episodes`."""
         batch, stack = self.processor.encode_observations(
             [[observation] for observation in observations], episodes.num_slots
         )
         features_KF, features = self._encode(stack, episodes.features)
-        history = batch if self.device.type == "cpu" else batch.to(self.device)
-        return _StepInputs(
-            history,
+        has_previous_B1 = torch.tensor(episodes.has_acted, device=self.device)[:, None]
+        inputs = (
+            episodes.prompt,
+            episodes.state,
+            batch if self.device.type == "cpu" else batch.to(self.device),
             features_KF,
             episodes.actions_BC[:, None],
-            torch.tensor(episodes.has_acted, device=self.device)[:, None],
-            tuple(batch.num_slots_BT[:, 0].tolist()),
-            features,
+            has_previous_B1,
         )
+        return inputs, tuple(batch.num_slots_BT[:, 0].tolist()), features
 
     def _encode(
         self, stack: ImageStack, cached: Mapping[bytes, torch.Tensor]
@@ -425,16 +394,16 @@ class NetworkPolicy(Policy):
         return features, dict(zip(keys, features, strict=True))
 
 
-def _recording(
+def _record(
     strategy: DecodingStrategy, margins: list[torch.Tensor], choices: list[torch.Tensor]
 ) -> DecodingStrategy:
     """Wrap a strategy to record the difference of the two best logits of each row, (B,), and its choices."""
 
-    def recorded(logits: torch.Tensor) -> torch.Tensor:
+    def record(logits: torch.Tensor) -> torch.Tensor:
         if logits.shape[-1] > 1:
             best, second = logits.topk(2).values.unbind(-1)
             margins.append((best - second).flatten(1).amin(1))
         choices.append(strategy(logits))
         return choices[-1]
 
-    return recorded
+    return record

@@ -8,8 +8,7 @@ from functools import cache
 import torch
 from torch import nn
 
-from openvima.policies.nn.layers import mlp
-from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.nn.layers import TensorRecord, mlp
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 # Slices of the action vector: positions and quaternions of both poses, in this order in all policies.

@@ -18,8 +18,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.errors import ConfigError, PolicyError
-from openvima.policies.nn.layers import Linear, Unpadder, normal_weights
-from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.nn.layers import Linear, TensorRecord, Unpadder, normal_weights
 
 MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history together
 MAX_PROMPT_POSITIONS = 256

@@ -7,7 +7,8 @@ Training uses oneDNN, which takes half the time of torch's default library on AM
 
 import os
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, Self
 
 import torch
 from torch import nn
@@ -232,3 +233,30 @@ class MetaInit(TorchFunctionMode):
             return args[0] if args else kwargs["tensor"]
         with torch.device("meta"):
             return (torch.empty if func is torch.randn else func)(*args, **kwargs)
+
+
+class TensorRecord:
+    """Base of dataclasses of tensors; fields may be records or tuples of tensors as well."""
+
+    __slots__ = ()
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the record on another device."""
+        return map_tensors(self, lambda tensor: tensor.to(device))
+
+    def select(self, rows: Sequence[int] | torch.Tensor) -> Self:
+        """Return some rows of the batch, the first axis of all tensors."""
+        index = rows if isinstance(rows, torch.Tensor) else torch.tensor(rows, dtype=torch.int64)
+        return map_tensors(self, lambda tensor: tensor[index.to(tensor.device)])
+
+
+def map_tensors(value: Any, function: Callable[[torch.Tensor], torch.Tensor]) -> Any:  # Any: its own kind
+    """Apply a function to all tensors of a record or tuple; values of other kinds stay."""
+    if isinstance(value, torch.Tensor):
+        return function(value)
+    if isinstance(value, tuple):
+        return tuple(map_tensors(each, function) for each in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        names = [field.name for field in fields(value)]
+        return replace(value, **{name: map_tensors(getattr(value, name), function) for name in names})
+    return value

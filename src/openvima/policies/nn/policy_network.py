@@ -14,9 +14,9 @@ from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_head import ObservationTokens
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, action_metrics, greedy
 from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder
+from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
-from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.scene import END_EFFECTORS
 
 

@@ -15,9 +15,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.nn.layers import mlp, scale_last
+from openvima.policies.nn.layers import TensorRecord, map_tensors, mlp, scale_last
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
-from openvima.policies.nn.tensor_record import TensorRecord, map_tensors
 from openvima.policies.pointer.config import CorrespondenceConfig
 
 _UNIT_M = 0.1  # positions are compared in decimetres, so that differences are of the order of 1

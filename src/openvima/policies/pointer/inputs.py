@@ -6,13 +6,13 @@ rotations.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch.nn import functional as F
 
 from openvima.policies.nn.actions import from_unit_range, masked_mean, to_unit_range
-from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.pointer.correspondence import ObjectFeatures
 
 
@@ -82,12 +82,6 @@ class PointerPrompt(TensorRecord):
     attributes_BLX: torch.Tensor | None = None
     describes_BL: torch.Tensor | None = None
 
-    def filled(self) -> "PointerPrompt":
-        """Return the prompts with a mask of the words that describe appearance, if none does."""
-        if self.describes_BL is not None:
-            return self
-        return replace(self, describes_BL=torch.zeros_like(self.mask_BL))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadInputs:
@@ -103,7 +97,7 @@ class HeadInputs:
         has_suction_BT: Whether the end effector is the suction cup, which carries an object rigidly; the
             spatula pushes.
         previous_BTC: The action before each step, metres and quaternions; zero where there was none.
-        steps_BT: Indices of the steps, from 0; (1, T) if they are those of all episodes.
+        steps_BT: Indices of the steps, from 0; (1, T), those of all episodes.
         first_step: Objects in view at the first step of the episode.
         prompt: Encoded prompts.
         rotations_BTNR: Probabilities of the rotation that brings each object in view to the heading in which

@@ -21,10 +21,10 @@ from openvima.policies.nn.action_head import (
 )
 from openvima.policies.nn.actions import ActionEncoder, ActionTargets, DecodingStrategy, greedy, to_unit_range
 from openvima.policies.nn.decoder import KVCache, TokenSegment, build_decoder
+from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork, StepTrace
 from openvima.policies.nn.prompt_encoder import PromptEncoder
-from openvima.policies.nn.tensor_record import TensorRecord, join_rows
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
 from openvima.policies.pointer.correspondence import (
@@ -50,12 +50,12 @@ class DecodingState(TensorRecord):
 
     Args:
         cache: Keys and values.
-        num_steps_B: Number of steps of each episode, int64.
-        first_step: Objects in view at the first of them, zeros for episodes before it; None if all are.
+        num_steps: Number of steps, the same for all episodes.
+        first_step: Objects in view at the first of them; None before it.
     """
 
     cache: KVCache
-    num_steps_B: torch.Tensor
+    num_steps: int = 0
     first_step: ObjectSet | None = None
 
 
@@ -110,7 +110,14 @@ class Pointer(PolicyNetwork):
         return self.images.encode_images(images)
 
     def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> PointerPrompt:
-        """Encode prompts with and without appearance, and gather their objects."""
+        """Encode prompts with and without appearance, and gather their objects.
+
+        An object has three numbers: its row among the objects of the batch (S), which the object encoder
+        reads; its place among the objects of its prompt in reading order (M), by which objects are compared;
+        and the position of its token (L). `row_BM` and `order_BM` lead from M to S and to L. Where
+        `exists_BM` is False they name something else, so what is written through them is masked first. No
+        object has two tokens, so that nothing is written twice.
+        """
         features_VSF = features_KF[prompts.crop_index_VS]
         is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
         appearance_SA = self.embed_appearance(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
@@ -118,6 +125,7 @@ class Pointer(PolicyNetwork):
         exists_BM = is_image_BL.gather(1, order_BM)
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
         objects = _prompt_objects(prompts, row_BM, exists_BM, features_VSF, appearance_SA)
+        # From words to the images that defined them: "This is a wug {image}. Put the wug …"
         weights_BLL = coreference(prompts).to(features_VSF.dtype)
         compared, selected_BP, attributes_BMX = objects, None, None
         if self.attributes is not None:
@@ -136,20 +144,19 @@ class Pointer(PolicyNetwork):
         changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
         describes_BL = prompts.names_texture_BL & (self.text_appearance is not None)
         tokens_BLD, masked_BLD = self._encode(prompts, describes_BL, features_VSF, changes_SD, weights_BLL)
+        # Heads attend over positions. A word stands for the images that it refers to: their sum of weight 1.
         appearance_BLA = tokens_BLD.new_zeros(*is_image_BL.shape, appearance_SA.shape[-1])
         if len(appearance_SA):
             appearance_BLA = appearance_SA[prompts.object_index_BL.clamp(min=0)] * is_image_BL[..., None]
-        object_mask_BL = is_image_BL
+        attributes_BLX, object_mask_BL = None, is_image_BL
+        if attributes_BMX is not None:
+            attributes_BLX = attributes_BMX.new_zeros(*is_image_BL.shape, attributes_BMX.shape[-1])
+            position_BMX = order_BM[..., None].expand_as(attributes_BMX)
+            attributes_BLX = attributes_BLX.scatter(1, position_BMX, attributes_BMX)
         if self.coreference is not None:
             appearance_BLA = appearance_BLA + weights_BLL @ appearance_BLA
             object_mask_BL = is_image_BL | (weights_BLL > 0).any(dim=-1)
-        attributes_BLX = None
-        if attributes_BMX is not None:
-            attributes_BLX = attributes_BMX.new_zeros(*is_image_BL.shape, attributes_BMX.shape[-1])
-            attributes_BLX = attributes_BLX.scatter(
-                1, order_BM[..., None].expand_as(attributes_BMX), attributes_BMX
-            )
-            if self.coreference is not None:
+            if attributes_BLX is not None:
                 attributes_BLX = attributes_BLX + weights_BLL @ attributes_BLX
         index_BMD = order_BM[..., None].expand(-1, -1, tokens_BLD.shape[-1])
         object_set = ObjectSet.of(tokens_BLD.gather(1, index_BMD), objects, rotations_BMR)
@@ -172,8 +179,7 @@ class Pointer(PolicyNetwork):
 
     def init_cache(self, prompt: PointerPrompt) -> DecodingState:
         """Return the state of decoding after the prompt and before the first step."""
-        cache = self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)
-        return DecodingState(cache, torch.zeros_like(cache.length_B))
+        return DecodingState(self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL))
 
     def loss(
         self, prompt: PointerPrompt, history: HistoryBatch, features_KF: torch.Tensor, targets: ActionTargets
@@ -235,15 +241,11 @@ class Pointer(PolicyNetwork):
         previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
         outputs_BTQD, cache = decode_observations(self.decoder, state.cache, tokens, previous)
         objects_BTND = outputs_BTQD[:, :, :-1]
-        num_steps = history.steps_BT.shape[1]
-        steps_BT = torch.arange(num_steps, device=prompt.mask_BL.device)[None]
-        first_step, is_first_B = state.first_step, state.num_steps_B == 0
-        if first_step is not None:
-            steps_BT = steps_BT + state.num_steps_B[:, None]
-        if first_step is None or is_first_B.any():
+        num_steps, first_step = history.steps_BT.shape[1], state.first_step
+        if first_step is None:
             now = objects.at_step(0)
-            now = ObjectSet.of(objects_BTND[:, 0], now, now.appearance_NA[..., :0])
-            first_step = now if first_step is None else _replaced(first_step, now, is_first_B)
+            first_step = ObjectSet.of(objects_BTND[:, 0], now, now.appearance_NA[..., :0])
+        steps_BT = state.num_steps + torch.arange(num_steps, device=prompt.mask_BL.device)[None]
         inputs = HeadInputs(
             query_BTD=tokens.query(outputs_BTQD),
             objects_BTND=objects_BTND,
@@ -259,7 +261,7 @@ class Pointer(PolicyNetwork):
             rotations_BTNR=rotations_BTNR,
             attributes_BTNX=attributes_BTNX,
         )
-        return inputs, DecodingState(cache, state.num_steps_B + num_steps, first_step)
+        return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
 
     def embed_appearance(
         self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
@@ -344,9 +346,8 @@ class Pointer(PolicyNetwork):
         if self.config.correspondence and self.config.correspondence.within_view:
             others = is_another(objects)
             changes_BTND = self.correspondence(objects, objects, others, rotation_between)[0] + changes_BTND
-        return changes_BTND, since_BTNR.flip(-1).roll(
-            1, dims=-1
-        )  # bin k of the inverse rotation is bin R - k
+        # Bin k of the inverse rotation is bin R - k.
+        return changes_BTND, since_BTNR.flip(-1).roll(1, dims=-1)
 
     @property
     def _rotation_between(self) -> RotationBetween | None:
@@ -408,13 +409,6 @@ def _objects_in_view(
         exists_BTN,
         now_BTN,
     )
-
-
-def _replaced(objects: ObjectSet, others: ObjectSet, rows_B: torch.Tensor) -> ObjectSet:
-    """Return a set with some rows of another one."""
-    count = len(rows_B)
-    both = join_rows([objects, others], [count, count])
-    return both.select(torch.arange(count, device=rows_B.device) + count * rows_B)
 
 
 def _scene_index(objects: ObjectFeatures) -> torch.Tensor:

@@ -1,10 +1,11 @@
-"""Attributes: how alike two objects are in texture, colour, shape, profile, height or size alone.
+"""What words of a prompt say about objects: attributes to compare, what was named before, appearance.
 
-"Put all objects with the same texture as {base} into it." A word of the prompt selects the projection of the
-object's crops and boxes under which objects are then compared.
+"Put all objects with the same texture as {base} into it." A word selects the projection of the object's crops
+and boxes under which objects are then compared: texture, colour, shape, profile, height or size alone.
 
-Shape suffixes: V views, N objects, F width of crop features, P attributes, W width of a projection, X all
-projections in one vector; B batch, L prompt positions; `...` any axes.
+Shape suffixes: V views, N objects, F width of crop features, P attributes, W width of a projection (in
+`Coreference` of the text encoder), X all projections in one vector; B batch, T steps, L prompt positions,
+A width of appearance; `...` any axes.
 """
 
 import math
@@ -213,9 +214,8 @@ class TextGrounding(nn.Module):
         scores_BTL = attention_scores(
             self.query(context_BTD), self.key(prompt.masked_BLD), prompt.describes_BL
         )
-        return torch.softmax(F.pad(scores_BTL, (0, 1)), dim=-1)[
-            ..., :-1
-        ]  # the last score, 0, is that of none
+        scores_BTL = F.pad(scores_BTL, (0, 1))  # the last score, 0, is that of none
+        return torch.softmax(scores_BTL, dim=-1)[..., :-1]
 
 
 def attention_scores(query_BTD: torch.Tensor, key_BLD: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:

@@ -22,7 +22,7 @@ from openvima.catalog.partitions import Pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random
 from openvima.multiprocess import imap_unordered
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
-from openvima.policies.nn.tensor_record import TensorRecord, map_tensors
+from openvima.policies.nn.layers import TensorRecord, map_tensors
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
