@@ -203,9 +203,9 @@ def _config(policy: str) -> "PolicyConfig":
         return preset(policy)
     from openvima.errors import UnknownPolicyError
     from openvima.policies.checkpoint import load_network, read_info
-    from openvima.policies.naming import find_checkpoint, is_policy_source, unknown_policy
+    from openvima.policies.naming import PolicyRef, find_checkpoint, unknown_policy
 
-    if not is_policy_source(policy):
+    if not PolicyRef.parse(policy).has_weights:
         raise UnknownPolicyError(unknown_policy(policy, ()))
     found = find_checkpoint(policy)
     return read_info(found).config if found.is_dir() else load_network(found)[0].config

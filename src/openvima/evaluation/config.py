@@ -29,11 +29,11 @@ from openvima.evaluation.ablations import (
 )
 from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
-from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
+from openvima.evaluation.sources import PolicySource, policy_sources
 from openvima.input_files import as_path, settle
-from openvima.policies.naming import BUNDLED
+from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene.command import steps_per_primitive
-from openvima.serving.lerobot import is_lerobot, lerobot_server
+from openvima.serving.lerobot import lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
@@ -151,7 +151,7 @@ class EvaluationConfig:
         if self.address is not None and self.engine == "processes":
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
         if self.python is not None and not any(
-            is_lerobot(one.source) for one in policy_sources(self.policies)
+            one.kind == "lerobot" for one in policy_sources(self.policies)
         ):
             yield f"python is {self.python!r}, but no policy is lerobot:PATH."
         takes_boxes = self.uses(DETECTED_BOXES)
@@ -209,7 +209,7 @@ class EvaluationConfig:
             ServerError: A policy cannot be served.
         """
         sources = policy_sources(self.policies) if self.python else ()
-        if not any(is_lerobot(source.source) for source in sources):
+        if not any(source.kind == "lerobot" for source in sources):
             yield self
             return
         assert self.python is not None
@@ -217,7 +217,7 @@ class EvaluationConfig:
             policies = []
             for source in sources:
                 where = source.source
-                if is_lerobot(where):
+                if PolicyRef.parse(where).kind == "lerobot":
                     where = stack.enter_context(lerobot_server(where, self.python, device=self.device))
                 policies.append(f"{source.name}={where}")
             yield replace(self, policies=tuple(policies), python=None)
@@ -295,10 +295,10 @@ class Batch:
     def with_whole_paths(self) -> "Batch":
         """Return the batch for a process with another working directory."""
         source, assets, boxes = self.source, self.env_config.assets, self.boxes
-        kind = PolicySource(self.policy, source).kind
+        kind = PolicyRef.parse(source).kind
         if kind == "code":
             source = with_absolute_path(source)
-        elif kind == "run" and source not in BUNDLED and Path(source).exists():
+        elif kind == "path":
             source = str(Path(source).absolute())
         if is_code(assets):
             assets = with_absolute_path(assets)

@@ -14,8 +14,8 @@ from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
 from openvima.evaluation.sources import NAMED_POLICIES, PolicySource, weights_hash
 from openvima.evaluation.verification import recorded_env_config
-from openvima.policies.naming import BUNDLED, CHECKPOINTS_FOLDER
-from openvima.policies.presets import PRESETS, UNTRAINED
+from openvima.policies.naming import BUNDLED, CHECKPOINTS_FOLDER, UNTRAINED
+from openvima.policies.presets import PRESETS
 from openvima.scene import Episode
 from openvima.scene.command import PRIMITIVES
 from openvima.user_code import is_code

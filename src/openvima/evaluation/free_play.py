@@ -14,8 +14,9 @@ from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, RolloutPolicy, load_rollout_policy
 from openvima.evaluation.session import EpisodeSession
-from openvima.evaluation.sources import ORACLE, PolicySource
+from openvima.evaluation.sources import PolicySource
 from openvima.policies.base import Policy
+from openvima.policies.naming import ORACLE
 from openvima.render.rasteriser import Rasteriser, front_above_top
 from openvima.scene import Action, Episode, Outcome, Scene
 from openvima.scene.explanation import Explanation

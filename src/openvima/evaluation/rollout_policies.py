@@ -21,15 +21,14 @@ from openvima.errors import (
 )
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
-from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource
-from openvima.policies.base import POLICIES_THAT_EXPLAIN
+from openvima.evaluation.sources import PolicySource
+from openvima.policies.base import POLICIES_THAT_EXPLAIN, require_torch, torch_threads
 from openvima.policies.loading import checked_policy
-from openvima.policies.naming import is_own_code
+from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene import Action
 from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand
 from openvima.scene.explanation import PLACE_KINDS, Explanation
 from openvima.serving.client import RemotePolicy
-from openvima.serving.protocol import is_remote
 from openvima.user_code import described
 
 _MAX_SEEDS = 16  # that an error lists
@@ -250,15 +249,12 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = Fals
 @contextmanager
 def one_thread(batch: Batch) -> Iterator[None]:
     """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
-    without_torch = is_own_code(batch.source) and importlib.util.find_spec("torch") is None
-    if batch.source in (ORACLE, RANDOM) or is_remote(batch.source) or without_torch:  # no network here
+    kind = PolicyRef.parse(batch.source).kind
+    without_torch = kind == "code" and importlib.util.find_spec("torch") is None
+    if kind in (ORACLE, RANDOM, "remote") or without_torch:  # no network here
         yield
         return
-    from openvima.policies.base import require_torch
-
     require_torch(f"policy {batch.policy!r}")
-    from openvima.policies.base import torch_threads
-
     with torch_threads(1):
         yield
 
@@ -290,9 +286,7 @@ def load_own_rollout_policy(
     if source == ORACLE:
         return OracleRolloutPolicy()
     options: dict[str, Any] = {}  # Any: of several kinds
-    if temperature and source != RANDOM and not is_remote(source) and not is_own_code(source):
-        from openvima.policies.base import require_torch
-
+    if temperature and PolicyRef.parse(source).kind not in (RANDOM, "remote", "code"):
         require_torch(f"policy {source!r}")
         import torch
 
@@ -305,7 +299,7 @@ def load_own_rollout_policy(
 def _load_policy(
     source: str, fingerprint: str, **options: Any
 ) -> Any:  # Any: see `PromptedRolloutPolicy`; options of several kinds
-    if is_remote(source):
+    if PolicyRef.parse(source).kind == "remote":
         _load_policy.cache_clear()  # ends the connection before: a server may let in one client only
     return _build_policy(source, **options)
 
@@ -315,7 +309,7 @@ def _build_policy(
 ) -> Any:  # Any: as for `_load_policy`
     from openvima.policies import load_policy
 
-    if is_remote(source):
+    if PolicyRef.parse(source).kind == "remote":
         return RemotePolicy(source)
     if precision:
         import torch

@@ -22,20 +22,19 @@ from openvima.policies.loading import (
 )
 from openvima.policies.naming import (
     BUNDLED,
+    ORACLE,
+    RANDOM,
+    UNTRAINED,
+    PolicyRef,
     find_checkpoint,
     hub_commit,
-    is_own_code,
-    is_policy_source,
     unknown_policy,
 )
-from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
 from openvima.serving.client import describe
-from openvima.serving.lerobot import SERVER_MODULE, is_lerobot, lerobot_name
-from openvima.serving.protocol import DEFAULT_MODALITIES, check_address, is_remote
+from openvima.serving.lerobot import SERVER_MODULE, lerobot_name
+from openvima.serving.protocol import DEFAULT_MODALITIES, check_address
 from openvima.user_code import load_function, source_hash, without_folder
 
-ORACLE = "oracle"
-RANDOM = "random"
 NAMED_POLICIES = (ORACLE, RANDOM, UNTRAINED)
 TRAINED_KINDS = ("run", "code", "remote")  # see `PolicySource.kind`
 _WEIGHTS = (".safetensors", ".ckpt", ".pt")
@@ -57,20 +56,18 @@ class PolicySource:
     trust_code: bool = False
 
     @property
+    def ref(self) -> PolicyRef:
+        """What the source names."""
+        return PolicyRef.parse(self.source)
+
+    @property
     def kind(self) -> str:
-        """What it is: oracle, random, untrained (of any preset), remote, lerobot, code or run.
+        """Its kind in the results: oracle, random, untrained, remote, lerobot, code or run.
 
         "code" is a function that makes a policy; "run" is all else.
         """
-        if is_lerobot(self.source):
-            return "lerobot"
-        if is_remote(self.source):
-            return "remote"
-        if is_untrained(self.source):
-            return UNTRAINED
-        if self.source in NAMED_POLICIES:
-            return self.source
-        return "code" if is_own_code(self.source) else "run"
+        kind = self.ref.kind
+        return "run" if kind in ("bundled", "path", "hub", "unknown") else kind
 
     @property
     def learner(self) -> LearnerCode | None:
@@ -96,10 +93,10 @@ class PolicySource:
         elif self.kind == "code":
             load_function(self.source, what="policy")
         elif self.kind == UNTRAINED:
-            untrained_preset(self.source)
+            _ = self.ref.preset  # raises
         elif code := self.learner:
             code.check(trusted=self.trust_code)
-        elif self.kind == "run" and not is_policy_source(self.source):
+        elif self.kind == "run" and not self.ref.has_weights:
             raise UnknownPolicyError(unknown_policy(self.source, NAMED_POLICIES))
 
     def record(self) -> dict[str, Any]:  # Any: plain values
@@ -136,7 +133,7 @@ class PolicySource:
             what = {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
             return what | ({"hub": resolved} if (resolved := hub_commit(self.source)) else {})
         is_preset = self.kind == UNTRAINED and self.source != UNTRAINED
-        return {"kind": self.kind} | ({"preset": untrained_preset(self.source)} if is_preset else {})
+        return {"kind": self.kind} | ({"preset": self.ref.preset} if is_preset else {})
 
     def _seen(self) -> dict[str, list[str]]:
         found = held_out_data(self.source)
@@ -157,7 +154,7 @@ def policy_sources(policies: Sequence[str], *, trust_code: bool = False) -> tupl
     sources = []
     for given in policies:
         given = expand_home(given)
-        whole = is_remote(given) or os.path.exists(given)  # such as runs/lr=0.001
+        whole = PolicyRef.parse(given).kind == "remote" or os.path.exists(given)  # such as runs/lr=0.001
         name, equals, source = ("", "", given) if whole else given.partition("=")
         if not equals:
             name, source = _default_name(given), given
@@ -204,12 +201,13 @@ def object_record(policy: Policy) -> dict[str, Any]:  # Any: plain values
 
 
 def _default_name(source: str) -> str:
-    if is_remote(source):
+    kind = PolicyRef.parse(source).kind
+    if kind == "remote":
         check_address(source)
         name = urlsplit(source).netloc
-    elif is_lerobot(source):
+    elif kind == "lerobot":
         name = lerobot_name(source)
-    elif is_own_code(source):
+    elif kind == "code":
         name = Path(source.rpartition(":")[0] or source).name.removesuffix(".py")
     else:
         name = Path(source).name

@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from openvima.errors import ConfigError, OpenVimaError, PolicyError, UnknownPolicyError, echo
-from openvima.input_files import as_text, read_yaml
-from openvima.policies.base import Policy, RandomPolicy, require_torch
+from openvima.input_files import read_yaml
+from openvima.policies.base import Policy, RandomPolicy, require_torch, usable_device
 from openvima.policies.naming import (
     CHECKPOINTS_FOLDER,
     CONFIG_FILE,
+    RANDOM,
+    UNTRAINED,
+    PolicyRef,
     checkpoint_folder,
-    is_own_code,
-    is_policy_source,
     unknown_policy,
 )
-from openvima.policies.presets import UNTRAINED, is_untrained, untrained_preset
+from openvima.policies.presets import preset
 from openvima.user_code import call_function, is_code
 
 _METHODS = {"reset": "prompts", "act": "observations"}
@@ -114,8 +115,6 @@ def policy_of_run(folder: str | Path, code: LearnerCode, *, device: str = "cpu")
         PolicyError: `Learner.policy` returns something else than a policy.
     """
     require_torch(f"the policy in {folder}")
-    from openvima.policies.base import usable_device
-
     learner = call_function(code.source, what=f"preset in {code.file}")
     learner.read(checkpoint_folder(Path(folder)))
     learner.to(usable_device(device)).eval()
@@ -218,35 +217,35 @@ def load_policy(
             checkpoint and has the name of a bundled one.
         MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
     """
-    name_or_run = as_text(name_or_run)
-    if name_or_run == "random":
+    ref = PolicyRef.parse(name_or_run)
+    source = ref.text
+    if ref.kind == RANDOM:
         return RandomPolicy(seed)
-    if is_untrained(name_or_run):
-        name = untrained_preset(name_or_run)
-        if Path(name_or_run).is_dir():
+    if ref.kind == UNTRAINED:
+        name = ref.preset
+        if Path(source).is_dir():
             raise PolicyError(
-                f"{name_or_run!r} is a network with fresh weights, and a folder here; write ./{name_or_run} "
+                f"{source!r} is a network with fresh weights, and a folder here; write ./{source} "
                 "for the folder, or work elsewhere for the network."
             )
-        require_torch(f"policy {name_or_run!r}")
+        require_torch(f"policy {source!r}")
         from openvima.policies.build import build_network
         from openvima.policies.inference import NetworkPolicy
-        from openvima.policies.presets import preset
 
         return NetworkPolicy(build_network(preset(name), seed=seed), **options)
-    if is_own_code(name_or_run):
-        _check_extractor(name_or_run, options)
-        return policy_of_code(name_or_run)
-    if not is_policy_source(name_or_run):
-        raise UnknownPolicyError(unknown_policy(name_or_run, ("random", UNTRAINED)))
-    if code := learner_code(name_or_run):
+    if ref.kind == "code":
+        _check_extractor(source, options)
+        return policy_of_code(source)
+    if not ref.has_weights:
+        raise UnknownPolicyError(unknown_policy(source, (RANDOM, UNTRAINED)))
+    if code := learner_code(source):
         code.check(trusted=trust_code)
-        _check_extractor(name_or_run, options)
-        return policy_of_run(name_or_run, code, device=options.get("device", "cpu"))
-    require_torch(f"the policy in {name_or_run}")
+        _check_extractor(source, options)
+        return policy_of_run(source, code, device=options.get("device", "cpu"))
+    require_torch(f"the policy in {source}")
     from openvima.policies.inference import NetworkPolicy
 
-    return NetworkPolicy.from_pretrained(name_or_run, **options)
+    return NetworkPolicy.from_pretrained(source, **options)
 
 
 def _check_extractor(source: str, options: Mapping[str, Any]) -> None:  # Any: see `load_policy`

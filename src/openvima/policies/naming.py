@@ -1,14 +1,15 @@
-"""File names in checkpoint folders and run folders."""
+"""Names of policies: what a text stands for, the bundled checkpoints, and files and folders of others."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from openvima.atomic_io import restore_folder
 from openvima.errors import CheckpointError, PolicyError, unknown_name
 from openvima.hub import HubName, fetch, hub_name
-from openvima.input_files import as_path, read_text
-from openvima.policies.presets import PRESETS, PUBLISHED, UNTRAINED, is_untrained
+from openvima.input_files import as_path, as_text, read_text
+from openvima.policies.presets import PRESETS, PUBLISHED, check_preset
 from openvima.user_code import is_code
 
 WEIGHTS_FILE = "model.safetensors"
@@ -27,6 +28,13 @@ def checkpoint_order(checkpoint: Path) -> tuple[str, int]:
 SMALL = "openvima-small"
 VIMA = "openvima-vima"
 MODEL_CARD = "MODEL_CARD.md"
+
+ORACLE, RANDOM, UNTRAINED = "oracle", "random", "untrained"
+LEROBOT = "lerobot:"  # begins the names of LeRobot policies
+SERVER_SCHEMES = ("ws://", "wss://")
+Kind = Literal[
+    "oracle", "random", "untrained", "remote", "lerobot", "code", "bundled", "path", "hub", "unknown"
+]
 
 _TRAINED = Path(__file__).parent / "trained"
 
@@ -94,16 +102,70 @@ def bundled_folder(name: str) -> Path:
 _HUB_FILES = (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*")
 
 
-def is_policy_source(text: str) -> bool:
-    """Whether a text names a bundled checkpoint, an existing path or a repository on the Hub."""
-    return text in BUNDLED or Path(text).exists() or hub_name(text) is not None
+@dataclass(frozen=True, slots=True)
+class PolicyRef:
+    """What a text names as a policy. Nothing is loaded, asked or downloaded.
+
+    | kind | text |
+    |---|---|
+    | oracle | "oracle", in evaluations |
+    | random | "random" |
+    | untrained | "untrained", or "untrained:PRESET" |
+    | remote | "ws://HOST:PORT" or "wss://…", in evaluations |
+    | lerobot | "lerobot:PATH" or "lerobot:OWNER/NAME", in evaluations |
+    | code | "FILE.py:FUNCTION" or "MODULE:FUNCTION" |
+    | bundled | name of a bundled checkpoint |
+    | path | an existing run folder, checkpoint folder or published .ckpt file |
+    | hub | "owner/name" or "owner/name@revision" on the Hugging Face Hub |
+    | unknown | anything else, such as a preset, which has no weights |
+
+    Args:
+        text: The text.
+        kind: As above.
+    """
+
+    text: str
+    kind: Kind
+
+    @staticmethod
+    def parse(source: str | Path) -> "PolicyRef":
+        """Read a name; a `Path` is always a local one."""
+        text = as_text(source)
+        return PolicyRef(text, _kind(text))
+
+    @property
+    def has_weights(self) -> bool:
+        """Whether it names a checkpoint, see `find_checkpoint`."""
+        return self.kind in ("bundled", "path", "hub")
+
+    @property
+    def preset(self) -> str:
+        """The preset whose fresh weights an untrained policy has.
+
+        Raises:
+            UnknownPolicyError: There is no such preset.
+        """
+        name = self.text.partition(":")[2] if ":" in self.text else "nano"
+        check_preset(name)
+        return name
 
 
-def is_own_code(text: str) -> bool:
-    """Whether a text names a function that makes a policy, and no existing path; or a file without one."""
-    if is_untrained(text):
-        return False
-    return text.endswith(".py") or (is_code(text) and not Path(text).exists())
+def _kind(text: str) -> Kind:
+    if text in (ORACLE, RANDOM):
+        return text
+    if text.startswith(LEROBOT):
+        return "lerobot"
+    if text.startswith(SERVER_SCHEMES):
+        return "remote"
+    if text.partition(":")[0] == UNTRAINED:
+        return "untrained"
+    if text.endswith(".py") or (is_code(text) and not Path(text).exists()):  # a file alone lacks its function
+        return "code"
+    if text in BUNDLED:
+        return "bundled"
+    if Path(text).exists():
+        return "path"
+    return "hub" if hub_name(text) else "unknown"
 
 
 def unknown_policy(name: str, others: Sequence[str]) -> str:

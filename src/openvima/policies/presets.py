@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 PUBLISHED = ("vima", "gato", "flamingo", "gpt", "midas")  # architectures of the papers, in all sizes
 # Repeats the keys of `sizes.SIZES`, so that listing presets does not import torch; a test compares them.
 SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
-UNTRAINED = "untrained"  # the policy with fresh weights of nano; with ":PRESET", of that preset
 
 
 def _config(module: str, function: str) -> "PolicyConfig":
@@ -41,32 +40,12 @@ def preset(name: str) -> "PolicyConfig":
     Raises:
         UnknownPolicyError: There is no preset of that name.
     """
-    _check(name)
+    check_preset(name)
     return PRESETS[name]()
 
 
-def is_untrained(policy: str) -> bool:
-    """Whether a policy's name asks for fresh weights: "untrained" or "untrained:PRESET"."""
-    return policy.partition(":")[0] == UNTRAINED
-
-
-def untrained_preset(policy: str) -> str:
-    """Return the preset whose fresh weights a policy's name asks for.
-
-    Args:
-        policy: "untrained" or "untrained:PRESET".
-
-    Raises:
-        UnknownPolicyError: There is no such preset.
-    """
-    _, colon, name = policy.partition(":")
-    if not colon:
-        return "nano"
-    _check(name)
-    return name
-
-
-def _check(name: str) -> None:
+def check_preset(name: str) -> None:
+    """Raises `UnknownPolicyError` if there is no preset of that name."""
     if name not in PRESETS:
         hint = f"Allowed: nano, nano-bins, small, and {'|'.join(PUBLISHED)}-{'|'.join(SIZE_NAMES)}."
         raise UnknownPolicyError(unknown_name("preset", name, PRESETS, hint))

@@ -12,10 +12,10 @@ from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation.config import Batch, EvaluationConfig, cells
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import Job, evaluate_prepared, prepare
-from openvima.evaluation.sources import ORACLE, TRAINED_KINDS, PolicySource
+from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
 from openvima.multiprocess import imap_unordered
-from openvima.policies.naming import BUNDLED
+from openvima.policies.naming import BUNDLED, ORACLE
 from openvima.report.confirmation import Confirmation
 from openvima.report.curves import METRICS_FILE
 from openvima.report.page import default_command, write_report

@@ -12,7 +12,7 @@ from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
 from openvima.input_files import as_path, names_of
-from openvima.policies.presets import UNTRAINED
+from openvima.policies.naming import UNTRAINED
 from openvima.report import episodes, figures, fragments, published, reasons, tables, text
 from openvima.report.ablations import ablated_policies
 from openvima.report.confirmation import Confirmation

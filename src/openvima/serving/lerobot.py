@@ -8,21 +8,15 @@ from pathlib import Path
 from typing import IO
 
 from openvima.errors import ConfigError, ServerError, echo
-from openvima.serving.protocol import SCHEMES
+from openvima.policies.naming import LEROBOT, SERVER_SCHEMES
 
-PREFIX = "lerobot:"
 SERVER_MODULE = "lerobot_env_openvima.serve"  # of plugins/lerobot
 _STOP_S = 10.0
 
 
-def is_lerobot(source: str) -> bool:
-    """Whether the name of a policy is that of a LeRobot policy, lerobot:PATH_OR_ID."""
-    return source.startswith(PREFIX)
-
-
 def lerobot_name(source: str) -> str:
     """Return a name for results: that of the folder or repository, or of the run that a checkpoint is in."""
-    path = Path(source.removeprefix(PREFIX))
+    path = Path(source.removeprefix(LEROBOT))
     if path.name == "pretrained_model" and len(path.parts) > 3:  # RUN/checkpoints/STEP/pretrained_model
         path = path.parents[2]
     return path.name
@@ -48,7 +42,7 @@ def lerobot_server(source: str, python: str, *, device: str = "cpu") -> Iterator
         python,
         "-m",
         SERVER_MODULE,
-        source.removeprefix(PREFIX),
+        source.removeprefix(LEROBOT),
         "--device",
         device,
         "--stop-with-input",
@@ -68,7 +62,7 @@ def lerobot_server(source: str, python: str, *, device: str = "cpu") -> Iterator
         with process:
             try:
                 assert process.stdout is not None  # a pipe
-                url = next((line.strip() for line in process.stdout if line.startswith(SCHEMES)), None)
+                url = next((line.strip() for line in process.stdout if line.startswith(SERVER_SCHEMES)), None)
                 if url is None:
                     raise ServerError(
                         f"{python} cannot serve {echo(source)}: {_last_line(log)}. "

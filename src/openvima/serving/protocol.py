@@ -15,6 +15,7 @@ import numpy as np
 
 from openvima.errors import ConfigError, MessageError, echo
 from openvima.imports import import_extra
+from openvima.policies.naming import SERVER_SCHEMES
 from openvima.render.camera import VIEWS
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 from openvima.scene.command import COMMAND_NAMES, CONTROLS, END_EFFECTOR, PRIMITIVES
@@ -179,7 +180,6 @@ def _is_shape(shape: object) -> bool:
 # meaning makes a new one, as both sides refuse what they do not know.
 PROTOCOL = "openvima-policy/1"
 TOKEN_VARIABLE = "OPENVIMA_SERVE_TOKEN"  # read by server and client where no token is given
-SCHEMES = ("ws://", "wss://")
 MODALITIES = ("rgb", "segm", "joints")  # that observations may hold besides `ee`
 DEFAULT_MODALITIES = ("rgb", "segm")  # of policies that name none
 MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
@@ -187,11 +187,6 @@ MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
 _KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")
 _LENGTHS = {"joints": 6, "tool": len(COMMAND_NAMES)}  # of what observations hold as numbers
 _RECORD_TYPES: dict[str, type] = {"object_id": int, "object": str, "texture": str}
-
-
-def is_remote(source: str) -> bool:
-    """Whether the name of a policy is the address of a server."""
-    return source.startswith(SCHEMES)
 
 
 def check_address(url: str) -> None:
@@ -202,7 +197,9 @@ def check_address(url: str) -> None:
     """
     try:
         parts = urlsplit(url)
-        usable = is_remote(url) and bool(parts.hostname) and parts.port != 0 and not parts.fragment
+        usable = (
+            url.startswith(SERVER_SCHEMES) and bool(parts.hostname) and parts.port != 0 and not parts.fragment
+        )
     except ValueError:  # the port is no number
         usable = False
     if not usable or not url.isprintable():

@@ -31,7 +31,7 @@ from openvima.evaluation.ablations.words import (
 from openvima.evaluation.in_context import in_context_prompt
 from openvima.evaluation.oracle_demonstration import demonstrated
 from openvima.evaluation.phrasings import has_phrasings, in_held_out_phrasing
-from openvima.evaluation.sources import ORACLE, RANDOM
+from openvima.policies.naming import ORACLE, RANDOM
 from openvima.tasks.options import MAX_DISTRACTORS
 from openvima.tasks.seeding import make_rng
 
