@@ -12,6 +12,7 @@ import sys
 import sysconfig
 import traceback
 from collections.abc import Callable
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -114,6 +115,23 @@ def load_file(path: Path, *, what: str) -> ModuleType:
         raise ConfigError(f"{what} names {str(path)!r}, which raised {described(error)}.") from error
     _loaded[path] = digest, module
     return module
+
+
+def load_entry_point(entry_point: EntryPoint) -> None:
+    """Import what an installed package registers.
+
+    Raises:
+        ConfigError: It raises.
+    """
+    try:
+        entry_point.load()
+    except OpenVimaError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"the entry point {entry_point.name} = {entry_point.value!r} of {entry_point.group} raised "
+            f"{described(error)}; repair or uninstall its package."
+        ) from error
 
 
 def source_hash(source: str, *, what: str) -> str:

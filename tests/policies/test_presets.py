@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 import yaml  # noqa: E402
 
 from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # noqa: E402
-from openvima.policies import PRESETS, preset  # noqa: E402
+from openvima.policies import PRESETS, preset, register_policy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import config_from_dict, config_to_dict  # noqa: E402
 from openvima.policies.nn.action_head import NUM_BINS  # noqa: E402
@@ -100,3 +100,28 @@ def test_a_file_with_a_field_too_many_names_it_and_those_allowed() -> None:
 def test_a_file_that_is_no_mapping_is_refused() -> None:
     with pytest.raises(ConfigError, match="must be a mapping"):
         config_from_dict([])  # type: ignore[arg-type]
+
+
+def test_a_learner_of_ones_own_has_a_name(tmp_path, monkeypatch) -> None:
+    from openvima.policies import presets
+    from openvima.training import TrainingConfig
+    from openvima.training.building import resolved
+
+    file = tmp_path / "named_learner.py"
+    lines = ("from openvima.policies import register_policy", "@register_policy('mine')", "def make(): ...")
+    file.write_text("\n".join(lines))
+    monkeypatch.setattr(presets, "_own", {})
+    monkeypatch.setenv(presets.POLICY_FILES_VARIABLE, str(file))
+    presets._load_own_files.cache_clear()
+    try:
+        assert presets.own_policies() == {"mine": f"{file}:make"}
+        config = TrainingConfig(data=tmp_path, out=tmp_path / "run", preset="mine")
+        assert resolved(config).preset == f"{file}:make"
+    finally:
+        presets._load_own_files.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["nano", "a:b", ""])
+def test_a_name_that_cannot_be_registered_is_refused(name) -> None:
+    with pytest.raises(ConfigError, match="a policy is named"):
+        register_policy(name)

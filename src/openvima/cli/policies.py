@@ -26,7 +26,7 @@ DEFAULT = "list"  # what `openvima policies` does without a further word
 
 
 def list_(*, as_json: Json = False) -> int:
-    """List the presets with their parameter counts by part, and the bundled checkpoints.
+    """List the presets with parameter counts by part, the bundled checkpoints, and learners of your own.
 
     Example: openvima policies
 
@@ -38,7 +38,7 @@ def list_(*, as_json: Json = False) -> int:
     """
     from openvima.policies.base import require_torch
     from openvima.policies.naming import BUNDLED
-    from openvima.policies.presets import PRESETS, preset
+    from openvima.policies.presets import PRESETS, own_policies, preset
 
     require_torch("counting parameters")
     from openvima.policies.build import policy_size
@@ -50,6 +50,7 @@ def list_(*, as_json: Json = False) -> int:
     if as_json:
         records = [{"name": name, **_record(size)} for name, size in sizes.items()]
         records += [{"name": name, **_record(trained[name]), **_facts(installed[name])} for name in installed]
+        records += [{"name": name, "code": source} for name, source in own_policies().items()]
         print(json.dumps(records, indent=1))
         return 0
     _print_table(sizes)
@@ -57,6 +58,8 @@ def list_(*, as_json: Json = False) -> int:
         parameters = _millions(trained[name].parameters.total)
         print(f"\n{name}, a bundled checkpoint, {parameters} M parameters")
         _print_facts(policy)
+    for name, source in own_policies().items():
+        print(f"\n{name}, a learner of your own, {source}")
     return 0
 
 

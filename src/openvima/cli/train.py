@@ -49,11 +49,13 @@ def run(words: Sequence[str]) -> int:
     Returns:
         Exit status.
     """
+    from openvima.policies.presets import PRESETS
+
     config = parse(words)
     folder = train_in_processes(config, words)
     if os.environ.get("RANK", "0") != "0":
         return 0
-    trust = " --trust-code" if ":" in config.preset else ""
+    trust = "" if config.preset in PRESETS else " --trust-code"
     hint = f"`openvima evaluate --policy {shlex.quote(str(folder))}{trust} --out scores` scores it."
     print(hint, file=sys.stderr)
     print(folder)

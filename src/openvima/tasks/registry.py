@@ -20,14 +20,13 @@ from openvima.catalog.registration import with_registered
 from openvima.errors import (
     ConfigError,
     LevelError,
-    OpenVimaError,
     UnknownTaskError,
     brief_repr,
     echo,
     unknown_name,
 )
 from openvima.scene import END_EFFECTORS, EndEffector, Problem
-from openvima.user_code import described, load_file
+from openvima.user_code import load_entry_point, load_file
 
 TASK_FILES_VARIABLE = "OPENVIMA_TASK_FILES"
 ENTRY_POINTS = "openvima.tasks"
@@ -255,7 +254,7 @@ def _load_task_files() -> None:
             importlib.import_module(module.name)
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
         with _all_or_no_tasks():
-            _load_entry_point(entry_point)
+            load_entry_point(entry_point)
     for path in filter(None, os.environ.get(TASK_FILES_VARIABLE, "").split(os.pathsep)):
         with _all_or_no_tasks():
             load_file(Path(path), what=TASK_FILES_VARIABLE)
@@ -271,15 +270,3 @@ def _all_or_no_tasks() -> Iterator[None]:
         _TASKS.clear()
         _TASKS.update(before)
         raise
-
-
-def _load_entry_point(entry_point: importlib.metadata.EntryPoint) -> None:
-    try:
-        entry_point.load()
-    except OpenVimaError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise ConfigError(
-            f"the entry point {entry_point.name} = {entry_point.value!r} of {ENTRY_POINTS} raised "
-            f"{described(error)}; repair or uninstall its package."
-        ) from error

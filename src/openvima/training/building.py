@@ -18,7 +18,7 @@ from openvima.policies.config import PolicyConfig, appearance_width, config_to_d
 from openvima.policies.naming import find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
-from openvima.policies.presets import preset
+from openvima.policies.presets import PRESETS, own_policies, preset
 from openvima.policies.processor import Processor
 from openvima.policies.sizes import t5_name
 from openvima.policies.t5 import load_t5, tokenizer_for
@@ -46,6 +46,8 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
     Raises:
         ConfigError: Settings contradict the preset.
     """
+    if config.preset not in PRESETS:
+        config = replace(config, preset=own_policies().get(config.preset, config.preset))
     loader = replace(config.loader, exclude_tasks=",".join(config.loader.excluded_tasks))
     config, augmentation = replace(config, loader=loader), config.augmentation
     if loader.detected_prob and loader.boxes is None:

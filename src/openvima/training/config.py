@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.input_files import settle
-from openvima.policies.presets import PRESETS
+from openvima.policies.presets import PRESETS, own_policies
 from openvima.training.validation import (
     Count,
     Probability,
@@ -388,5 +388,8 @@ class TrainingConfig(RunConfig):
         return ("preset", "init_from", "t5", "assets")
 
     def _unknown(self) -> Iterator[str]:
-        if isinstance(self.preset, str) and self.preset not in PRESETS and ":" not in self.preset:
-            yield unknown_name("preset", self.preset, PRESETS, "`openvima policies` lists all.")
+        if not isinstance(self.preset, str) or self.preset in PRESETS or ":" in self.preset:
+            return
+        if self.preset not in own_policies():
+            names = (*PRESETS, *own_policies())
+            yield unknown_name("preset", self.preset, names, "`openvima policies` lists all.")

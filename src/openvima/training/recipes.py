@@ -10,6 +10,7 @@ from typing import Any
 from openvima.errors import ConfigError, InputFileError, unknown_name
 from openvima.input_files import read_yaml
 from openvima.policies.naming import CONFIG_FILE
+from openvima.policies.presets import PRESETS
 from openvima.training.config import TrainingConfig
 from openvima.training.validation import convert, flatten, setting_types
 
@@ -129,7 +130,7 @@ def default_recipe(preset: str | None) -> str:
     """
     if preset == "small":
         return preset
-    if preset and (preset.startswith("nano") or ":" in preset):
+    if preset and (preset.startswith("nano") or preset not in PRESETS):
         return "nano"
     return "papers" if preset and preset.endswith("-nano") else "paper"
 
