@@ -11,8 +11,7 @@ torch = pytest.importorskip("torch")
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.build import PolicyConfig, build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.action_head import NUM_BINS, decode_bins, encode_bins  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402

@@ -12,7 +12,11 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 
 from openvima.errors import CheckpointError  # noqa: E402
 from openvima.policies import checkpoint, preset, tensor_files  # noqa: E402
-from openvima.policies.build import build_network, outline_network  # noqa: E402
+from openvima.policies.build import (  # noqa: E402
+    build_network,
+    config_to_dict,
+    outline_network,
+)
 from openvima.policies.checkpoint import (  # noqa: E402
     CONFIG_FILE,
     WEIGHTS_FILE,
@@ -20,7 +24,6 @@ from openvima.policies.checkpoint import (  # noqa: E402
     load_weights,
     save_checkpoint,
 )
-from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.policies.loading import load_policy  # noqa: E402
 from openvima.policies.naming import (  # noqa: E402
     BEST_FILE,

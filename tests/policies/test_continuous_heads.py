@@ -9,8 +9,11 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import config_from_dict, config_to_dict  # noqa: E402
+from openvima.policies.build import (  # noqa: E402
+    build_network,
+    config_from_dict,
+    config_to_dict,
+)
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
     ActionEncoder,

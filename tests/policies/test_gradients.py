@@ -9,8 +9,7 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.architectures import flamingo, gato, gpt, midas, vima  # noqa: E402
 from openvima.policies.batch import PromptBatch  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.build import PolicyConfig, build_network  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.prompt_encoder import (  # noqa: E402
     PromptEncoder,

@@ -10,8 +10,11 @@ import yaml  # noqa: E402
 
 from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # noqa: E402
 from openvima.policies import PRESETS, preset, register_policy  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import config_from_dict, config_to_dict  # noqa: E402
+from openvima.policies.build import (  # noqa: E402
+    build_network,
+    config_from_dict,
+    config_to_dict,
+)
 from openvima.policies.nn.action_head import NUM_BINS  # noqa: E402
 from openvima.policies.nn.image_encoders import ConvConfig, VitConfig  # noqa: E402
 from openvima.policies.presets import PUBLISHED, SIZE_NAMES  # noqa: E402

@@ -13,8 +13,11 @@ torch = pytest.importorskip("torch")
 from openvima.errors import CheckpointError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.architectures import flamingo, gato, gpt, vima  # noqa: E402
-from openvima.policies.build import build_network, outline_network  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.build import (  # noqa: E402
+    PolicyConfig,
+    build_network,
+    outline_network,
+)
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig  # noqa: E402

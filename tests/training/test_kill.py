@@ -14,7 +14,7 @@ from safetensors.torch import load_file  # noqa: E402
 
 from openvima.errors import Terminated  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.config import config_to_dict  # noqa: E402
+from openvima.policies.build import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, loop, train  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -23,7 +23,7 @@ TRAIN = """
 import json, sys
 from pathlib import Path
 from openvima.policies import presets
-from openvima.policies.config import config_from_dict
+from openvima.policies.build import config_from_dict
 from openvima.training import TrainingConfig, train
 
 sizes, settings = json.loads(sys.argv[1])

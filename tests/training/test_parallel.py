@@ -16,7 +16,7 @@ from torch.utils import backend_registration  # noqa: E402
 from noisy_extractor import HOOK  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.config import config_to_dict  # noqa: E402
+from openvima.policies.build import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.parallel import (  # noqa: E402
     join_processes,
@@ -29,7 +29,7 @@ TRAIN = """
 import json, os, sys
 from pathlib import Path
 from openvima.policies import presets
-from openvima.policies.config import config_from_dict
+from openvima.policies.build import config_from_dict
 from openvima.training import TrainingConfig, train
 
 sizes, settings = json.loads(sys.argv[1])

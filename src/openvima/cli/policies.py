@@ -10,8 +10,7 @@ import tyro
 from openvima.cli.terminal import print_files, print_table, table_console
 
 if TYPE_CHECKING:
-    from openvima.policies.build import PolicySize
-    from openvima.policies.config import PolicyConfig
+    from openvima.policies.build import PolicyConfig, PolicySize
     from openvima.policies.naming import BundledPolicy
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
@@ -82,8 +81,7 @@ def show(
     from openvima.policies.naming import BUNDLED
 
     require_torch("counting parameters")
-    from openvima.policies.build import policy_size
-    from openvima.policies.config import config_to_dict
+    from openvima.policies.build import config_to_dict, policy_size
 
     config, bundled = _config(policy), BUNDLED.get(policy)
     size = policy_size(config)

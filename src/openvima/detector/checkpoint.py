@@ -24,7 +24,7 @@ from openvima.detector.layers import BOX_WEIGHTS, PROPOSAL_WEIGHTS
 from openvima.detector.network import MaskRCNN
 from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.input_files import read_yaml
-from openvima.policies.config import check_limits
+from openvima.policies.config_fields import check_limits
 from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
 from openvima.policies.nn.layers import MetaInit
 from openvima.policies.tensor_files import (

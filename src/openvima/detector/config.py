@@ -135,8 +135,6 @@ class DetectorConfig:
         Raises:
             ConfigError: A field is missing or unknown, or the sizes contradict each other.
         """
-        from openvima.policies.config import build_config  # needs torch
-
         return build_config(DetectorConfig, values, "detector")
 
 

@@ -350,3 +350,15 @@ class Midas(TokenPolicy):
 
     Source: MIDAS (Li et al. 2023).
     """
+
+
+def _points_from_above(history: HistoryBatch, num_tokens: int) -> torch.Tensor:
+    """Return the table points under the boxes of the top view, (B, T, Q, 2), for the last N of Q tokens."""
+    boxes_BTN4, mask_BTN = history.boxes_BTVN4[:, :, TOP], history.masks_BTVN[:, :, TOP]
+    origin, right, down = unproject(
+        np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"]
+    )  # it looks straight down
+    axes = torch.from_numpy(np.stack([right - origin, down - origin])).to(boxes_BTN4.device)
+    points_BTN2 = torch.from_numpy(origin).to(axes) + boxes_BTN4[..., :2].to(axes) @ axes
+    points_BTN2 = points_BTN2.masked_fill(~mask_BTN[..., None], math.inf)
+    return F.pad(points_BTN2, (0, 0, num_tokens - mask_BTN.shape[-1], 0), value=math.inf)

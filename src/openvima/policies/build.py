@@ -1,31 +1,63 @@
-"""Build networks from their configs."""
+"""All architectures: their configs as plain values, networks from them, and counts of parameters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from reprlib import repr as short
+from typing import Any, get_args
 
 import torch
 
-from openvima.policies.architectures import Flamingo, Gato, Gpt, Midas, Vima
-from openvima.policies.config import PolicyConfig, check_limits
+from openvima.errors import ConfigError, unknown_name
+from openvima.policies.architectures import (
+    FlamingoConfig,
+    GatoConfig,
+    GptConfig,
+    MidasConfig,
+    TokenPolicy,
+    VimaConfig,
+)
+from openvima.policies.config_fields import build_config, check_limits
 from openvima.policies.nn.layers import MetaInit
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.pointer.model import Pointer
 
-MODELS: dict[str, type[PolicyNetwork]] = {
-    "vima": Vima,
-    "gato": Gato,
-    "flamingo": Flamingo,
-    "gpt": Gpt,
-    "midas": Midas,
-    "pointer": Pointer,
-}
+PolicyConfig = VimaConfig | GatoConfig | FlamingoConfig | GptConfig | MidasConfig | PointerConfig
+ARCHITECTURES: dict[str, type[PolicyConfig]] = {kind.architecture: kind for kind in get_args(PolicyConfig)}
+
+
+def config_to_dict(config: PolicyConfig) -> dict[str, Any]:  # Any: plain YAML values
+    """Convert to nested dictionaries of plain values, the architecture first."""
+    return {"architecture": config.architecture, **asdict(config)}
+
+
+def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whatever a file holds
+    """Inverse of `config_to_dict`.
+
+    Raises:
+        ConfigError: A field is missing or unknown, or sizes are inconsistent.
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"policy is {short(values)}; it must be a mapping of architecture and sizes.")
+    architecture = values.get("architecture")
+    if not isinstance(architecture, str) or architecture not in ARCHITECTURES:
+        raise ConfigError(unknown_name("architecture", short(architecture).strip("'"), ARCHITECTURES))
+    sizes = {name: value for name, value in values.items() if name != "architecture"}
+    return build_config(ARCHITECTURES[architecture], sizes, "policy")
+
+
+def appearance_width(config: PolicyConfig) -> int:
+    """Length of the appearance embedding; 0 for networks without one."""
+    images = config.images
+    return images.appearance_width if isinstance(images, ObjectEncoderConfig) else 0
 
 
 def build_network(config: PolicyConfig, *, seed: int) -> PolicyNetwork:
     """Build a network with fresh weights from a seed, leaving the global random state unchanged."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return MODELS[config.architecture](config)
+        return _network(config)
 
 
 def outline_network(config: PolicyConfig) -> PolicyNetwork:
@@ -38,7 +70,11 @@ def outline_network(config: PolicyConfig) -> PolicyNetwork:
     """
     check_limits(config, "policy")
     with MetaInit():
-        return MODELS[config.architecture](config)
+        return _network(config)
+
+
+def _network(config: PolicyConfig) -> PolicyNetwork:
+    return Pointer(config) if isinstance(config, PointerConfig) else TokenPolicy(config)
 
 
 # Part -> prefixes of its parameters; the first match counts. Published size names, such as 200M, count the

@@ -18,8 +18,7 @@ from openvima import __version__
 from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
 from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.input_files import as_path, read_yaml
-from openvima.policies.build import outline_network
-from openvima.policies.config import PolicyConfig, config_from_dict, config_to_dict
+from openvima.policies.build import PolicyConfig, config_from_dict, config_to_dict, outline_network
 from openvima.policies.naming import CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE, find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published import load_published

@@ -229,7 +229,7 @@ class NetworkPolicy(Policy):
             PolicyError: There is no last action, or the network has no explanations.
         """
         if not self.network.explains:
-            kind = type(self.network).__name__
+            kind = self.network.config.architecture.capitalize()
             raise PolicyError(f"a policy of kind {kind} has no explain(). {POLICIES_THAT_EXPLAIN}")
         if self._last_step is None or self._episodes is None:
             raise PolicyError(

@@ -22,7 +22,7 @@ from openvima.errors import ConfigError, UnknownPolicyError, brief_repr, unknown
 from openvima.user_code import load_entry_point, load_file
 
 if TYPE_CHECKING:
-    from openvima.policies.config import PolicyConfig
+    from openvima.policies.build import PolicyConfig
 
 PUBLISHED = ("vima", "gato", "flamingo", "gpt", "midas")  # architectures of the papers, in all sizes
 POLICY_FILES_VARIABLE = "OPENVIMA_POLICY_FILES"

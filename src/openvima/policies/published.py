@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from openvima.errors import CheckpointError, ConfigError, InputFileError
-from openvima.policies.build import outline_network
-from openvima.policies.config import MAX_WIDTH, PolicyConfig
+from openvima.policies.build import PolicyConfig, outline_network
+from openvima.policies.config_fields import MAX_WIDTH
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig

@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.architectures import MidasConfig, VimaConfig
-from openvima.policies.config import PolicyConfig, check_limits
+from openvima.policies.build import PolicyConfig
+from openvima.policies.config_fields import check_limits
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.heads import HEADS, AutoregressiveConfig
 from openvima.policies.nn.image_encoders import ConvConfig, VitConfig

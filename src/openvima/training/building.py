@@ -12,9 +12,8 @@ from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, differences
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.architectures import TokenPolicyConfig
-from openvima.policies.build import build_network
+from openvima.policies.build import PolicyConfig, appearance_width, build_network, config_to_dict
 from openvima.policies.checkpoint import load_network
-from openvima.policies.config import PolicyConfig, appearance_width, config_to_dict
 from openvima.policies.naming import find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
@@ -26,8 +25,7 @@ from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
 from openvima.policies.variants import image_tokens, with_variant
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
-from openvima.tasks.paraphrasing import training_paraphrases
-from openvima.tasks.prompts import description_of, synonyms
+from openvima.tasks.prompts import description_of, synonyms, training_paraphrases
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.augmentation.prompts import DEFINITION, motion_text, text_of
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, AugmentationConfig, TrainingConfig

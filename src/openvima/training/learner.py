@@ -14,8 +14,8 @@ from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import Policy
 from openvima.policies.batch import Batch
+from openvima.policies.build import config_to_dict
 from openvima.policies.checkpoint import load_weights, write_checkpoint
-from openvima.policies.config import config_to_dict
 from openvima.policies.naming import TOKENIZER_FOLDER, WEIGHTS_FILE
 from openvima.policies.nn.layers import rounded_rows
 from openvima.policies.nn.policy_network import PolicyNetwork

@@ -13,8 +13,7 @@ from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, ObjectViews  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.build import PolicyConfig, build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.action_head import shift_actions  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH  # noqa: E402

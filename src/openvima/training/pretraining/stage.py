@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.layers import TensorRecord
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.pointer.model import Pointer
 from openvima.policies.pointer.words import Attributes

@@ -2,15 +2,12 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from reprlib import repr as short
 from types import NoneType, UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from openvima.errors import ConfigError, unknown_name
-from openvima.policies.architectures import FlamingoConfig, GatoConfig, GptConfig, MidasConfig, VimaConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
-from openvima.policies.pointer.config import PointerConfig
+from openvima.errors import ConfigError
 
 # Largest whole numbers by name of the field; the largest published policy has 22 layers 768 wide.
 _LIMITS = {"num_layers": 128, "num_blocks": 128, "depths": 128, "vocabulary_size": 1_000_000}
@@ -123,33 +120,3 @@ def _num_shared_fields(kind: Any, value: Any) -> int:  # Any: a type as written 
         return 0
     names = {field.name for field in fields(kind)}
     return len(names & set(value)) - len(names ^ set(value))
-
-
-PolicyConfig = VimaConfig | GatoConfig | FlamingoConfig | GptConfig | MidasConfig | PointerConfig
-ARCHITECTURES: dict[str, type[PolicyConfig]] = {kind.architecture: kind for kind in get_args(PolicyConfig)}
-
-
-def config_to_dict(config: PolicyConfig) -> dict[str, Any]:  # Any: plain YAML values
-    """Convert to nested dictionaries of plain values, the architecture first."""
-    return {"architecture": config.architecture, **asdict(config)}
-
-
-def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whatever a file holds
-    """Inverse of `config_to_dict`.
-
-    Raises:
-        ConfigError: A field is missing or unknown, or sizes are inconsistent.
-    """
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"policy is {short(values)}; it must be a mapping of architecture and sizes.")
-    architecture = values.get("architecture")
-    if not isinstance(architecture, str) or architecture not in ARCHITECTURES:
-        raise ConfigError(unknown_name("architecture", short(architecture).strip("'"), ARCHITECTURES))
-    sizes = {name: value for name, value in values.items() if name != "architecture"}
-    return build_config(ARCHITECTURES[architecture], sizes, "policy")
-
-
-def appearance_width(config: PolicyConfig) -> int:
-    """Length of the appearance embedding; 0 for networks without one."""
-    images = config.images
-    return images.appearance_width if isinstance(images, ObjectEncoderConfig) else 0
