@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
+from openvima.policies.config_fields import build_config
 
 FIRST_STRIDE = 4  # of the finest pyramid level, in pixels
 
