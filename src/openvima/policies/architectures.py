@@ -88,8 +88,143 @@ class TokenPolicyConfig:
         return InputLayout("frames", (images.image_height, images.image_width), tokens)
 
 
+@dataclass(frozen=True, slots=True)
+class VimaConfig(TokenPolicyConfig):
+    """VIMA: objects, and cross-attention to the prompt.
+
+    One token for each object in each view.
+
+    "Put the {a} into the {b}." with one object in each image, two objects on the table:
+
+        prompt   [put, the, A front, A top, into, the, B front, B top, ., end]
+        history  [front 1, front 2, top 1, top 2, action, front 1, front 2, top 1, top 2, …]
+                                             |                                       |
+                                        1st action                              2nd action
+
+    With `images.fuse_views` both views of an object are one token; with `query_token` the action is decoded
+    from a learned token behind the objects instead of the last object token.
+
+    Source: VIMA (Jiang et al. 2023), section 4.
+    """
+
+    architecture: ClassVar[str] = "vima"
+
+
+def vima(of: Size) -> VimaConfig:
+    """Return VIMA in a size."""
+    images = ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width)
+    return VimaConfig(images, of.prompt, of.decoder(), BinsConfig(of.hidden_width, of.action_width))
+
+
+def nano_bins() -> VimaConfig:
+    """As the pointer model `nano`, with the published head: fused views, convolutions, a query token."""
+    crop = ConvConfig(width=32, output_width=128)
+    images = ObjectEncoderConfig(
+        crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
+    )
+    decoder = DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4)
+    return VimaConfig(
+        images, size("nano").prompt, decoder, BinsConfig(256, action_width=64), query_token=True
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class GatoConfig(TokenPolicyConfig):
+    """VIMA-Gato: the patches of frames, and the prompt as prefix.
+
+    Patches of both views in one causal sequence.
+
+        [put, the, 16 patches, into, the, 16 patches, ., end, separator, 16 patches, action, 16 patches, …]
+                                                                                  |
+                                                                             1st action
+
+    Source: VIMA (Jiang et al. 2023), baselines; after Gato (Reed et al. 2022).
+    """
+
+    architecture: ClassVar[str] = "gato"
+
+
+def gato(of: Size) -> GatoConfig:
+    """Return VIMA-Gato in a size."""
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return GatoConfig(of.frame_encoder(class_token=False), of.prompt, of.prefix_decoder(), head)
+
+
+@dataclass(frozen=True, slots=True)
+class FlamingoConfig(TokenPolicyConfig):
+    """VIMA-Flamingo: resampled patches of frames, and cross-attention to the prompt.
+
+    A Perceiver resampler over the patches of both views.
+
+        prompt   [put, the, 4 latents, into, the, 4 latents, ., end]
+        history  [4 latents, action, 4 latents, action, …]
+                          |
+                     1st action
+
+    Source: VIMA (Jiang et al. 2023), baselines; after Flamingo (Alayrac et al. 2022).
+    """
+
+    architecture: ClassVar[str] = "flamingo"
+
+
+def flamingo(of: Size) -> FlamingoConfig:
+    """Return VIMA-Flamingo in a size."""
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return FlamingoConfig(of.frame_encoder(class_token=False), of.prompt, of.decoder(), head, of.resampler())
+
+
+@dataclass(frozen=True, slots=True)
+class GptConfig(TokenPolicyConfig):
+    """VIMA-GPT: one token per pair of frames, and the prompt as prefix.
+
+    The class vectors of both views, side by side, are one token.
+
+        [put, the, A, into, the, B, ., end, separator, frames, action, frames, action, …]
+                                                            |
+                                                       1st action
+
+    Source: VIMA (Jiang et al. 2023), baselines; after GPT (Radford et al. 2018).
+    """
+
+    architecture: ClassVar[str] = "gpt"
+
+
+def gpt(of: Size) -> GptConfig:
+    """Return VIMA-GPT in a size."""
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return GptConfig(of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), head)
+
+
+@dataclass(frozen=True, slots=True)
+class MidasConfig(TokenPolicyConfig):
+    """MIDAS: objects with a token for each view, and the prompt as prefix.
+
+    Object tokens for each view, the prompt as prefix, and one token per action component.
+
+        [put, the, A front, A top, into, …, end, separator, front 1, front 2, top 1, top 2, x0, y0, …, d1, …]
+                                                                                       |    |
+                                                                                       x0   y0
+
+    The visual residual adds what enters the text encoder for an object to what it returns.
+
+    Source: MIDAS (Li et al. 2023).
+    """
+
+    architecture: ClassVar[str] = "midas"
+
+
+def midas(of: Size) -> MidasConfig:
+    """Return MIDAS in a size."""
+    return MidasConfig(
+        ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width),
+        replace(of.prompt, visual_residual=True),
+        of.prefix_decoder(),
+        AutoregressiveConfig(of.hidden_width, of.initial_std, of.action_width),
+    )
+
+
 class TokenPolicy(PolicyNetwork):
-    """Image tokens in prompt and history, and one of two decoders; the architectures draw theirs."""
+    """Image tokens in prompt and history, and one of two decoders; the configs draw their sequences."""
 
     def __init__(self, config: TokenPolicyConfig) -> None:
         super().__init__()
@@ -175,14 +310,18 @@ class TokenPolicy(PolicyNetwork):
     ) -> torch.Tensor:
         """Resample the objects of each image in the prompts, (latents · S, E): the first latent of all first.
 
-        The image tokens are numbered by the first object of their image; those of its others are copies.
+        The resampler wants one padded row of objects per image, (J, N), but objects come in one row of all
+        prompts, (S), without a mark where an image begins. The prompts tell: an image has its tokens at the
+        number of its first object, plus a multiple of S for each further latent. So the numbers that occur,
+        modulo S, are the first objects. The result is numbered like that again; rows of the other objects
+        are copies that no token refers to.
         """
         count = prompts.masks_VS.shape[1]
         index_BL = prompts.object_index_BL
         is_first_S = torch.zeros(count, dtype=torch.bool, device=tokens_IE.device)
         is_first_S[index_BL[index_BL >= 0] % count] = True
         image_S, first_J = is_first_S.cumsum(dim=0) - 1, is_first_S.nonzero().squeeze(1)
-        slot_S = torch.arange(count, device=tokens_IE.device) - first_J[image_S]
+        slot_S = torch.arange(count, device=tokens_IE.device) - first_J[image_S]  # N: its place in its image
         mask_QS = prompts.masks_VS
         if len(tokens_IE) == count:  # fused views
             mask_QS = mask_QS.any(dim=0, keepdim=True)
@@ -198,166 +337,8 @@ class TokenPolicy(PolicyNetwork):
 def _points_from_above(history: HistoryBatch, num_tokens: int) -> torch.Tensor:
     """Return the table points under the boxes of the top view, (B, T, Q, 2), for the last N of Q tokens."""
     boxes_BTN4, mask_BTN = history.boxes_BTVN4[:, :, TOP], history.masks_BTVN[:, :, TOP]
-    origin, right, down = unproject(
-        np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"]
-    )  # it looks straight down
-    axes = torch.from_numpy(np.stack([right - origin, down - origin])).to(boxes_BTN4.device)
-    points_BTN2 = torch.from_numpy(origin).to(axes) + boxes_BTN4[..., :2].to(axes) @ axes
-    points_BTN2 = points_BTN2.masked_fill(~mask_BTN[..., None], math.inf)
-    return F.pad(points_BTN2, (0, 0, num_tokens - mask_BTN.shape[-1], 0), value=math.inf)
-
-
-@dataclass(frozen=True, slots=True)
-class VimaConfig(TokenPolicyConfig):
-    """Sizes of VIMA: objects, and cross-attention to the prompt."""
-
-    architecture: ClassVar[str] = "vima"
-
-
-def vima(of: Size) -> VimaConfig:
-    """Return VIMA in a size."""
-    images = ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width)
-    return VimaConfig(images, of.prompt, of.decoder(), BinsConfig(of.hidden_width, of.action_width))
-
-
-def nano_bins() -> VimaConfig:
-    """As the pointer model `nano`, with the published head: fused views, convolutions, a query token."""
-    crop = ConvConfig(width=32, output_width=128)
-    images = ObjectEncoderConfig(
-        crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
-    )
-    decoder = DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4)
-    return VimaConfig(
-        images, size("nano").prompt, decoder, BinsConfig(256, action_width=64), query_token=True
-    )
-
-
-class Vima(TokenPolicy):
-    """One token for each object in each view.
-
-    "Put the {a} into the {b}." with one object in each image, two objects on the table:
-
-        prompt   [put, the, A front, A top, into, the, B front, B top, ., end]
-        history  [front 1, front 2, top 1, top 2, action, front 1, front 2, top 1, top 2, …]
-                                             |                                       |
-                                        1st action                              2nd action
-
-    With `images.fuse_views` both views of an object are one token; with `query_token` the action is decoded
-    from a learned token behind the objects instead of the last object token.
-
-    Source: VIMA (Jiang et al. 2023), section 4.
-    """
-
-
-@dataclass(frozen=True, slots=True)
-class GatoConfig(TokenPolicyConfig):
-    """Sizes of VIMA-Gato: the patches of frames, and the prompt as prefix."""
-
-    architecture: ClassVar[str] = "gato"
-
-
-def gato(of: Size) -> GatoConfig:
-    """Return VIMA-Gato in a size."""
-    head = BinsConfig(of.hidden_width, of.action_width)
-    return GatoConfig(of.frame_encoder(class_token=False), of.prompt, of.prefix_decoder(), head)
-
-
-class Gato(TokenPolicy):
-    """Patches of both views in one causal sequence.
-
-        [put, the, 16 patches, into, the, 16 patches, ., end, separator, 16 patches, action, 16 patches, …]
-                                                                                  |
-                                                                             1st action
-
-    Source: VIMA (Jiang et al. 2023), baselines; after Gato (Reed et al. 2022).
-    """
-
-
-@dataclass(frozen=True, slots=True)
-class FlamingoConfig(TokenPolicyConfig):
-    """Sizes of VIMA-Flamingo: resampled patches of frames, and cross-attention to the prompt."""
-
-    architecture: ClassVar[str] = "flamingo"
-
-
-def flamingo(of: Size) -> FlamingoConfig:
-    """Return VIMA-Flamingo in a size."""
-    head = BinsConfig(of.hidden_width, of.action_width)
-    return FlamingoConfig(of.frame_encoder(class_token=False), of.prompt, of.decoder(), head, of.resampler())
-
-
-class Flamingo(TokenPolicy):
-    """A Perceiver resampler over the patches of both views.
-
-        prompt   [put, the, 4 latents, into, the, 4 latents, ., end]
-        history  [4 latents, action, 4 latents, action, …]
-                          |
-                     1st action
-
-    Source: VIMA (Jiang et al. 2023), baselines; after Flamingo (Alayrac et al. 2022).
-    """
-
-
-@dataclass(frozen=True, slots=True)
-class GptConfig(TokenPolicyConfig):
-    """Sizes of VIMA-GPT: one token per pair of frames, and the prompt as prefix."""
-
-    architecture: ClassVar[str] = "gpt"
-
-
-def gpt(of: Size) -> GptConfig:
-    """Return VIMA-GPT in a size."""
-    head = BinsConfig(of.hidden_width, of.action_width)
-    return GptConfig(of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), head)
-
-
-class Gpt(TokenPolicy):
-    """The class vectors of both views, side by side, are one token.
-
-        [put, the, A, into, the, B, ., end, separator, frames, action, frames, action, …]
-                                                            |
-                                                       1st action
-
-    Source: VIMA (Jiang et al. 2023), baselines; after GPT (Radford et al. 2018).
-    """
-
-
-@dataclass(frozen=True, slots=True)
-class MidasConfig(TokenPolicyConfig):
-    """Sizes of MIDAS: objects with a token for each view, and the prompt as prefix."""
-
-    architecture: ClassVar[str] = "midas"
-
-
-def midas(of: Size) -> MidasConfig:
-    """Return MIDAS in a size."""
-    return MidasConfig(
-        ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width),
-        replace(of.prompt, visual_residual=True),
-        of.prefix_decoder(),
-        AutoregressiveConfig(of.hidden_width, of.initial_std, of.action_width),
-    )
-
-
-class Midas(TokenPolicy):
-    """Object tokens for each view, the prompt as prefix, and one token per action component.
-
-        [put, the, A front, A top, into, …, end, separator, front 1, front 2, top 1, top 2, x0, y0, …, d1, …]
-                                                                                       |    |
-                                                                                       x0   y0
-
-    The visual residual adds what enters the text encoder for an object to what it returns.
-
-    Source: MIDAS (Li et al. 2023).
-    """
-
-
-def _points_from_above(history: HistoryBatch, num_tokens: int) -> torch.Tensor:
-    """Return the table points under the boxes of the top view, (B, T, Q, 2), for the last N of Q tokens."""
-    boxes_BTN4, mask_BTN = history.boxes_BTVN4[:, :, TOP], history.masks_BTVN[:, :, TOP]
-    origin, right, down = unproject(
-        np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"]
-    )  # it looks straight down
+    corners = np.array([(0, 0), (1, 0), (0, 1)])
+    origin, right, down = unproject(corners, CAMERAS["top"])  # it looks straight down
     axes = torch.from_numpy(np.stack([right - origin, down - origin])).to(boxes_BTN4.device)
     points_BTN2 = torch.from_numpy(origin).to(axes) + boxes_BTN4[..., :2].to(axes) @ axes
     points_BTN2 = points_BTN2.masked_fill(~mask_BTN[..., None], math.inf)
