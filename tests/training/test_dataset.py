@@ -30,8 +30,8 @@ from openvima.training.run_folder import held_out_demonstrations  # noqa: E402
 from openvima.training.source import (  # noqa: E402
     check_scenes,
     check_words,
+    make_order,
     open_demonstrations,
-    order_of,
     split_examples,
 )
 from training_examples import collate_examples, examples_of, rngs_of  # noqa: E402
@@ -134,10 +134,10 @@ def test_the_split_follows_from_the_episode_and_keeps_everything(data):
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):
     cache = open_object_cache(Dataset(data))
     _, few = split_examples(cache, validation_fraction=0.3, validation_episodes=3)
-    orders = [order_of(few, batch_size=64, seed=0, bucket=0, rank=rank, num_ranks=2) for rank in range(2)]
+    orders = [make_order(few, batch_size=64, seed=0, bucket=0, rank=rank, num_ranks=2) for rank in range(2)]
     assert [order.batch_size for order in orders] == [2, 2]
     with pytest.raises(ConfigError, match="there are 3 demonstrations to train on and 4 processes"):
-        order_of(few, batch_size=64, seed=0, bucket=0, rank=0, num_ranks=4)
+        make_order(few, batch_size=64, seed=0, bucket=0, rank=0, num_ranks=4)
 
 
 def test_an_example_of_a_source_knows_its_images_among_all(data):

@@ -18,7 +18,7 @@ from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
 from openvima.scene import ObjectRecord  # noqa: E402
 from openvima.tasks.prompts import described, description_of, image_descriptions, synonyms  # noqa: E402
-from openvima.training import sequence_lengths  # noqa: E402
+from openvima.training import source as source_module  # noqa: E402
 from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
 from openvima.training.augmentation.prompts import (  # noqa: E402
     DescribeObjects,
@@ -155,7 +155,7 @@ def test_descriptions_count_for_the_length_of_prompts(data) -> None:
     dataset = Dataset(data)
     tokenizer = WordTokenizer(Vocabulary().extended(training_texts(dataset, ALWAYS)))
     cache, processor = open_object_cache(dataset), Processor("objects", tokenizer=tokenizer)
-    bounds, _ = sequence_lengths._upper_bounds(cache, processor, False, True)
+    bounds, _ = source_module._upper_bounds(cache, processor, False, True)
     for episode, bound in zip(cache, bounds, strict=True):
         text = with_descriptions(episode, 1.0, np.random.default_rng(0)).prompt.text
         assert len(tokenizer.encode(text)) <= bound

@@ -12,7 +12,7 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn import decoder  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from openvima.training import TrainingConfig, sequence_lengths, train  # noqa: E402
+from openvima.training import TrainingConfig, source, train  # noqa: E402
 from openvima.training.augmentation.prompts import with_motion_prompt  # noqa: E402
 
 NAMES = ("nano", "midas-nano", "gato-nano")  # objects, views, frames
@@ -45,7 +45,7 @@ def test_widths_are_those_of_the_episodes(case) -> None:
 @pytest.mark.parametrize("is_motion", [False, True])
 def test_the_bounds_hold(case, is_motion) -> None:
     cache, _, processor = case
-    prompt, whole = sequence_lengths._upper_bounds(cache, processor, is_motion)
+    prompt, whole = source._upper_bounds(cache, processor, is_motion)
     episodes = [with_motion_prompt(tokens) if is_motion else tokens for tokens in cache]
     found = np.array([num_places(tokens, processor) for tokens in episodes])
     assert (found <= prompt).all() and (prompt < whole).all()
@@ -56,20 +56,20 @@ def test_an_inverse_dynamics_prompt_that_is_too_long_is_named(case, monkeypatch)
     cache, network, processor = case
     tasks, motions = ([num_places(f(t), processor) for t in cache] for f in (lambda t: t, with_motion_prompt))
     limit = max(motions) - 1
-    for module in (sequence_lengths, decoder):
+    for module in (source, decoder):
         monkeypatch.setattr(module, "MAX_PROMPT_POSITIONS", limit)
     with pytest.raises(
         DatasetError, match=r"^episode \d+ of \w+ with its inverse-dynamics prompt is too long"
     ):
-        sequence_lengths.check_lengths(cache, network, processor, inverse_dynamics_prob=1.0)
+        source.check_lengths(cache, network, processor, inverse_dynamics_prob=1.0)
     if max(tasks) <= limit:
-        sequence_lengths.check_lengths(cache, network, processor)
+        source.check_lengths(cache, network, processor)
         with pytest.raises(DatasetError, match="with its inverse-dynamics prompt"):
-            sequence_lengths.check_lengths(cache, network, processor, inverse_dynamics_prob=0.5)
+            source.check_lengths(cache, network, processor, inverse_dynamics_prob=0.5)
 
 
 def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, monkeypatch) -> None:
-    for module in (sequence_lengths, decoder):
+    for module in (source, decoder):
         monkeypatch.setattr(module, "MAX_POSITIONS", 30)
     config = TrainingConfig.of(
         {**settings, "preset": "midas-nano", "pretraining.steps": 0, "schedule.checkpoint_every": 1}
@@ -82,8 +82,8 @@ def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, mon
 @pytest.mark.slow
 def test_the_check_draws_no_random_numbers(case, monkeypatch) -> None:
     cache, network, processor = case
-    monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_POSITIONS", 1)  # so that all are read
+    monkeypatch.setattr(source, "MAX_PROMPT_POSITIONS", 1)  # so that all are read
     before = torch.get_rng_state()
-    sequence_lengths.check_lengths(cache, network.train(), processor, inverse_dynamics_prob=0.5)
+    source.check_lengths(cache, network.train(), processor, inverse_dynamics_prob=0.5)
     assert torch.equal(torch.get_rng_state(), before)
     assert all(parameter.grad is None for parameter in network.parameters())

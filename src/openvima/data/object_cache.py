@@ -21,13 +21,13 @@ from xxhash import xxh3_64
 
 from openvima.atomic_io import NO_SPACE, atomic_write, folder_lock
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
-from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, left_out_episode, preprocess
+from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empty_episode, preprocess
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
 from openvima.data.shard import DAMAGE_ERRORS, Envelope, Shard, map_file, spans_of
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.input_files import as_path
-from openvima.multiprocess import imap_unordered
+from openvima.multiprocess import Report, imap_unordered
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import (
     IMAGE_SIZES,
@@ -39,7 +39,6 @@ from openvima.perception.preprocessing import (
 )
 from openvima.scene import COMPOSED
 
-Report = Callable[[int, int, str], None]
 CACHE_VERSION = 7  # grows whenever the same demonstration gives another row
 _RERENDERED = "rerendered-v"  # in front of version and number of a random appearance
 # Columns of lists, one record for each object, step or image: Arrow type of a number and shape of each field,
@@ -139,7 +138,9 @@ class CacheFile:
             self._scalars = {name: rows.column(name) for name in _SCALARS}
             self._checksums = rows.column(_CHECKSUM)
         except DAMAGE_ERRORS as error:
-            raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
+            raise ShardError(
+                _describe_damage(path, str(error).splitlines()[0] if str(error) else "empty")
+            ) from None
         self.kind: InputKind = about["kind"]
         self.source, self.variant = about["source"], about["variant"]
 
@@ -153,7 +154,9 @@ class CacheFile:
             arrays |= {name: flat[span] for name, flat in fields.items()}
         scalars = tuple(column[row].as_py() for column in self._scalars.values())
         if _checksum(scalars, arrays.values()) != self._checksums[row].as_py():
-            raise ShardError(_unfit(self.path, f"the checksum of row {row} of {len(self)} is wrong"))
+            raise ShardError(
+                _describe_damage(self.path, f"the checksum of row {row} of {len(self)} is wrong")
+            )
         task, seed, end_effector, text, descriptions = scalars
         in_prompt, objects, final = (
             ObjectTable(*(arrays[f"{path}.{name}"] for name in _OBJECT))
@@ -296,7 +299,7 @@ def _checksum(scalars: tuple[object, ...], arrays: Iterable[np.ndarray]) -> int:
     return digest.intdigest()
 
 
-def _unfit(path: Path, reason: str) -> str:
+def _describe_damage(path: Path, reason: str) -> str:
     remedy = "Delete it; `openvima data preprocess` makes it anew"
     return f"{path} is no readable file of the object cache ({reason}). {remedy}."
 
@@ -331,9 +334,8 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     ) -> None:
         self.dataset, self.kind, self.variant, self._root = dataset, kind, variant, folder
         self.folder = _cache_folder(dataset, kind, folder, variant)
-        found = {source.name: _made(self.folder, source, kind, variant) for source in sources(dataset)}
-        missing = [name for name, file in found.items() if file is None]
-        if missing:
+        files = _open_files(self.folder, _index_by_shard(dataset), kind, variant)
+        if missing := [name for name, file in files.items() if file is None]:
             option = "--boxes DETECTOR" if variant else f"--kind {kind}"
             if variant.startswith(_RERENDERED):
                 option = f"--kind {kind} --rerendered {variant.rpartition('-')[2]}"
@@ -341,7 +343,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
                 f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; "
                 f"`openvima data preprocess {shlex.quote(str(dataset.path))} {option}` writes them."
             )
-        self._files = {name: file for name, file in found.items() if file is not None}
+        self._files = {name: file for name, file in files.items() if file is not None}
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -396,25 +398,12 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
-    """One shard of demonstrations.
-
-    Args:
-        name: Of the shard.
-        content_hash: Of its episodes together.
-        index: Its part of the index.
-    """
-
-    name: str
-    content_hash: str
-    index: pa.Table
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Work:
+    """A shard, with its part of the index, and the file to write for it."""
+
     shard: Path
     envelope: Envelope
-    source: Source
+    index: pa.Table
     path: Path
     kind: InputKind
     variant: Variant
@@ -452,12 +441,10 @@ def open_object_cache(
     if boxes is not None and kind == "frames":
         raise DatasetError(f"boxes are those of {boxes.name}, but whole frames have none; leave them out.")
     variant = Variant(boxes, appearance)
-    target = _cache_folder(dataset, kind, folder, variant.name)
     if check_object_cache(dataset, kind, variant, folder=folder):
+        target = _cache_folder(dataset, kind, folder, variant.name)
         with folder_lock(target, timeout_s=timeout_s):
-            _write_missing(
-                _missing(dataset, kind, target, variant), workers, report, _note_on_older(target, kind)
-            )
+            _write_missing(dataset, kind, variant, target, workers, report)
     return ObjectCache(dataset, kind, folder, variant.name)
 
 
@@ -476,7 +463,7 @@ def check_object_cache(
         DatasetError: The folder would have to be written to, and cannot be.
     """
     target = _cache_folder(dataset, kind, folder, variant.name)
-    if not _missing(dataset, kind, target, variant):
+    if None not in _open_files(target, _index_by_shard(dataset), kind, variant.name).values():
         return False
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -491,60 +478,6 @@ def check_object_cache(
     return True
 
 
-def _missing(dataset: Dataset, kind: InputKind, target: Path, variant: Variant) -> list[_Work]:
-    return [
-        _Work(
-            dataset.path / source.name,
-            Envelope.from_entry(dataset.manifest["shards"][source.name]),
-            source,
-            target / source.name,
-            kind,
-            variant,
-        )
-        for source in sources(dataset)
-        if _made(target, source, kind, variant.name) is None
-    ]
-
-
-def _note_on_older(folder: Path, kind: InputKind) -> str:
-    """Say which folders of older versions a new one replaces."""
-    current = f"{kind}-v{CACHE_VERSION}"
-    older = sorted(
-        path.name for path in folder.parent.glob(f"{kind}-v[0-9]*") if not path.name.startswith(current)
-    )
-    return f"extracting objects anew; delete {', '.join(older)} of older versions" if older else ""
-
-
-def _write_missing(work: list[_Work], workers: int, report: Report | None, note: str) -> None:
-    total = sum(item.source.index.num_rows for item in work)
-    work.sort(key=lambda item: -item.source.index.num_rows)
-
-    def say(done: int) -> None:
-        if report is not None:
-            report(done, total, note)
-
-    try:
-        for _ in imap_unordered(_write, work, workers, report=say):
-            pass  # the result of a job is its file
-    finally:
-        _extractor.cache_clear()  # where it was made here
-
-
-def sources(dataset: Dataset) -> list[Source]:
-    """List the shards that hold episodes of a data set, each with all that it holds."""
-    whole = dataset if dataset.tasks is None else Dataset(dataset.path)
-    shards = whole.index.column("shard").combine_chunks().dictionary_encode()
-    # Episodes of a shard follow each other.
-    starts = np.flatnonzero(np.diff(shards.indices.to_numpy(), prepend=-1)).tolist()
-    wanted, found = set(dataset.shard_names()), []
-    for start, end in zip(starts, [*starts[1:], whole.index.num_rows], strict=True):
-        name = shards[start].as_py()
-        if name in wanted:
-            part = whole.index.slice(start, end - start)
-            found.append(Source(name, joint_hash(part.column("content_hash")), part))
-    return found
-
-
 def _cache_folder(dataset: Dataset, kind: InputKind, folder: str | Path | None, variant: str) -> Path:
     if kind not in KINDS:
         raise DatasetError(unknown_name("kind of object cache", kind, KINDS))
@@ -552,37 +485,92 @@ def _cache_folder(dataset: Dataset, kind: InputKind, folder: str | Path | None, 
     return (as_path(folder) if folder else dataset.path / CACHE_FOLDER) / "-".join(parts)
 
 
-def _made(folder: Path, source: Source, kind: InputKind, variant: str) -> CacheFile | None:
-    """Open the file of a shard; None if it is missing, damaged, or of another version or content."""
+def _index_by_shard(dataset: Dataset) -> dict[str, pa.Table]:
+    """Return the whole index of each shard that holds episodes of a data set."""
+    whole = dataset if dataset.tasks is None else Dataset(dataset.path)
+    shards = whole.index.column("shard").combine_chunks().dictionary_encode()
+    # Episodes of a shard follow each other.
+    starts = np.flatnonzero(np.diff(shards.indices.to_numpy(), prepend=-1)).tolist()
+    parts = {
+        shards[start].as_py(): whole.index.slice(start, end - start)
+        for start, end in pairwise([*starts, whole.index.num_rows])
+    }
+    wanted = set(dataset.shard_names())
+    return {name: part for name, part in parts.items() if name in wanted}
+
+
+def _open_files(
+    folder: Path, indices: Mapping[str, pa.Table], kind: InputKind, variant: str
+) -> dict[str, CacheFile | None]:
+    """Open the file of each shard; None if it is missing, damaged, or of another version or content."""
+    files: dict[str, CacheFile | None] = {}
+    for name, index in indices.items():
+        try:
+            file = CacheFile(folder / name)
+        except ShardError:
+            files[name] = None
+            continue
+        asked = (joint_hash(index.column("content_hash")), kind, variant)
+        files[name] = file if (file.source, file.kind, file.variant) == asked else None
+    return files
+
+
+def _write_missing(
+    dataset: Dataset, kind: InputKind, variant: Variant, folder: Path, workers: int, report: Report | None
+) -> None:
+    indices, entries = _index_by_shard(dataset), dataset.manifest["shards"]
+    work = [
+        _Work(
+            dataset.path / name,
+            Envelope.from_entry(entries[name]),
+            indices[name],
+            folder / name,
+            kind,
+            variant,
+        )
+        for name, file in _open_files(folder, indices, kind, variant.name).items()
+        if file is None
+    ]
+    work.sort(key=lambda item: -item.index.num_rows)
+    total, note = sum(item.index.num_rows for item in work), _note_on_older(folder, kind)
     try:
-        file = CacheFile(folder / source.name)
-    except ShardError:
-        return None
-    asked = (source.content_hash, kind, variant)
-    return file if (file.source, file.kind, file.variant) == asked else None
+        for _ in imap_unordered(
+            _write, work, workers, report=report and (lambda done: report(done, total, note))
+        ):
+            pass  # the result of a job is its file
+    finally:
+        _extractor.cache_clear()  # where it was made here
+
+
+def _note_on_older(folder: Path, kind: InputKind) -> str:
+    """Say which folders of older versions a new one replaces."""
+    current = f"{kind}-v{CACHE_VERSION}"
+    names = {path.name for path in folder.parent.glob(f"{kind}-v[0-9]*")}
+    older = sorted(name for name in names if not name.startswith(current))
+    return f"extracting objects anew; delete {', '.join(older)} of older versions" if older else ""
 
 
 def _write(work: _Work, count: Callable[[int], None]) -> None:
-    shard, episodes, variant = Shard(work.shard, work.envelope), [], work.variant
+    shard, index, variant = Shard(work.shard, work.envelope), work.index, work.variant
     extractor = _extractor(variant.boxes) if variant.boxes else None
-    kept = split_hashes(work.source.index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
-    tasks, seeds = (work.source.index.column(name).to_pylist() for name in ("task", "seed"))
-    for row, span in enumerate(spans_of(work.source.index)):
+    kept = split_hashes(index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
+    tasks, seeds = (index.column(name).to_pylist() for name in ("task", "seed"))
+    episodes = []
+    for row, span in enumerate(spans_of(index)):
         is_unknown = variant.appearance is not None and tasks[row] == COMPOSED  # its prompt is not sampled
         if is_unknown or not kept[row]:
-            episodes.append(left_out_episode(tasks[row], seeds[row], work.kind))
-            count(row + 1)
-            continue
-        shard.check(row, span)
-        demo = shard[row]
-        if variant.appearance is None:
-            episodes.append(preprocess(demo, work.kind, extractor))
+            episodes.append(empty_episode(tasks[row], seeds[row], work.kind))
         else:
-            demo = with_random_appearance(demo, shard.info, variant.appearance)
+            shard.check(row, span)
+            demo = shard[row]
+            if variant.appearance is not None:
+                demo = with_random_appearance(demo, shard.info, variant.appearance)
+            episode = preprocess(demo, work.kind, extractor)
             # Random appearances have no names.
-            episodes.append(replace(preprocess(demo, work.kind, extractor), descriptions={}))
+            episodes.append(episode if variant.appearance is None else replace(episode, descriptions={}))
         count(row + 1)
-    write_cache_file(work.path, episodes, work.kind, work.source.content_hash, variant.name)
+    source = joint_hash(index.column("content_hash"))
+    write_cache_file(work.path, episodes, work.kind, source, variant.name)
 
 
 @lru_cache(maxsize=1)

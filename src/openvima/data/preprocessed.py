@@ -129,7 +129,7 @@ def preprocess(
     if kind == "objects":
         # From the content alone, so that the cache does not depend on who makes it and in what order.
         rng = np.random.default_rng([demo.seed, *demo.task.encode()])
-        _sample_false_positives(false_positives, observations, views, stack, rng)
+        _cut_false_positives(false_positives, observations, views, stack, rng)
     final = extract_observation(demo.observation(demo.num_steps), kind, extractor)
     return PreprocessedEpisode(
         task=demo.task,
@@ -162,7 +162,7 @@ def number_images(
     return [episode.with_image_offset(first) for episode, first in zip(episodes, first_images, strict=True)]
 
 
-def left_out_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:
+def empty_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:
     """Return an episode without steps and images, in place of one that a cache leaves out."""
     stack, none = ImageStack(IMAGE_SIZES[kind]), np.zeros(0, np.int16)
     nothing = ObjectTable.from_views(see_nothing(), stack)
@@ -182,7 +182,7 @@ def left_out_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpiso
     )
 
 
-def _sample_false_positives(
+def _cut_false_positives(
     false_positives: FalsePositives,
     observations: list[dict],
     views: list[ObjectViews],

@@ -15,11 +15,12 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
-from openvima.data.object_cache import Boxes, ObjectCache, Report, open_object_cache
+from openvima.data.object_cache import Boxes, ObjectCache, open_object_cache
 from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.detector.detection import MATCHING_VERSION, DetectedObjects
 from openvima.errors import ConfigError
+from openvima.multiprocess import Report
 from openvima.perception.objects import AheadExtractor, ObjectExtractor, ObjectViews, see_nothing
 from openvima.policies.naming import WEIGHTS_FILE, checkpoint_folder
 from openvima.scene import PromptImage

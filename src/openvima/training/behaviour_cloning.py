@@ -18,7 +18,7 @@ from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Metrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.stage import crop_parameters
-from openvima.training.source import order_of
+from openvima.training.source import make_order
 
 CHUNK = 64  # demonstrations per batch of precomputed features
 MAX_FEATURES = 4_000_000  # images, about 1 kB each; above, features are computed in every step
@@ -54,7 +54,7 @@ class BehaviourCloning:
         self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
         self._training, self._validation, self._alternatives = training, validation, alternatives
         self._validated = module if parallel.is_sharded else learner
-        self._order = order_of(
+        self._order = make_order(
             training,
             batch_size=config.loader.batch_size,
             seed=config.seed,

@@ -31,13 +31,13 @@ from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
 from openvima.training.recipes import command_going_on
 from openvima.training.run_folder import held_out_demonstrations, run_lock
-from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import (
     alternative_source,
+    check_lengths,
     check_scenes,
     check_words,
-    demonstrated_actions,
     open_demonstrations,
+    read_actions,
     split_examples,
 )
 
@@ -202,7 +202,7 @@ class _Stages:
                     describes=describes,
                 )
             if not (config.init_from or self.trainer.progress.step):
-                learner.network.fit_prior(demonstrated_actions(self._examples[0]))
+                learner.network.fit_prior(read_actions(self._examples[0]))
             if freezes_crops(learner.network, config):
                 freeze_crops(learner, caches, self.parallel)
         if config.runtime.compile:
