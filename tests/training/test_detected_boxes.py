@@ -249,7 +249,6 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
             "loader.detected_prob": 0.4,
             "loader.rerendered_prob": 0.4,
             "loader.detected_fraction": 0.5,
-            "loader.rerendered_variants": 2,
         },
     ],
 )

@@ -49,8 +49,6 @@ class LoaderConfig:
             have true boxes. Detection takes about 0.2 s of CPU time per demonstration.
         rerendered_prob: Probability of using a demonstration rendered again with random shapes and textures,
             drawn per demonstration and batch; together with `detected_prob` at most 1.
-        rerendered_variants: Random appearances of each demonstration; each takes as much memory and disk as
-            the demonstrations themselves.
         exclude_tasks: Tasks that the run must not see, comma-separated: in no stage, vocabulary or
             validation.
     """
@@ -64,7 +62,6 @@ class LoaderConfig:
     detected_prob: Probability | None = None
     detected_fraction: Probability = 1.0
     rerendered_prob: Probability = 0.0
-    rerendered_variants: Annotated[int, Range(1, 64)] = 1
     exclude_tasks: str = ""
 
     @property
@@ -182,8 +179,6 @@ class PretrainingConfig:
             can be pretrained.
         num_scenes: Scenes to render.
         batch_size: Object pairs a step.
-        learning_rate: Peak learning rate.
-        temperature: Softmax temperature of the InfoNCE loss.
         appearance_randomization_prob: Probability for each object of a random texture instead of one of the
             training partition, and of a random shape.
         hard_negative_prob: Probability for each movable object of a neighbour that differs in height, shade,
@@ -206,8 +201,6 @@ class PretrainingConfig:
     steps: Steps | None = None
     num_scenes: Annotated[int, Range(2)] = 2500
     batch_size: Annotated[int, Range(2)] = 128
-    learning_rate: Probability = 1e-3
-    temperature: Annotated[float, Range(1e-3)] = 0.07
     appearance_randomization_prob: Probability = 0.0
     hard_negative_prob: Probability = 0.0
     box_jitter_px: Annotated[float, Range(0, 8)] = 0.0

@@ -128,9 +128,8 @@ def _variants(config: TrainingConfig, boxes: Boxes | None) -> list[tuple[Variant
     loader, detected_prob = config.loader, config.loader.detected_prob or 0.0
     stored = [(Variant(), 1 - detected_prob - loader.rerendered_prob)] if detected_prob < 1 else []
     detected = [(Variant(boxes), detected_prob)] if detected_prob > 0 else []
-    numbers = range(loader.rerendered_variants if loader.rerendered_prob else 0)
-    prob = loader.rerendered_prob / loader.rerendered_variants
-    return [*stored, *detected, *((Variant(appearance=number), prob) for number in numbers)]
+    rerendered = [(Variant(appearance=0), loader.rerendered_prob)] if loader.rerendered_prob else []
+    return [*stored, *detected, *rerendered]
 
 
 def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:  # Any: YAML

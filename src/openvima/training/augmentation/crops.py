@@ -44,8 +44,9 @@ _BRACE_WIDTH = 0.08
 def with_occlusion(pairs: Pairs, prob: float, generator: torch.Generator) -> Pairs:
     """Paint bars of the background over the crops of some objects.
 
-    The background is white in a prompt image, the table in a scene. Few shapes of the training partition have gaps, so that the encoder would take what shows through those of
-    pallets and crates for their texture. All images of one object get the same bars, upright or level.
+    The background is white in a prompt image, the table in a scene. Few shapes of the training partition have
+    gaps, so that the encoder would take what shows through those of pallets and crates for their texture. All
+    images of one object get the same bars, upright or level.
 
     Their rotations become NaN: bars look the same from two sides.
 

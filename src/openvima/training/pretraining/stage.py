@@ -95,6 +95,7 @@ def caption_texts() -> Iterator[str]:
 
 
 _NUM_CAPTIONS, _CAPTION_BATCH = 4096, 64
+_TEMPERATURE = 0.07
 _VALIDATION_SCENES = 0.05  # the last ones
 _PURPOSE = "1-matching"  # hashed into the seed of every batch; changing it would change all runs
 
@@ -121,6 +122,7 @@ class ContrastivePretraining:
     """
 
     name = "1-pretraining"
+    learning_rate = 1e-3
 
     def __init__(
         self,
@@ -132,7 +134,6 @@ class ContrastivePretraining:
         encode: Callable[[str], list[int]] | None = None,
     ) -> None:
         assert network.object_encoder is not None  # `resolved` has checked it
-        self.learning_rate = config.learning_rate
         self.encoder = network.object_encoder
         self.parameters = crop_parameters(network)
         held_out = pairs.scenes >= int(pairs.scenes.max()) * (1 - _VALIDATION_SCENES)
@@ -159,7 +160,7 @@ class ContrastivePretraining:
         loss, metrics = contrastive_loss(
             self.encoder,
             batch,
-            temperature=config.temperature,
+            temperature=_TEMPERATURE,
             generator=generator,
             attributes=self._attributes,
             attribute_weight=config.attribute_loss_weight,
