@@ -12,7 +12,7 @@ from openvima.policies.base import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
 from openvima.serving.protocol import MAX_PIXELS, encode_prompt, pack, unpack
-from openvima.serving.server import Calls, Session, WaitingRequest
+from openvima.serving.server import Session
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
 
@@ -30,12 +30,6 @@ def refusal(message: Any, policy: Any = None) -> str:  # Any: whatever can be pa
     return answer
 
 
-def answered(session: Session, calls: Calls) -> bytes | str:
-    request = WaitingRequest(session, calls, is_joint=False)
-    request.begin()
-    return request.reply.result()
-
-
 def prompt_with(text: str = "Look at {thing}.", **fields: Any) -> dict[str, Any]:  # Any: of a message
     sent = encode_prompt(made_up_prompt(1))
     return {"text": text, "images": [{**sent["images"][0], **fields}]}
@@ -50,7 +44,7 @@ def test_a_policy_that_reads_language_is_served_descriptions() -> None:
     session = Session(policy, 64, "text")
     request = session.read(pack({"type": "reset", "prompts": [encode_prompt(made_up_prompt(3))]}))
     assert not isinstance(request, str)
-    assert answered(session, request) == pack({"type": "reset", "episodes": 1})
+    assert session.reply(request) == pack({"type": "reset", "episodes": 1})
     (prompt,) = policy.prompts
     assert (prompt.text, prompt.images) == ("Look at the red swirl bowl, number 3.", {})
     long = prompt_with(objects=[{"object_id": 2, "object": "x" * 201, "texture": "red"}])
@@ -154,7 +148,7 @@ def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCap
     request = session.read(pack({"type": "reset", "prompts": [prompt_with()]}))
     assert not isinstance(request, str)
     with caplog.at_level(logging.ERROR):
-        answers = [answered(session, request)]
+        answers = [session.reply(request)]
     answers += [
         refusal({"type": hostile}),
         refusal({"type": "reset", hostile: 1}),

@@ -20,7 +20,6 @@ def main(
     threads: int = 1,
     prompts: str = "multimodal",
     max_connections: int = 16,
-    max_batch: int = 16,
     max_episodes: int = 64,
     max_message_mb: int = 128,
     idle_s: float = 600.0,
@@ -50,8 +49,6 @@ def main(
             probability ½. With ",paraphrased": synonyms.
         max_connections: Clients at the same time; `openvima evaluate` has one for each worker.
         max_episodes: Largest batch of episodes.
-        max_batch: Episodes of several clients that a network computes at once, in float64 on the cpu, where
-            that changes no bit; with 1 it answers one request after the other.
         max_message_mb: Size of the largest message, in 2**20 bytes; an image of a prompt takes 0.26.
         idle_s: Seconds after which a client is dropped that sends nothing.
         trust_code: Run the code that a run folder names, as that of a learner of your own does.
@@ -74,7 +71,6 @@ def main(
         max_message_bytes=max_message_mb * 2**20,
         max_episodes=max_episodes,
         max_connections=max_connections,
-        max_batch=max_batch,
         idle_s=idle_s,
         num_threads=threads,
         prompts=prompts,

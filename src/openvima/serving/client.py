@@ -25,13 +25,13 @@ from openvima.serving.protocol import (
     decode_action,
     encode_observation,
     encode_prompt,
+    is_loopback,
     pack,
     read_list,
     require_extra,
     type_of,
     unpack,
 )
-from openvima.serving.server import is_loopback
 
 if TYPE_CHECKING:
     from websockets.sync.connection import Connection as Socket

@@ -6,6 +6,7 @@ send it: `__ndarray__` (true), `data` (its bytes, rows first), `dtype` (as numpy
 counts only after it was compared with the bytes that are there.
 """
 
+import ipaddress
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
@@ -187,6 +188,14 @@ MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
 _KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")
 _LENGTHS = {"joints": 6, "tool": len(COMMAND_NAMES)}  # of what observations hold as numbers
 _RECORD_TYPES: dict[str, type] = {"object_id": int, "object": str, "texture": str}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address is certain to mean this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def check_address(url: str) -> None:

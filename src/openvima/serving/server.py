@@ -3,21 +3,18 @@
 import asyncio
 import hmac
 import http
-import ipaddress
 import logging
 import socket
 import sys
 import threading
-import time
 import traceback
-from collections.abc import Awaitable, Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -39,6 +36,7 @@ from openvima.serving.protocol import (
     decode_observation,
     decode_prompt,
     encode_action,
+    is_loopback,
     pack,
     read_list,
     require_extra,
@@ -46,6 +44,23 @@ from openvima.serving.protocol import (
     unpack,
 )
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, described
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+# Objects in the images of a request, on average over the largest batch. The benchmark's hardest prompts have
+# 20, and demonstrations as prompts three times as many; its observations have 9, and ids of arm and table.
+MAX_IN_PROMPTS, MAX_IN_VIEW = 64, 24
+_MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
+HEALTH_PATH = "/healthz"
+MAX_FRAGMENTS = 1024  # of a message, besides one for each KiB: each costs time, and empty ones have no size
+CLOSE_S = 2.0  # for the other side to say goodbye
+_LOG = logging.getLogger(__name__)
+_TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
+_TRANSPORT_LOG.setLevel(logging.CRITICAL)  # a traceback for every port scan; `serve_client` says what matters
+
+Answer = Callable[[], Any]  # calls the policy and returns the answer to one request
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +75,6 @@ class ServerConfig:
             observation.
         max_episodes: Episodes of the largest batch, for which 128 MiB are enough.
         max_connections: Clients at the same time.
-        max_batch: Episodes of several clients that a network computes at once; with 1 it answers one request
-            after the other.
         idle_s: Seconds after which a client is dropped that has not sent a whole message, or not taken an
             answer.
         num_threads: Threads that a network computes with. One gives the last bits of `openvima evaluate`.
@@ -79,7 +92,6 @@ class ServerConfig:
     max_message_bytes: int = 128 * 2**20
     max_episodes: int = 64
     max_connections: int = 16
-    max_batch: int = 16
     idle_s: float = 600.0
     num_threads: int = 1
     prompts: str = "multimodal"
@@ -91,7 +103,6 @@ class ServerConfig:
                 ("port", self.port, 0, 65535),
                 ("max_message_bytes", self.max_message_bytes, 1024, 2**32),
                 ("max_episodes", self.max_episodes, 1, MAX_LENGTH),
-                ("max_batch", self.max_batch, 1, 1024),
                 ("max_connections", self.max_connections, 1, 10_000),
                 ("idle_s", self.idle_s, 0.01, 10**6),
                 ("num_threads", self.num_threads, 1, 1024),
@@ -119,14 +130,6 @@ def server_config(**settings: Any) -> ServerConfig:  # Any: of several kinds
     if unknown := [name for name in settings if name not in known]:
         raise ConfigError(" ".join(unknown_name("setting of a server", name, known) for name in unknown))
     return ServerConfig(**settings)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host name or address is certain to mean this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def is_own_page(headers: Mapping[str, str], *, any_host: bool) -> bool:
@@ -158,30 +161,6 @@ def check_can_listen(host: str, port: int) -> None:
         raise ConfigError(f"cannot listen on {host}, port {port}: {error}; choose another one.") from error
 
 
-# Objects in the images of a request, on average over the largest batch. The benchmark's hardest prompts have
-# 20, and demonstrations as prompts three times as many; its observations have 9, and ids of arm and table.
-MAX_IN_PROMPTS, MAX_IN_VIEW = 64, 24
-_MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PolicyCall:
-    """A call that a policy is to compute.
-
-    Args:
-        kind: The name of the method.
-        inputs: Its prompts or observations.
-    """
-
-    kind: Literal["reset", "act"]
-    inputs: Sequence[Any]
-
-
-# Gives the calls that an answer needs, is sent what they return, and returns the answer.
-Calls = Generator[PolicyCall, Any, Any]  # Any: actions; plain values and arrays
-ReplyCalls = Generator[PolicyCall, Any, bytes | str]
-
-
 class Session:
     """Answers the requests of one client.
 
@@ -203,17 +182,17 @@ class Session:
         self._prompts = prompts
         self._num_episodes = 0
 
-    def read(self, data: bytes | str) -> Calls | str:
-        """Read a request, whatever it is, and return what answers it; nothing is called yet."""
+    def read(self, data: bytes | str) -> Answer | str:
+        """Read a request, whatever it is, and return what answers it; the policy is not called yet."""
         try:
             return self._read(data)
         except OpenVimaError as error:
             return _refusal(error)
 
-    def reply(self, request: Calls) -> ReplyCalls:
-        """Answer a request that `read` returned. Whoever runs this makes the calls."""
+    def reply(self, answer: Answer) -> bytes | str:
+        """Call the policy for a request that `read` returned, and pack the answer."""
         try:
-            return pack((yield from request))
+            return pack(answer())
         except OpenVimaError as error:
             return _refusal(error)
         except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
@@ -221,7 +200,7 @@ class Session:
             _LOG.error("the policy failed\n%s", where)
             return f"the policy failed: {type(error).__name__}: {echo(str(error))}"
 
-    def _read(self, data: bytes | str) -> Calls:
+    def _read(self, data: bytes | str) -> Answer:
         if isinstance(data, str):
             raise MessageError("a text frame came in; requests are binary frames of MessagePack.")
         message = unpack(data)
@@ -231,7 +210,7 @@ class Session:
             protocol = message.get("protocol", PROTOCOL)
             check_protocol(protocol, theirs="the client", ours="this server")
             prompts = read_list(message, "reset", "prompts", self._max_episodes, optional=("protocol",))
-            return self._begin(self._decoded(prompts))
+            return partial(self._begin, self._decoded(prompts))
         if kind == "act":
             seen = read_list(message, "act", "observations", self._max_episodes)
             observations = [
@@ -240,11 +219,12 @@ class Session:
             ]
             num_ids = sum(_num_ids(one["segm"]) for one in observations if one and "segm" in one)
             self._check_objects(num_ids, MAX_IN_VIEW)
-            return self._act(observations)
+            return partial(self._act, observations)
         if isinstance(message, dict) and "type" not in message:
             prompt = message.pop("prompt", None)
             sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
-            return self._infer(decode_observation(message, control=self._control), self._decoded(sent))
+            observation = decode_observation(message, control=self._control)
+            return partial(self._infer, observation, self._decoded(sent))
         raise MessageError(
             f"a request must be a map with type 'reset' or 'act', or an observation ({PROTOCOL})."
         )
@@ -265,25 +245,21 @@ class Session:
                 "Send fewer episodes."
             )
 
-    def _begin(self, prompts: Sequence[RenderedPrompt]) -> Calls:
-        yield from self._reset(prompts)
-        return {"type": "reset", "episodes": self._num_episodes}
-
-    def _reset(self, prompts: Sequence[RenderedPrompt]) -> Calls:
+    def _begin(self, prompts: Sequence[RenderedPrompt]) -> dict[str, Any]:
         if not prompts:
             raise MessageError("reset has no prompts; give one for each episode.")
         self._num_episodes = 0  # should the policy fail, there is nothing to go on with
-        yield PolicyCall("reset", prompts)
+        self.policy.reset(prompts)
         self._num_episodes = len(prompts)
+        return {"type": "reset", "episodes": self._num_episodes}
 
-    def _act(self, observations: Sequence[dict[str, Any] | None]) -> Calls:  # Any: values and arrays
-        actions = yield from self._actions(observations)
+    def _act(self, observations: Sequence[dict[str, Any] | None]) -> dict[str, Any]:
+        actions = self._actions(observations)
         near_ties = getattr(self.policy, "near_ties", None)
         extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
         return {"type": "act", "actions": actions, **extra}
 
-    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> Calls:  # Any: values and arrays
-        """Ask the policy."""
+    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> list[Any]:
         if not self._num_episodes:
             raise MessageError("there are no episodes yet; send a reset with their prompts first.")
         if len(observations) != self._num_episodes:
@@ -291,19 +267,18 @@ class Session:
                 f"act has {len(observations)} observations for {self._num_episodes} prompts; send one for "
                 "each, and nil for episodes that have ended."
             )
-        given = yield PolicyCall("act", observations)
-        actions = [encode_action(action, self._control) for action in given]
+        actions = [encode_action(action, self._control) for action in self.policy.act(observations)]
         if len(actions) != len(observations):
             raise MessageError(
                 f"the policy gave {len(actions)} actions for {len(observations)} observations."
             )
         return actions
 
-    def _infer(self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]) -> Calls:
+    def _infer(self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]) -> Any:
         """Act in a single episode, which an observation with a prompt begins."""
         if prompts:
-            yield from self._reset(prompts)
-        return (yield from self._actions([observation]))[0]
+            self._begin(prompts)
+        return self._actions([observation])[0]
 
 
 def _num_ids(segm: Mapping[str, np.ndarray]) -> int:
@@ -318,220 +293,7 @@ def _refusal(error: OpenVimaError) -> str:
 
 
 if TYPE_CHECKING:
-    from openvima.policies.episodes import JointCall
-
-# Of waiting for the other clients, which are those that asked within the last second. A client that was just
-# answered needs a few ms for its next request, and a batch of 16 takes ten times the window.
-WINDOW_S = 0.01
-ACTIVE_S = 1.0
-
-
-class DynamicBatcher:
-    """Answers the requests of sessions, in order of arrival.
-
-    While one batch is computed, the requests for the next one arrive. It takes the same number of episodes of
-    each client, as far as they have so many, so a client with many episodes is answered in several batches
-    and the others wait for one of them at most.
-
-    Policies without `joint_call`, and those for which it returns None, are called once for each request.
-
-    Args:
-        readers: Threads that read and check requests.
-        computing: The one thread that policies are called in.
-        max_batch: Episodes of several requests that are computed at once; with 1 each request is computed by
-            itself.
-    """
-
-    def __init__(self, readers: Executor, computing: Executor, max_batch: int) -> None:
-        self._readers, self._computing = readers, computing
-        self._max_batch = max_batch
-        self._changed = threading.Condition()
-        self._last_asked_s: WeakKeyDictionary[Session, float] = WeakKeyDictionary()
-        self._arrived: list[WaitingRequest] = []
-        self._is_running = False  # or about to: `_run` is submitted once, however many requests wait
-        self._waiting: list[WaitingRequest] = []  # those that have waited longest come first
-
-    async def submit(self, session: Session, data: bytes | str) -> Awaitable[bytes | str] | str:
-        """Read a message.
-
-        Returns:
-            The answer, which is to be awaited, or a refusal. The message is no longer needed.
-        """
-        loop = asyncio.get_running_loop()
-        with self._changed:
-            self._last_asked_s[session] = time.monotonic()
-        calls = await loop.run_in_executor(self._readers, session.read, data)
-        if isinstance(calls, str):
-            return calls
-        request = WaitingRequest(session, calls, is_joint=self._max_batch > 1)
-        with self._changed:
-            self._arrived.append(request)
-            self._changed.notify()
-            was_running, self._is_running = self._is_running, True
-        if not was_running:
-            self._computing.submit(self._run)
-        return asyncio.wrap_future(request.reply)
-
-    def _run(self) -> None:
-        """Compute batches until no request waits."""
-        try:
-            while self._is_needed():
-                self._gather(self._compute_batch() if self._waiting else [])
-        except BaseException:  # the next request runs it again
-            with self._changed:
-                self._is_running = False
-            raise
-
-    def _is_needed(self) -> bool:
-        """Whether a request waits; if not, the next one will run the batcher again."""
-        with self._changed:
-            self._is_running = bool(self._waiting or self._arrived)
-            return self._is_running
-
-    def _gather(self, unfinished: "Sequence[WaitingRequest]") -> None:
-        """Take the requests that have arrived, and some behind them; wait a little for other clients."""
-        self._take_arrived()
-        if count := len(self._waiting) + len(unfinished):
-            since_s = time.monotonic() - ACTIVE_S
-            with self._changed:
-                num_active = sum(asked_s > since_s for asked_s in self._last_asked_s.values())
-                full = min(num_active, self._max_batch)
-                self._changed.wait_for(lambda: count + len(self._arrived) >= full, WINDOW_S)
-            self._take_arrived()
-        self._waiting += unfinished
-
-    def _take_arrived(self) -> None:
-        with self._changed:
-            arrived, self._arrived = self._arrived, []
-        self._waiting += [each for each in arrived if each.begin()]
-
-    def _compute_batch(self) -> "list[WaitingRequest]":
-        """Compute rows of the request that has waited longest, and of those that join it.
-
-        Returns:
-            Those of them that are not finished; they no longer wait.
-        """
-        calls = [(each, each.joint) for each in self._waiting if each.joint]
-        first = calls[0][1]
-        calls = [(each, call) for each, call in calls if call.joins(first)]
-        shares = fair_shares([call.num_left for _, call in calls], self._max_batch)
-        pieces = [(*call, share) for call, share in zip(calls, shares, strict=True) if share]
-        _compute(pieces)
-        served = [each for each, _, _ in pieces]
-        self._waiting = [each for each in self._waiting if each not in served]
-        return [each for each in served if each.joint]
-
-
-class WaitingRequest:
-    """A request that waits for its answer.
-
-    Attributes:
-        reply: The answer, once it is there.
-        joint: A call of the policy that is to be computed with those of others; None if there is none.
-    """
-
-    def __init__(self, session: Session, calls: Calls, *, is_joint: bool) -> None:
-        self._policy: Any = session.policy  # Any: `joint_call` is optional
-        self._calls = session.reply(calls)
-        self._is_joint = is_joint and hasattr(session.policy, "joint_call")
-        self.reply: Future[bytes | str] = Future()
-        self.joint: JointCall | None = None
-
-    def begin(self) -> bool:
-        """Make the calls before the first joint one; whether there is one."""
-        if self.reply.set_running_or_notify_cancel():  # else the server stops
-            self._resume(lambda: None)
-        return self.joint is not None
-
-    def go_on(self) -> None:
-        """Go on with the answer if the joint call is computed."""
-        joint = self.joint
-        if joint is not None and not joint.num_left:
-            self.joint = None
-            self._resume(joint.finish)
-
-    def fail(self, error: Exception) -> None:
-        """Go on with the error of the joint call."""
-        self.joint = None
-        self._resume(partial(_raise, error))
-
-    def _resume(self, result: Callable[[], Any]) -> None:  # Any: what a policy returns
-        """Send what a call returned, or raised, and make those that follow, up to a joint one."""
-        while True:
-            try:
-                given = result()
-            except Exception as error:
-                resume = partial(self._calls.throw, error)
-            else:
-                if self.joint is not None:
-                    return
-                resume = partial(self._calls.send, given)
-            try:
-                call = resume()
-            except StopIteration as end:
-                self.reply.set_result(end.value)
-                return
-            result = partial(self._made, call)
-
-    def _made(self, call: PolicyCall) -> Any:  # Any: what a policy returns
-        """Make a call, unless it is a joint one."""
-        joint: JointCall | None = None
-        if self._is_joint:
-            joint = self._policy.joint_call(call.kind, call.inputs)
-        if joint is None:
-            return getattr(self._policy, call.kind)(call.inputs)
-        if not joint.num_left:
-            return joint.finish()
-        self.joint = joint
-        return None
-
-
-def fair_shares(wanted: Sequence[int], total: int) -> list[int]:
-    """Divide a number of rows in turns, one at a time, so that whoever wants few gets them.
-
-    Example:
-        >>> fair_shares([1, 64, 1, 5], total=16)
-        [1, 9, 1, 5]
-    """
-    shares = [0] * len(wanted)
-    total = min(total, sum(wanted))
-    while total:
-        for index, most in enumerate(wanted):
-            if shares[index] < most and total:
-                shares[index] += 1
-                total -= 1
-    return shares
-
-
-def _compute(pieces: "Sequence[tuple[WaitingRequest, JointCall, int]]") -> None:
-    """Compute rows of calls in one batch; if that fails each by itself, for errors of its own."""
-    try:
-        pieces[0][1].compute_together([(call, count) for _, call, count in pieces])
-    except Exception as error:
-        if len(pieces) == 1:
-            pieces[0][0].fail(error)
-        else:
-            for piece in pieces:
-                _compute([piece])
-        return
-    for request, _, _ in pieces:
-        request.go_on()
-
-
-def _raise(error: Exception) -> None:
-    raise error
-
-
-if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
-    from websockets.http11 import Request, Response
-
-HEALTH_PATH = "/healthz"
-MAX_FRAGMENTS = 1024  # of a message, besides one for each KiB: each costs time, and empty ones have no size
-CLOSE_S = 2.0  # for the other side to say goodbye
-_LOG = logging.getLogger(__name__)
-_TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
-_TRANSPORT_LOG.setLevel(logging.CRITICAL)  # a traceback for every port scan; `serve_client` says what matters
+    pass
 
 
 def serve(
@@ -666,7 +428,7 @@ class _PolicyServer:
             ThreadPoolExecutor(2, "openvima-reading") as readers,
             ThreadPoolExecutor(1, "openvima-policy", _set_threads, threads) as computing,
         ):
-            self._batcher = DynamicBatcher(readers, computing, config.max_batch)
+            self._readers, self._computing = readers, computing
             try:
                 server = await serve(
                     self._serve_client,
@@ -732,13 +494,16 @@ class _PolicyServer:
     async def _converse(self, connection: "ServerConnection") -> None:
         session = Session(self._new_policy(), self._config.max_episodes, self._config.prompts)
         reply: bytes | str = self._metadata
+        loop = asyncio.get_running_loop()
         while True:
             async with asyncio.timeout(self._config.idle_s):
                 await connection.send(reply)
                 data = await _whole_message(connection)
-            answer = await self._batcher.submit(session, data)
+            answer = await loop.run_in_executor(self._readers, session.read, data)
             del data  # it may be large, and the policy may be busy with others
-            reply = answer if isinstance(answer, str) else await answer
+            if not isinstance(answer, str):
+                answer = await loop.run_in_executor(self._computing, session.reply, answer)
+            reply = answer
             if isinstance(reply, str):
                 _LOG.warning("%s: refused: %s", _name(connection), reply)
 
