@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from openvima.catalog import Geometry, TriangleMesh, Vector3
-from openvima.catalog.boxes import block
+from openvima.catalog.bodies import block
 
 COLOURS = {"red": (255, 87, 89), "blue": (78, 121, 167), "white": (255, 255, 255)}
 

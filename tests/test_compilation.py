@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from openvima import compilation
-from openvima.catalog.cache import cached_array
+from openvima.catalog.procedural import cached_array
 from openvima.errors import ConfigError
 from openvima.input_files import as_path, cache_dir
 

@@ -6,8 +6,7 @@ import pytest
 from openvima.catalog.bodies import build_geometry
 from openvima.catalog.geometry import CollisionBox, CollisionHull
 from openvima.catalog.objects import OBJECTS, object_spec
-from openvima.catalog.outlines import outline
-from openvima.catalog.triangulation import signed_area
+from openvima.catalog.outlines import outline, signed_area
 from openvima.errors import AssetError, UnknownObjectError
 
 ALL = list(OBJECTS)

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.catalog.images import draw_texture
-from openvima.catalog.noise import hashed, value_noise
+from openvima.catalog.images import draw_texture, hashed, value_noise
 from openvima.catalog.textures import TEXTURES, texture_spec
 
 DIGESTS = Path(__file__).parents[1] / "golden" / "procedural_textures.json"

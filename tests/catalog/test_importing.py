@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from openvima.catalog import OBJECTS, TEXTURES, CollisionHull, load_assets, pack_files
-from openvima.catalog.importing import import_pack, imported_pack
-from openvima.catalog.original import OriginalAssets
+from openvima.catalog import OBJECTS, TEXTURES, CollisionHull, load_assets, original
+from openvima.catalog.original import OriginalAssets, import_pack, imported_pack
 from openvima.errors import AssetError
 from openvima.input_files import cache_dir
 
@@ -56,17 +55,16 @@ def _own_cache(tmp_path, monkeypatch):
 def checkout(tmp_path, monkeypatch) -> Path:
     """A checkout of five small files, which stand for the original ones."""
     hashes = {path: hashlib.sha256(content).hexdigest() for path, content in FILES.items()}
-    for module in ("pack_files", "importing", "original"):
-        monkeypatch.setattr(f"openvima.catalog.{module}.known_hashes", lambda: hashes)
+    monkeypatch.setattr(original, "known_hashes", lambda: hashes)
     for path, content in FILES.items():
-        file = tmp_path / "checkout" / pack_files.PACK_FOLDER / path
+        file = tmp_path / "checkout" / original.PACK_FOLDER / path
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(content)
     return tmp_path / "checkout"
 
 
 def in_pack(checkout: Path, path: str) -> Path:
-    return checkout / pack_files.PACK_FOLDER / path
+    return checkout / original.PACK_FOLDER / path
 
 
 def test_an_import_holds_every_file_and_needs_the_checkout_no_more(checkout):
@@ -127,7 +125,7 @@ def test_importing_again_replaces_the_import_and_what_was_loaded_of_it(checkout)
     in_pack(checkout, "kitting/cross.obj").write_bytes(content)
     import_pack(checkout)
     assert load_assets("original").geometry("cross", SIZE).visual.vertices.shape == (4, 3, 3)
-    assert [path.name for path in cache_dir().iterdir() if path.is_file()] == [pack_files.ARCHIVE_NAME]
+    assert [path.name for path in cache_dir().iterdir() if path.is_file()] == [original.ARCHIVE_NAME]
 
 
 def test_the_same_checkout_gives_the_same_archive(checkout):
@@ -153,7 +151,7 @@ def test_an_import_that_fails_leaves_the_last_one(checkout, tmp_path, monkeypatc
         import_pack(checkout)
     pack = imported_pack()
     assert pack is not None and pack.is_complete
-    assert [path.name for path in cache_dir().iterdir() if path.is_file()] == [pack_files.ARCHIVE_NAME]
+    assert [path.name for path in cache_dir().iterdir() if path.is_file()] == [original.ARCHIVE_NAME]
 
 
 def test_text_files_may_have_the_line_ends_of_windows(checkout):
@@ -196,7 +194,7 @@ def test_decoded_files_that_were_damaged_are_decoded_again(checkout):
 
 
 needs_reference = pytest.mark.skipif(
-    not (REFERENCE / pack_files.PACK_FOLDER).is_dir(),
+    not (REFERENCE / original.PACK_FOLDER).is_dir(),
     reason=f"{REFERENCE} is absent; OPENVIMA_REFERENCE_ASSETS names another folder",
 )
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from openvima.catalog import OBJECTS, TEXTURES, Assets, CollisionBox, CollisionHull
-from openvima.catalog.boxes import block, container, line, square, three_sided_rectangle
-from openvima.catalog.obj_file import parse_obj
+from openvima.catalog.bodies import block, container, line, square, three_sided_rectangle
+from openvima.catalog.mesh_files import parse_obj
 from openvima.catalog.original import _FIXED_MESHES, OriginalAssets, image_file
 from openvima.catalog.textures import texture_spec
 from openvima.errors import AssetError, UnknownObjectError, UnknownTextureError

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.catalog.cache import cached_array
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
-from openvima.catalog.procedural import _DRAWING_MODULES, ProceduralAssets
+from openvima.catalog.procedural import _DRAWING_MODULES, ProceduralAssets, cached_array
 from openvima.errors import AssetError, UnknownTextureError
 from openvima.input_files import cache_dir
 

@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from openvima.catalog import outlines
+from openvima.catalog.outlines import signed_area
 from openvima.catalog.packs import load_assets
-from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random, random_name
+from openvima.catalog.random_pack import (
+    RandomAppearanceAssets,
+    darkened_texture,
+    has_visible_heading,
+    is_random,
+    random_name,
+    random_texture,
+)
 from openvima.catalog.random_shapes import (
     has_heading,
     random_container,
@@ -15,8 +23,6 @@ from openvima.catalog.random_shapes import (
     random_round_container,
     random_square_container,
 )
-from openvima.catalog.random_textures import darkened_texture, random_texture
-from openvima.catalog.triangulation import signed_area
 from openvima.errors import UnknownTextureError
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from openvima.catalog import Pool, load_assets, registration, user_assets
-from openvima.catalog.user_assets import recorded_assets
+from openvima.catalog import Pool, load_assets, packs, registration
+from openvima.catalog.packs import recorded_assets
 from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate, rerender
 from openvima.data.verification import VerifyConfig, replay, verify
@@ -39,8 +39,8 @@ def restored(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def forget() -> None:
     """Undo what the functions did, as another process would find it."""
-    user_assets._packs.clear()
-    os.environ.pop(user_assets._LOADED_VARIABLE, None)
+    packs._packs.clear()
+    os.environ.pop(packs._LOADED_VARIABLE, None)
     for cached in (rerender._rasteriser, replay._env):
         cached.cache_clear()
     for table in (registration.REGISTERED_OBJECTS, registration.REGISTERED_TEXTURES):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from openvima.catalog import importing
+from openvima.catalog import original
 from openvima.cli.main import main
 from openvima.render import gallery
 
@@ -17,8 +17,7 @@ def import_small_pack(tmp_path, monkeypatch, *, damaged: bool = False) -> int:
     """Import a checkout in which every file is a body description without content."""
     names = ("kitting/object-template.urdf", "pallet/pallet.urdf")
     hashes = dict.fromkeys(names, "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855")
-    for module in ("pack_files", "importing"):
-        monkeypatch.setattr(f"openvima.catalog.{module}.known_hashes", lambda: hashes)
+    monkeypatch.setattr(original, "known_hashes", lambda: hashes)
     folder = tmp_path / "checkout/vima_bench/tasks/assets"
     (folder / "textures").mkdir(parents=True)
     for name in names:
@@ -56,7 +55,7 @@ def test_an_incomplete_import_lists_what_it_lacks_and_ends_with_1(tmp_path, monk
     printed = capsys.readouterr()
     assert "1 of 2 files imported" in printed.out
     assert "1 not imported" in printed.err and "pallet/pallet.urdf differs" in printed.err
-    pack = importing.imported_pack()
+    pack = original.imported_pack()
     assert pack is not None and len(pack.files) == 1
 
 

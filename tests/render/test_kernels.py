@@ -12,7 +12,7 @@ import pytest
 import naive
 from box_assets import random_mesh, triangle
 from openvima.catalog import TriangleMesh
-from openvima.catalog.boxes import block
+from openvima.catalog.bodies import block
 from openvima.render import FRONT, TOP
 from openvima.render.camera import Camera
 from openvima.render.indexed import KernelBuffers, indexed, matrix_3x4

@@ -5,7 +5,7 @@ import pytest
 
 from box_assets import COLOURS, BoxAssets
 from openvima.catalog import OBJECTS
-from openvima.catalog.boxes import block
+from openvima.catalog.bodies import block
 from openvima.catalog.procedural import ProceduralAssets
 from openvima.errors import ConfigError, ShapeError, UnknownObjectError
 from openvima.render import CAMERAS, VIEWS, Drawable, Rasteriser, project

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
-from openvima.catalog.triangulation import triangulate
+from openvima.catalog.outlines import triangulate
 
 TEXTURE_PER_M = 3.5
 """Texture widths per metre of surface, much as on the kit objects of the original pack."""

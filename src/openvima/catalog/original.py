@@ -1,22 +1,258 @@
-"""The original asset pack: meshes, textures and collision shapes of VIMA-Bench."""
+"""The original asset pack: meshes, textures and collision shapes of VIMA-Bench, and their import.
 
+Files come from a checkout, or from the archive of an import in the cache. Every file is compared with a known
+hash, so that an incomplete or different pack is reported.
+"""
+
+import hashlib
 import io
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
+from typing import Protocol
 
 import numpy as np
 
-from openvima.catalog.bodies import BOX_SHAPES
-from openvima.catalog.cache import cached_array
+from openvima.atomic_io import atomic_write
+from openvima.catalog.bodies import BOX_SHAPES, LONG_RODS_Z, hanoi_stand
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
-from openvima.catalog.hanoi import LONG_RODS_Z, hanoi_stand
+from openvima.catalog.mesh_files import ObjMesh, parse_obj
 from openvima.catalog.meshes import scaled_geometry
-from openvima.catalog.obj_file import ObjMesh, parse_obj
 from openvima.catalog.objects import REGISTERED_OBJECTS, ObjectSpec, object_spec
-from openvima.catalog.pack_files import CheckoutFiles, PackFiles, known_hashes
+from openvima.catalog.procedural import cached_array
 from openvima.catalog.registration import registered_geometry, registered_texture
 from openvima.catalog.textures import REGISTERED_TEXTURES, TextureSpec, texture_spec
 from openvima.errors import AssetError
+from openvima.input_files import cache_dir
+
+PACK_FOLDER = Path("vima_bench/tasks/assets")  # inside a checkout
+ARCHIVE_NAME = "original-pack-1.zip"  # the number is that of the archive's layout
+IMPORT_COMMAND = "openvima assets import CHECKOUT"
+_TEXT_SUFFIXES = (".obj", ".urdf")
+
+
+class PackFiles(Protocol):
+    """The files of an original pack; instances with the same files are equal."""
+
+    def read(self, relative_path: str) -> bytes:
+        """Return a file's content, as in the original benchmark.
+
+        Args:
+            relative_path: One of `known_hashes`.
+
+        Raises:
+            AssetError: The file is missing, unreadable, damaged or of another version.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CheckoutFiles:
+    """The files of a checkout of the original benchmark.
+
+    Args:
+        folder: The pack's folder, absolute.
+    """
+
+    folder: Path
+
+    @classmethod
+    def within(cls, checkout: str | Path) -> "CheckoutFiles":
+        """Find the pack in a checkout.
+
+        Args:
+            checkout: Folder of the checkout (it holds `vima_bench/tasks/assets`), or that assets folder.
+
+        Raises:
+            AssetError: The folder holds no asset pack.
+        """
+        candidates = (Path(checkout) / PACK_FOLDER, Path(checkout))
+        folder = next((path for path in candidates if (path / "textures").is_dir()), None)
+        if folder is None:
+            raise AssetError(
+                f"{checkout} holds no original asset pack ({PACK_FOLDER}/textures is missing); "
+                "give the folder of a VIMABench checkout."
+            )
+        return cls(folder.resolve())
+
+    def read(self, relative_path: str) -> bytes:
+        """Return a file's content; see `PackFiles.read`."""
+        path = self.folder / relative_path
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise AssetError(
+                f"{path} is missing or unreadable; complete the checkout of VIMABench."
+            ) from error
+        original = _as_original(content, relative_path)
+        if original is None:
+            raise AssetError(
+                f"{path} differs from the file of the original benchmark (damaged, or another version); "
+                "restore it from a fresh checkout of VIMABench."
+            )
+        return original
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedFiles:
+    """The files that were imported into the cache.
+
+    Args:
+        archive: The archive.
+        stamp: Identifies the version of the archive.
+    """
+
+    archive: Path
+    stamp: tuple[int, ...]
+
+    @classmethod
+    def present(cls) -> "ImportedFiles":
+        """Find the imported pack.
+
+        Raises:
+            AssetError: None was imported.
+        """
+        archive = cache_dir() / ARCHIVE_NAME
+        try:
+            status = archive.stat()
+        except OSError:
+            raise AssetError(
+                f"the original asset pack has not been imported ({archive} is missing). Run "
+                f"`{IMPORT_COMMAND}` with the folder of a VIMABench checkout, or use the pack 'procedural'."
+            ) from None
+        return cls(archive, (status.st_mtime_ns, status.st_size, status.st_ino))
+
+    def read(self, relative_path: str) -> bytes:
+        """Return a file's content; see `PackFiles.read`."""
+        try:
+            with zipfile.ZipFile(self.archive) as archive:
+                content = archive.read(relative_path)
+        except KeyError:
+            raise AssetError(
+                f"the imported original pack lacks {relative_path}, which the checkout did not hold or held "
+                f"damaged; complete the checkout of VIMABench and run `{IMPORT_COMMAND}` again."
+            ) from None
+        except (OSError, zipfile.BadZipFile) as error:
+            raise AssetError(
+                f"{relative_path} cannot be read from {self.archive} ({error}); run `{IMPORT_COMMAND}` again."
+            ) from error
+        if _as_original(content, relative_path) is None:
+            raise AssetError(
+                f"{relative_path} in {self.archive} differs from the file of the original benchmark; "
+                f"run `{IMPORT_COMMAND}` again."
+            )
+        return content
+
+
+@lru_cache(maxsize=1)
+def known_hashes() -> Mapping[str, str]:
+    """Return the SHA-256 of every file that is imported, by path in the pack."""
+    text = Path(__file__).with_name("original_files.json").read_text(encoding="utf-8")
+    return MappingProxyType(json.loads(text))
+
+
+def _as_original(content: bytes, relative_path: str) -> bytes | None:
+    """The content if it is the known one; Git for Windows may have changed the line ends of text files."""
+    candidates = [content]
+    if relative_path.endswith(_TEXT_SUFFIXES):
+        candidates.append(content.replace(b"\r\n", b"\n"))
+    expected = known_hashes()[relative_path]
+    return next((c for c in candidates if hashlib.sha256(c).hexdigest() == expected), None)
+
+
+Report = Callable[[int, int, str], None]
+
+_PROBLEMS_MEMBER = "problems.json"
+_DATE = (1980, 1, 1, 0, 0, 0)  # the same checkout gives the same archive
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedPack:
+    """Result of an import.
+
+    Args:
+        archive: The archive in the cache.
+        files: Imported files, as paths in the pack.
+        problems: One sentence for each missing file.
+    """
+
+    archive: Path
+    files: tuple[str, ...]
+    problems: tuple[str, ...]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every file was imported."""
+        return not self.problems
+
+
+def import_pack(checkout: str | Path, report: Report | None = None) -> ImportedPack:
+    """Import the original asset pack for `load_assets("original")`.
+
+    Missing or damaged files are reported. An earlier import is replaced atomically.
+
+    Args:
+        checkout: Folder of a checkout of the original benchmark, or its assets folder.
+        report: Called with the number of files done, the total, and the last name.
+
+    Returns:
+        Imported files and problems.
+
+    Raises:
+        AssetError: The folder contains no asset pack, or only damaged files.
+        OSError: The cache cannot be written to.
+    """
+    source = CheckoutFiles.within(checkout)
+    contents: dict[str, bytes] = {}
+    problems = []
+    for done, relative_path in enumerate(known_hashes(), start=1):
+        try:
+            decode_file(source, relative_path)
+            contents[relative_path] = source.read(relative_path)
+        except AssetError as error:
+            problems.append(str(error))
+        if report:
+            report(done, len(known_hashes()), relative_path)
+    if not contents:
+        raise AssetError(f"none of the {len(problems)} files in {source.folder} is sound; {problems[0]}")
+    archive = cache_dir() / ARCHIVE_NAME
+    _write_archive(archive, contents, problems)
+    return ImportedPack(archive, tuple(contents), tuple(problems))
+
+
+def imported_pack() -> ImportedPack | None:
+    """Return the result of the last import, or None.
+
+    Raises:
+        AssetError: The archive is damaged.
+    """
+    try:
+        archive = ImportedFiles.present().archive
+    except AssetError:
+        return None
+    try:
+        with zipfile.ZipFile(archive) as file:
+            problems = json.loads(file.read(_PROBLEMS_MEMBER))
+            names = tuple(name for name in file.namelist() if name in known_hashes())
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise AssetError(
+            f"{archive} is damaged ({error}); delete it, or import the pack again with "
+            "`openvima assets import CHECKOUT`."
+        ) from error
+    return ImportedPack(archive, names, tuple(problems))
+
+
+def _write_archive(archive: Path, contents: dict[str, bytes], problems: list[str]) -> None:
+    archive.parent.mkdir(parents=True, exist_ok=True)
+    members = {**contents, _PROBLEMS_MEMBER: json.dumps(problems, indent=1).encode()}
+    with atomic_write(archive) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as packed:
+        for name, content in members.items():
+            packed.writestr(zipfile.ZipInfo(name, _DATE), content)
+
 
 # Scales of meshes of fixed size, metres per mesh unit, and the height at which their origin rests.
 _FIXED_MESHES: dict[str, tuple[str, Vector3, float]] = {

@@ -1,11 +1,17 @@
-"""An asset pack with random shapes and textures, whose names contain their seeds."""
+"""An asset pack with random shapes and textures, whose names contain their seeds.
 
+Textures are stripes, dots, checks, patches, swirls and plain colours: two or three colours from anywhere, any
+scale, any angle. They know nothing of the catalogue, so what is learnt from them is what textures are like.
+"""
+
+import colorsys
 import re
 from functools import lru_cache
 
 import numpy as np
 
 from openvima.catalog.geometry import Assets, Geometry, Vector3, protect
+from openvima.catalog.images import layered_noise, value_noise
 from openvima.catalog.meshes import scaled_geometry
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
 from openvima.catalog.random_shapes import (
@@ -20,7 +26,142 @@ from openvima.catalog.random_shapes import (
     random_shape,
     random_square_container,
 )
-from openvima.catalog.random_textures import darkened_texture, random_texture
+from openvima.catalog.textures import DARK_VALUE_DROP
+
+_SIDE_PX = 128
+_PERIODS = (0.05, 0.35)  # shortest and longest, in widths of the image; a kit object shows a third of it
+_LEAST_CONTRAST = 60  # in the channel in which two neighbouring colours differ most
+_GREY_SHARE = 0.2
+_PLAIN_SHARE = 0.2
+
+_Field = np.ndarray  # shape (S, S): what decides which colour a pixel has, a whole colour for each step of 1
+
+
+def random_texture(rng: np.random.Generator) -> np.ndarray:
+    """Draw a texture.
+
+    Args:
+        rng: Every draw comes from here.
+
+    Returns:
+        Shape (128, 128, 3), uint8, row 0 on top; 1 × 1 for plain colours.
+    """
+    if rng.random() < _PLAIN_SHARE:
+        return _random_colour(rng).astype(np.uint8).reshape(1, 1, 3)
+    colours = _contrasting_colours(rng, count=int(rng.integers(2, 4)))
+    field = _FAMILIES[int(rng.integers(len(_FAMILIES)))](rng)
+    image = (
+        _blended(field, colours) if rng.random() < 0.25 else colours[field.astype(np.int64) % len(colours)]
+    )
+    if rng.random() < 0.3:
+        grain = value_noise((_SIDE_PX, _SIDE_PX), (64, 64), _seed(rng)) - 0.5
+        image = image + rng.uniform(5, 25) * grain[..., None]
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def darkened_texture(texture: np.ndarray) -> np.ndarray:
+    """Lower the HSV value of each pixel by 0.3, not below 0, as the dark textures of the catalogue are made.
+
+    Args:
+        texture: Shape (H, W, 3), uint8.
+    """
+    value = texture.max(axis=2, keepdims=True) / 255
+    factor = np.maximum(0, value - DARK_VALUE_DROP) / np.maximum(value, 1 / 255)
+    return (texture * factor).astype(np.uint8)
+
+
+def _random_colour(rng: np.random.Generator) -> np.ndarray:
+    """Any hue; shape (3,), float64, 0 to 255."""
+    saturation = 0.0 if rng.random() < _GREY_SHARE else rng.uniform(0.15, 1.0)
+    return 255 * np.array(colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.2, 1.0)))
+
+
+def _contrasting_colours(rng: np.random.Generator, *, count: int) -> np.ndarray:
+    """Colours of which no two are alike, shape (count, 3), float64."""
+    colours = [_random_colour(rng)]
+    while len(colours) < count:
+        colour = _random_colour(rng)
+        if min(np.abs(colour - other).max() for other in colours) >= _LEAST_CONTRAST:
+            colours.append(colour)
+    return np.array(colours)
+
+
+def _blended(field: _Field, colours: np.ndarray) -> np.ndarray:
+    """Go from colour to colour without a border, shape (S, S, 3)."""
+    first = np.floor(field).astype(np.int64)
+    weight = (field - first)[..., None]
+    return colours[first % len(colours)] * (1 - weight) + colours[(first + 1) % len(colours)] * weight
+
+
+def _axes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates along and across a random direction, in random periods, about the middle of the image."""
+    places = (np.arange(_SIDE_PX) + 0.5) / _SIDE_PX - 0.5
+    x, y = np.meshgrid(places, places)
+    angle, period = rng.uniform(0, 2 * np.pi), float(np.exp(rng.uniform(*np.log(_PERIODS))))
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    return along / period + rng.uniform(0, 8), across / (period * rng.uniform(0.6, 1.7)) + rng.uniform(0, 8)
+
+
+def _stripes(rng: np.random.Generator) -> _Field:
+    along, _ = _axes(rng)
+    return 2 * along
+
+
+def _waves(rng: np.random.Generator) -> _Field:
+    along, across = _axes(rng)
+    return 2 * along + rng.uniform(0.3, 1.5) * np.sin(rng.uniform(1, 4) * across)
+
+
+def _checks(rng: np.random.Generator) -> _Field:
+    along, across = _axes(rng)
+    return np.floor(2 * along) + np.floor(2 * across)
+
+
+def _dots(rng: np.random.Generator) -> _Field:
+    along, across = _axes(rng)
+    shift = rng.choice((0.0, 0.5))
+    row = np.floor(across)
+    dx, dy = (along + shift * row) % 1 - 0.5, across - row - 0.5
+    size, squareness = rng.uniform(0.18, 0.45), rng.choice((1.0, 2.0, 6.0))  # diamonds, discs, squares
+    inside = np.abs(dx) ** squareness + np.abs(dy) ** squareness < size**squareness
+    return np.where(inside, 1.0 + (row % 2 if rng.random() < 0.3 else 0.0), 0.0)
+
+
+def _bricks(rng: np.random.Generator) -> _Field:
+    along, across = _axes(rng)
+    row = np.floor(across)
+    joint = rng.uniform(0.08, 0.25)
+    x = along / rng.uniform(1.0, 2.5) + 0.5 * row
+    return np.where((x % 1 < joint) | (across % 1 < joint), 0.0, 1.0 + (np.floor(x) + row) % 2)
+
+
+def _patches(rng: np.random.Generator) -> _Field:
+    cells = (int(rng.integers(3, 20)), int(rng.integers(3, 20)))
+    noise = layered_noise((_SIDE_PX, _SIDE_PX), cells, _seed(rng), num_layers=int(rng.integers(1, 4)))
+    return rng.uniform(2, 5) * noise + rng.uniform(0, 3)
+
+
+def _veins(rng: np.random.Generator) -> _Field:
+    cells = (int(rng.integers(3, 12)), int(rng.integers(3, 12)))
+    noise = layered_noise((_SIDE_PX, _SIDE_PX), cells, _seed(rng), num_layers=3)
+    return np.where(np.abs(noise - 0.5) < rng.uniform(0.02, 0.07), 1.0, 0.0)
+
+
+def _swirl(rng: np.random.Generator) -> _Field:
+    """Rays about a point near the middle, bent into a spiral; without rays these are circles."""
+    places = (np.arange(_SIDE_PX) + 0.5) / _SIDE_PX - 0.5
+    x, y = np.meshgrid(places - rng.uniform(-0.15, 0.15), places - rng.uniform(-0.15, 0.15))
+    num_rays = int(rng.choice((0, 1, 2, 3, 5, 8, 12)))
+    bend = rng.uniform(8, 30) if num_rays < 2 else rng.uniform(-12, 12)
+    return 6 + num_rays * np.arctan2(y, x) / np.pi + bend * np.sqrt(x * x + y * y)
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(1 << 31))
+
+
+_FAMILIES = (_stripes, _waves, _checks, _dots, _bricks, _patches, _veins, _swirl)
+
 
 _SHAPES = {
     "shape": random_shape,

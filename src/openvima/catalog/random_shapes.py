@@ -4,11 +4,10 @@ from typing import cast
 
 import numpy as np
 
-from openvima.catalog import boxes
+from openvima.catalog import bodies
 from openvima.catalog.geometry import Geometry
 from openvima.catalog.meshes import combined, draped, prism, revolved
-from openvima.catalog.outlines import rectangle
-from openvima.catalog.triangulation import signed_area
+from openvima.catalog.outlines import rectangle, signed_area
 
 _WIDTHS_M = (0.07, 0.125)  # smallest and largest extent of an outline, much as of the kit objects
 _HEIGHTS_M = (0.02, 0.036)
@@ -57,22 +56,22 @@ def random_grating(rng: np.random.Generator) -> Geometry:
     slat_width, beam_width = width / num_slats * rng.uniform(0.35, 0.75), rng.uniform(0.008, 0.02)
     parts = [
         *(
-            boxes.Box((beam_width, width, beam), (x, 0.0, beam / 2))
+            bodies.Box((beam_width, width, beam), (x, 0.0, beam / 2))
             for x in _spread(length, beam_width, num_beams)
         ),
         *(
-            boxes.Box((length, slat_width, slat), (0.0, y, beam + slat / 2))
+            bodies.Box((length, slat_width, slat), (0.0, y, beam + slat / 2))
             for y in _spread(width, slat_width, num_slats)
         ),
     ]
     if rng.random() < 0.3:  # slats upright around it
         height = float(rng.uniform(0.02, 0.05))
         parts += [
-            boxes.Box((beam_width, boxes.WALL_M, height), (x, y, height / 2))
+            bodies.Box((beam_width, bodies.WALL_M, height), (x, y, height / 2))
             for x in _spread(length, beam_width, num_slats)
             for y in (-width / 2, width / 2)
         ]
-    return Geometry(draped(boxes.box_mesh(parts)), (), 0.0)
+    return Geometry(draped(bodies.box_mesh(parts)), (), 0.0)
 
 
 def random_eared_container(rng: np.random.Generator) -> Geometry:
@@ -279,7 +278,7 @@ def _borders(cells: set[Cell]) -> list[np.ndarray]:
 
 def _open_box(rng: np.random.Generator) -> Geometry:
     x, y = rng.uniform(0.12, 0.2, 2)
-    geometry = boxes.container((float(x), float(y), float(rng.uniform(0.015, 0.07))))
+    geometry = bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07))))
     return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
 
 
@@ -289,7 +288,7 @@ def _spread(length: float, part: float, count: int) -> list[float]:
 
 
 def _flat_square(rng: np.random.Generator) -> Geometry:
-    geometry = boxes.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001))
+    geometry = bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001))
     return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
 
 

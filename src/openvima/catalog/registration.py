@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from openvima.catalog.geometry import Geometry, Vector3, protect
+from openvima.catalog.mesh_files import Mesh, UserMesh, check_lengths, read_mesh
 from openvima.catalog.objects import OBJECTS, REGISTERED_OBJECTS, ObjectSpec, Profile
 from openvima.catalog.partitions import LEVELS, PUBLISHED_TASKS, Level, Pool
 from openvima.catalog.textures import NEUTRAL_TEXTURE, REGISTERED_TEXTURES, TEXTURES, TextureSpec
-from openvima.catalog.user_mesh import Mesh, UserMesh, check_lengths, read_mesh
 from openvima.errors import (
     AssetError,
     ConfigError,

@@ -51,7 +51,7 @@ def import_(
     Returns:
         Exit status: 0 everything was imported, 1 files are missing.
     """
-    from openvima.catalog.importing import import_pack
+    from openvima.catalog.original import import_pack
 
     with progress_bar("original assets") as report:
         pack = import_pack(checkout, report)
@@ -74,8 +74,8 @@ def info() -> int:
         Exit status.
     """
     from openvima.catalog import OBJECTS, TEXTURES
-    from openvima.catalog.importing import imported_pack
     from openvima.catalog.objects import REGISTERED_OBJECTS
+    from openvima.catalog.original import imported_pack
     from openvima.catalog.textures import REGISTERED_TEXTURES
     from openvima.input_files import cache_dir
     from openvima.tasks import list_tasks

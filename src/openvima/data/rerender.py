@@ -29,7 +29,7 @@ from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import OBJECT_SETS
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, random_name
 from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
-from openvima.catalog.user_assets import recorded_assets
+from openvima.catalog.packs import recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.schema import VIEWS

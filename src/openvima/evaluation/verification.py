@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from openvima.atomic_io import atomic_write_file
-from openvima.catalog.user_assets import recorded_assets
+from openvima.catalog.packs import recorded_assets
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, DatasetError, OpenVimaError, echo
 from openvima.evaluation.ablations import ablated_environment
