@@ -14,7 +14,7 @@ from pathlib import Path
 from openvima.catalog import LEVELS
 from openvima.env import EnvConfig
 from openvima.evaluation import EvaluationConfig, Results, evaluate
-from openvima.scene.command import CONTROLS, PRIMITIVES
+from openvima.scene.action import CONTROLS, PRIMITIVES
 
 RECORD = Path(__file__).parents[1] / "src/openvima/tasks/oracle_success.json"
 

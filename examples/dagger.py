@@ -17,7 +17,7 @@ from torch.nn import functional as F
 import openvima
 from openvima.evaluation.statistics import wilson_interval
 from openvima.perception.objects import TOP, observe
-from openvima.scene.command import COMMAND_HIGH, MAX_MOVE_M
+from openvima.scene.action import COMMAND_HIGH, MAX_MOVE_M
 
 
 class Errors(gymnasium.ObservationWrapper):

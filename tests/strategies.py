@@ -5,7 +5,7 @@ import math
 from hypothesis import strategies as st
 
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Pose
-from openvima.scene.pose import normalised
+from openvima.scene.scene import normalised
 
 angles = st.floats(-math.pi, math.pi)
 coordinates = st.floats(-2.0, 2.0)

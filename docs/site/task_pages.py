@@ -13,7 +13,7 @@ from openvima.evaluation.recording import save_episode_image
 from openvima.evaluation.statistics import wilson_interval
 from openvima.report.published import models_by_task, published_tasks, task_rate
 from openvima.tasks import TaskSpec, list_tasks, task_spec
-from openvima.tasks.oracle_success import oracle_record
+from openvima.tasks.registry import oracle_record
 
 ROOT = Path(__file__).parents[2]
 LEVELS = {

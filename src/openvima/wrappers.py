@@ -13,7 +13,7 @@ from openvima.errors import ActionError, ConfigError
 from openvima.perception.objects import TOP, ObjectViews, observe, observe_prompt_image
 from openvima.render.camera import CAMERAS
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action
-from openvima.scene.command import END_EFFECTOR, HIGHEST_TIP_Z_M
+from openvima.scene.action import END_EFFECTOR, HIGHEST_TIP_Z_M
 from openvima.tasks.goals import LEVER_M
 
 ACTION_SIZE = 6

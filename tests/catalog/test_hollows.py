@@ -8,7 +8,7 @@ import pytest
 from openvima.catalog import OBJECTS, Assets, load_assets
 from openvima.scene import Placement, Pose, Scene
 from openvima.sim.bodies import Bodies
-from openvima.sim.settling import settle
+from openvima.sim.primitive_state import Settling
 
 PACK = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
 X, Y = 0.5, 0.05
@@ -29,8 +29,10 @@ def dropped(assets: Assets, name: str, onto: str, offset: tuple[float, float], h
     base = Placement(5, onto, "red", OBJECTS[onto].size_max, Pose.planar(X, Y, 0.0, z=base_z), fixed=True)
     start = Pose.planar(X + offset[0], Y + offset[1], 0.3, z=base_z + height_m)
     bodies = Bodies(Scene((base, Placement(6, name, "blue", OBJECTS[name].size_max, start))), assets)
-    _, completed = settle(bodies)
-    assert completed
+    settling = Settling(bodies)
+    while not settling.is_over:
+        settling.run()
+    assert settling.is_at_rest
     pose = bodies.pose(1)
     return Pose.planar(pose.x - X, pose.y - Y, 0.0, z=pose.z - base_z)
 

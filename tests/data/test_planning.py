@@ -10,7 +10,7 @@ from openvima.data import GenerateConfig, plan
 from openvima.data.planning import MAX_EPISODES, MAX_FIRST_SEED, generate_command, shard_episodes
 from openvima.env import EnvConfig
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
-from openvima.tasks.seeding import MAX_SEED
+from openvima.tasks.sampling import MAX_SEED
 from small_generations import config
 
 

@@ -21,7 +21,7 @@ from openvima.data.verification import verify
 from openvima.errors import DatasetError
 from openvima.scene import Placement, Problem, SceneImage
 from openvima.tasks import sample_episode
-from openvima.tasks.comparisons import MEANINGS
+from openvima.tasks.novel_words import MEANINGS
 
 ASSETS = RandomAppearanceAssets(load_assets("procedural"), 4096)
 TASKS = ("novel_adj", "scene_understanding", "same_shape", "twist", "sweep_without_exceeding")

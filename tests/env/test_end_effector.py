@@ -16,7 +16,7 @@ from openvima.evaluation.merging import merge
 from openvima.evaluation.scoring import score
 from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy
-from openvima.scene.command import COMMAND_HIGH, STEPS_PER_PRIMITIVE, ToolCommand
+from openvima.scene.action import COMMAND_HIGH, STEPS_PER_PRIMITIVE, ToolCommand
 
 STAY = np.zeros(5, np.float32)
 

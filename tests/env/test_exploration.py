@@ -10,7 +10,7 @@ import openvima
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError, ReachError, SamplingError
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
-from openvima.scene.command import COMMAND_HIGH, COMMAND_LOW, HIGHEST_TIP_Z_M
+from openvima.scene.action import COMMAND_HIGH, COMMAND_LOW, HIGHEST_TIP_Z_M
 from openvima.sim.tool_world import ToolWorld
 
 FIRST_SEED = 3_000_000

@@ -12,7 +12,7 @@ from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
 from openvima.data.appearances import appearances_of, find_leaks
 from openvima.scene import ObjectImage, Placement, SceneImage
 from openvima.tasks import sample_episode
-from openvima.tasks.seeding import make_rng
+from openvima.tasks.sampling import make_rng
 from recorded_seeds import seeds_of
 
 FOLDER = Path(openvima.__file__).parent / "policies" / "trained" / "openvima-small"

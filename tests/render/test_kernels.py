@@ -15,8 +15,15 @@ from openvima.catalog import TriangleMesh
 from openvima.catalog.bodies import block
 from openvima.render import FRONT, TOP
 from openvima.render.camera import Camera
-from openvima.render.indexed import KernelBuffers, indexed, matrix_3x4
-from openvima.render.kernels import draw_triangles, light_intensity, stamp_triangles, texel_index
+from openvima.render.kernels import (
+    KernelBuffers,
+    draw_triangles,
+    indexed,
+    light_intensity,
+    matrix_3x4,
+    stamp_triangles,
+    texel_index,
+)
 from openvima.render.labels import CEILING_M, empty_labels
 from openvima.scene import Pose
 

@@ -11,8 +11,7 @@ from openvima.catalog import OBJECTS, TEXTURES, load_assets
 from openvima.catalog.procedural import ProceduralAssets
 from openvima.errors import AssetError
 from openvima.render import Rasteriser, gallery
-from openvima.render.gallery import PICTURES, write_gallery
-from openvima.render.thumbnails import draw_thumbnail
+from openvima.render.gallery import PICTURES, draw_thumbnail, write_gallery
 
 
 @pytest.fixture(scope="module")

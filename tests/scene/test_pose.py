@@ -8,7 +8,7 @@ from hypothesis import given
 
 from openvima.errors import SceneError
 from openvima.scene import Pose, angle_difference
-from openvima.scene.pose import normalised
+from openvima.scene.scene import normalised
 from strategies import angles, flat_poses, poses, vectors
 
 

@@ -8,7 +8,7 @@ import pytest
 from openvima.scene import Action, Pose
 from openvima.sim import World
 from openvima.sim.bodies import Bodies
-from openvima.sim.primitives import body_under_probe
+from openvima.sim.world import body_under_probe
 from sim_tables import ASSETS, table
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from openvima.scene import Action
 from openvima.sim import World, ur5
-from openvima.sim.arm_path import FREE_SPEED
+from openvima.sim.primitive_state import FREE_SPEED
 from sim_tables import ASSETS, table
 
 CASES = [

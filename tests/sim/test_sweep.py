@@ -7,10 +7,9 @@ import pytest
 
 from openvima.scene import Action, Scene
 from openvima.sim import World
-from openvima.sim.end_effectors import COMPAT_SHORTFALL_M
-from openvima.sim.primitive_state import PrimitiveState
-from openvima.sim.settling import MONITOR_TICKS
+from openvima.sim.primitive_state import MONITOR_TICKS, PrimitiveState
 from openvima.sim.spatula import SWEEP_M_S, Spatula
+from openvima.sim.ur5 import COMPAT_SHORTFALL_M
 from sim_tables import ASSETS, Body, table
 
 

@@ -7,14 +7,21 @@ import numpy as np
 import pytest
 
 from openvima.scene import Action, Pose, Scene
-from openvima.scene.command import HIGHEST_TIP_Z_M, MAX_MOVE_M, MAX_TURN_RAD, ToolCommand
+from openvima.scene.action import HIGHEST_TIP_Z_M, MAX_MOVE_M, MAX_TURN_RAD, ToolCommand
 from openvima.sim import World
-from openvima.sim.end_effectors import HOVER_TIP_Z_M, PROBE_BELOW_TIP_M, SWEEP_TIP_Z_M
 from openvima.sim.model import FLOOR_Z_M
 from openvima.sim.spatula import SWEEP_M_S
 from openvima.sim.tool_path import PathFollower, onward_path, tool_path
 from openvima.sim.tool_world import MAX_JOINT_SPEED, ToolWorld
-from openvima.sim.ur5 import JOINT_LIMITS, forward, highest_tip_z, tool_pose
+from openvima.sim.ur5 import (
+    HOVER_TIP_Z_M,
+    JOINT_LIMITS,
+    PROBE_BELOW_TIP_M,
+    SWEEP_TIP_Z_M,
+    forward,
+    highest_tip_z,
+    tool_pose,
+)
 from sim_tables import ASSETS, random_table, table
 
 ON, OFF = ToolCommand(0, 0, 0, 0, True), ToolCommand(0, 0, 0, 0, False)

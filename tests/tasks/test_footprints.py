@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openvima.scene import Zone
-from openvima.tasks.footprints import Rectangle
+from openvima.tasks.pushes import Rectangle
 
 rectangles = st.builds(
     Rectangle,

@@ -23,7 +23,7 @@ from openvima.scene import (
 )
 from openvima.tasks import advance, begin, monitor, oracle_action
 from openvima.tasks.goals import needs_monitoring
-from openvima.tasks.ids import RenumberedCondition, shuffled_ids
+from openvima.tasks.sampling import RenumberedCondition, shuffled_ids
 
 HEART, STAR = 5, 6
 

@@ -9,7 +9,7 @@ from openvima.evaluation.ablations import ablate
 from openvima.evaluation.phrasings import held_out_phrasings
 from openvima.scene.prompt import PLACEHOLDER
 from openvima.tasks import sample_episode, task_spec
-from openvima.tasks.paraphrasing import rephrased, training_paraphrases
+from openvima.tasks.prompts import rephrased, training_paraphrases
 
 TASKS = ("visual_manipulation", "rotate", "scene_understanding", "same_shape", "rearrange")
 

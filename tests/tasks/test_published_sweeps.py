@@ -9,7 +9,7 @@ import pytest
 
 from openvima.scene import InZone, NeverTouches, Placement, Pose, Problem, Prompt, Scene, Zone
 from openvima.tasks import advance, begin
-from openvima.tasks.published_sweeps import published_sweep
+from openvima.tasks.sweeping import published_sweep
 
 GOLDEN = Path(os.environ.get("OPENVIMA_GOLDEN", Path(__file__).parents[3] / "shared" / "golden"))
 EPISODES = GOLDEN / "dynamics" / "episodes.json.gz"

@@ -12,7 +12,7 @@ from openvima.catalog import TEXTURE_SETS
 from openvima.errors import ConfigError
 from openvima.scene import InZone, NeverTouches, ObjectImage, Placement, Problem, ZoneKeptClear, block_points
 from openvima.tasks import sample_episode, task_spec
-from openvima.tasks.footprints import Rectangle
+from openvima.tasks.pushes import Rectangle
 
 NUM_EPISODES = 1500
 EXCEEDING, TOUCHING = "sweep_without_exceeding", "sweep_without_touching"

@@ -7,11 +7,8 @@ import pytest
 from openvima.env import TabletopEnv
 from openvima.scene import InZone, NeverTouches, Placement, Pose, Problem, Prompt, Scene, Zone, ZoneKeptClear
 from openvima.tasks import sample_episode
-from openvima.tasks.footprints import Rectangle
-from openvima.tasks.pushes import SHORTFALL_M, STANDOFF_M, Sweep
-from openvima.tasks.separation import separating_sweeps
-from openvima.tasks.sweep_view import View
-from openvima.tasks.sweeping import plan_sweep
+from openvima.tasks.pushes import SHORTFALL_M, STANDOFF_M, Rectangle, Sweep, View
+from openvima.tasks.sweeping import plan_sweep, separating_sweeps
 
 ZONE, LINE = Zone(0.5, 0.0, 0.1, 0.27), Zone(0.41, 0.0, 0.04, 0.34)
 AREA = Zone(0.39, 0.0, 0.172, 0.3)  # with a line at its mouth

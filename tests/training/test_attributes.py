@@ -19,7 +19,7 @@ from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer, s
 from openvima.scene import Placement, Pose  # noqa: E402
 from openvima.scene.prompt import PLACEHOLDER  # noqa: E402
 from openvima.tasks import list_tasks, task_spec  # noqa: E402
-from openvima.tasks.paraphrasing import training_paraphrases  # noqa: E402
+from openvima.tasks.prompts import training_paraphrases  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import resolve  # noqa: E402
 from openvima.training.pretraining.losses import (  # noqa: E402

@@ -13,7 +13,7 @@ from lerobot_env_openvima.env import OpenVimaEnv
 from openvima.data.lerobot_frames import IMAGE_PREFIX, MAX_PROMPT_IMAGES, FrameLayout, frame_layout
 from openvima.env.tabletop import IMAGE_SHAPE
 from openvima.errors import ConfigError
-from openvima.scene.command import CONTROL_HZ, END_EFFECTOR, PRIMITIVES, check_control
+from openvima.scene.action import CONTROL_HZ, END_EFFECTOR, PRIMITIVES, check_control
 
 
 @EnvConfig.register_subclass("openvima")

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from openvima.data.lerobot_frames import FrameLayout
 from openvima.env.tabletop import IMAGE_SHAPE, TabletopEnv
 from openvima.errors import ActionError
-from openvima.scene.command import steps_per_primitive
+from openvima.scene.action import steps_per_primitive
 
 
 class OpenVimaEnv(gymnasium.Env[dict[str, Any], np.ndarray]):

@@ -26,7 +26,7 @@ from openvima.data.lerobot_frames import ACTION_NAMES, IMAGE_PREFIX, frame_layou
 from openvima.errors import PolicyError
 from openvima.policies.base import Policy, prompt_hash
 from openvima.scene import RenderedPrompt
-from openvima.scene.command import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES
+from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES
 from openvima.serving import serve
 from openvima.serving.lerobot import lerobot_name
 

@@ -9,7 +9,7 @@ import tyro
 
 from openvima.cli.terminal import print_table, table_console
 from openvima.tasks.options import option_descriptions
-from openvima.tasks.oracle_success import oracle_record
+from openvima.tasks.registry import oracle_record
 
 if TYPE_CHECKING:
     from openvima.tasks import TaskSpec

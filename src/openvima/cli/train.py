@@ -152,7 +152,7 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
     from openvima.data.reader import Dataset
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
     from openvima.scene import COMPOSED
-    from openvima.scene.command import PRIMITIVES
+    from openvima.scene.action import PRIMITIVES
     from openvima.tasks.registry import task_spec
 
     dataset = Dataset(config.data)

@@ -27,7 +27,7 @@ from openvima.scene import (
     RenderedPrompt,
     Scene,
 )
-from openvima.scene.command import PRIMITIVES
+from openvima.scene.action import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 from openvima.user_code import is_code
 

@@ -25,7 +25,7 @@ from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import settle
 from openvima.multiprocess import Report
-from openvima.scene.command import CONTROL_HZ, END_EFFECTOR, PRIMITIVES
+from openvima.scene.action import CONTROL_HZ, END_EFFECTOR, PRIMITIVES
 from openvima.video.encoder import import_av
 
 __all__ = ["LerobotConfig", "export_lerobot", "frame_layout"]

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from openvima.catalog.user_assets import recorded_assets
+from openvima.catalog.packs import recorded_assets
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.env.config import EnvConfig
 from openvima.errors import ActionError, DatasetError
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS, WORKSPACE_HIGH, WORKSPACE_LOW, RenderedPrompt
-from openvima.scene.command import COMMAND_NAMES, END_EFFECTOR
+from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR
 
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ACTION_NAMES = tuple(f"{key}.{axis}" for key, length in ACTION_SHAPES.items() for axis in "xyzw"[:length])

@@ -25,8 +25,7 @@ from openvima.input_files import settle
 from openvima.multiprocess import MAX_WORKERS, Counts
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.registry import named_tasks
-from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
-from openvima.tasks.seeding import MAX_SEED
+from openvima.tasks.sampling import MAX_SEED, check_task_options, check_text_form, takes_prompts
 
 Engine = Literal["processes", "ray"]
 Compression = Literal["lz4", "zstd"]

@@ -36,7 +36,7 @@ from openvima.scene import (
 )
 from openvima.scene.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from openvima.tasks import task_spec
-from openvima.tasks.seeding import MAX_SEED
+from openvima.tasks.sampling import MAX_SEED
 
 _OPCODES = OPCODES | {"BYTEARRAY8"}  # in which protocol 5 writes the content of arrays
 MAX_OPERATIONS = 100_000  # opcodes; the largest known file has about 3,000

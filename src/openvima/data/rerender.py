@@ -25,11 +25,10 @@ import numpy as np
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.objects import OBJECTS, ObjectSpec, object_spec
-from openvima.catalog.packs import load_assets
+from openvima.catalog.packs import load_assets, recorded_assets
 from openvima.catalog.partitions import OBJECT_SETS
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, random_name
 from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
-from openvima.catalog.packs import recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.schema import VIEWS

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.catalog.packs import load_assets
-from openvima.catalog.user_assets import recorded_assets
+from openvima.catalog.packs import load_assets, recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
     CACHE_FOLDER,
@@ -54,7 +53,7 @@ from openvima.scene import (
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
 )
-from openvima.scene.command import PRIMITIVES
+from openvima.scene.action import PRIMITIVES
 from openvima.tasks.oracle import TIED_TO_TABLE
 from openvima.tasks.prompts import MULTIMODAL
 from openvima.user_code import is_code

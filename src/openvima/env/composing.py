@@ -60,8 +60,7 @@ from openvima.scene import (
 )
 from openvima.scene.goal import is_condition
 from openvima.scene.prompt import PHOTO_SIDE
-from openvima.tasks.into_base import TOLERANCE
-from openvima.tasks.rotation import TOLERANCE_DEG, rotation_goal
+from openvima.tasks.placing import TOLERANCE, TOLERANCE_DEG, rotation_goal
 from openvima.tasks.sweep_table import MAGNIFICATION
 from openvima.tasks.table import TableSampler
 

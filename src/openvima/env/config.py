@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
 from openvima.errors import ConfigError, echo
-from openvima.scene.command import PRIMITIVES, check_control
+from openvima.scene.action import PRIMITIVES, check_control
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts

@@ -47,7 +47,7 @@ from openvima.scene import (
     ZoneKeptClear,
     in_workspace,
 )
-from openvima.tasks.seeding import DOMAINS, checked_seed
+from openvima.tasks.sampling import DOMAINS, checked_seed
 
 MAX_EPISODE_BYTES = 256 * 1024  # sampled ones have 2 to 7 kB, a photo adds up to 10
 FORMATS = (".yaml", ".yml", ".json")

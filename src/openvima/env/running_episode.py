@@ -9,14 +9,14 @@ import numpy as np
 from openvima.catalog.geometry import Assets
 from openvima.errors import ActionError, brief_repr, echo
 from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
-from openvima.scene.command import END_EFFECTOR, PRIMITIVES, STAY, ToolCommand, steps_per_primitive
+from openvima.scene.action import END_EFFECTOR, PRIMITIVES, STAY, ToolCommand, steps_per_primitive
 from openvima.sim.tool_path import PathFollower, onward_path, tool_path
 from openvima.sim.tool_world import ToolWorld
 from openvima.sim.world import World
 from openvima.tasks import goals
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision
-from openvima.tasks.seeding import make_rng
+from openvima.tasks.sampling import make_rng
 
 
 class ObjectNames(Mapping[int, dict[str, str]]):

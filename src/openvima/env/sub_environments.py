@@ -14,9 +14,8 @@ from gymnasium.vector import AutoresetMode
 
 from openvima.errors import ActionError, ConfigError, EpisodeError
 from openvima.scene import ACTION_SHAPES, WORKSPACE_LOW, Action
-from openvima.scene.action import is_valid_batch
-from openvima.scene.command import COMMAND_NAMES, PRIMITIVES, ToolCommand
-from openvima.tasks.seeding import checked_seed
+from openvima.scene.action import COMMAND_NAMES, PRIMITIVES, ToolCommand, is_valid_batch
+from openvima.tasks.sampling import checked_seed
 
 RESET_MASK = "reset_mask"  # Gymnasium's option: which sub-environments to reset, shape (N,), bool
 

@@ -38,7 +38,7 @@ from openvima.scene import (
     RenderedPrompt,
     Scene,
 )
-from openvima.scene.command import (
+from openvima.scene.action import (
     COMMAND_HIGH,
     COMMAND_LOW,
     CONTROL_HZ,
@@ -52,8 +52,7 @@ from openvima.sim.ur5 import JOINT_LIMITS
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision, oracle_action
-from openvima.tasks.sampling import check_text_form
-from openvima.tasks.seeding import checked_seed, make_rng
+from openvima.tasks.sampling import check_text_form, checked_seed, make_rng
 
 IMAGE_SHAPE = (128, 256)  # rows, columns; the cameras are tuned for this size
 MODALITIES = ("rgb", "segm", "depth", "joints")

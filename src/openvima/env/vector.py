@@ -18,7 +18,7 @@ from openvima.env.sub_environments import RESET_MASK, ActionValidator, SubEnviro
 from openvima.env.tabletop import TabletopEnv
 from openvima.env.workers import AsyncTabletopEnvs
 from openvima.errors import ConfigError, OpenVimaError, echo, unknown_name
-from openvima.tasks.seeding import checked_seed
+from openvima.tasks.sampling import checked_seed
 
 
 def make_vec(

@@ -16,7 +16,7 @@ from openvima.evaluation.results import Row
 from openvima.evaluation.rollout_policies import Decision, Explainer, Observation, RolloutPolicy
 from openvima.input_files import open_regular
 from openvima.scene import ACTION_SHAPES, Action
-from openvima.scene.command import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES, ToolCommand
+from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES, ToolCommand
 
 ACTIONS_NAME = "actions.arrow"
 _WIDTHS = {PRIMITIVES: sum(ACTION_SHAPES.values()), END_EFFECTOR: len(COMMAND_NAMES)}  # in their order

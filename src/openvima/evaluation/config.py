@@ -32,11 +32,10 @@ from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import PolicySource, policy_sources
 from openvima.input_files import as_path, settle
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
-from openvima.scene.command import steps_per_primitive
+from openvima.scene.action import steps_per_primitive
 from openvima.serving.lerobot import lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
-from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
-from openvima.tasks.seeding import MAX_SEED
+from openvima.tasks.sampling import MAX_SEED, check_task_options, check_text_form, takes_prompts
 from openvima.user_code import is_code, with_absolute_path
 
 REFERENCE_POLICIES = (RANDOM, ORACLE)  # lower and upper bound

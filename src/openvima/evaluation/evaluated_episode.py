@@ -17,7 +17,7 @@ from openvima.evaluation.verification import recorded_env_config
 from openvima.policies.naming import BUNDLED, CHECKPOINTS_FOLDER, UNTRAINED
 from openvima.policies.presets import PRESETS
 from openvima.scene import Episode
-from openvima.scene.command import PRIMITIVES
+from openvima.scene.action import PRIMITIVES
 from openvima.user_code import is_code
 
 _SEED_DOMAIN = "eval"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from openvima.tasks.paraphrasing import Phrasings, read_phrasings, rephrased
+from openvima.tasks.prompts import Phrasings, read_phrasings, rephrased
 from openvima.tasks.registry import task_spec
 
 

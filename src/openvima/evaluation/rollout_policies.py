@@ -26,7 +26,7 @@ from openvima.policies.base import POLICIES_THAT_EXPLAIN, require_torch, torch_t
 from openvima.policies.loading import checked_policy
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene import Action
-from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand
+from openvima.scene.action import END_EFFECTOR, PRIMITIVES, ToolCommand
 from openvima.scene.explanation import PLACE_KINDS, Explanation
 from openvima.serving.client import RemotePolicy
 from openvima.user_code import described

@@ -13,7 +13,7 @@ from openvima.evaluation.sources import object_record
 from openvima.evaluation.versions import versions
 from openvima.input_files import names_of
 from openvima.policies.base import Policy
-from openvima.scene.command import PRIMITIVES
+from openvima.scene.action import PRIMITIVES
 
 
 def score(

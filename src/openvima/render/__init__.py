@@ -7,11 +7,12 @@ from openvima.render.camera import (
     VIEWS,
     Camera,
     View,
+    channels_first,
+    channels_last,
     points_from_depth,
     project,
     unproject,
 )
-from openvima.render.image_layout import channels_first, channels_last
 from openvima.render.labels import CELL_M, LABEL_SHAPE, cell_centres, empty_labels, label_raster, stamp
 from openvima.render.rasteriser import Drawable, Image, Rasteriser
 

@@ -1,4 +1,8 @@
-"""The two fixed cameras, and projection between world and pixels."""
+"""The two fixed cameras, projection between world and pixels, and the two layouts of images.
+
+Images are channels first from the rasteriser through observations and demonstrations to the networks. Shards,
+image files, video encoders and plots have them channels last.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -196,3 +200,13 @@ def points_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
 def _check_last_axis(name: str, array: np.ndarray, length: int) -> None:
     if array.shape[-1:] != (length,):
         raise ShapeError(f"{name} has shape {array.shape}; its last axis must have length {length}.")
+
+
+def channels_last(images: np.ndarray) -> np.ndarray:
+    """Return images of shape (..., C, H, W) as a view of shape (..., H, W, C)."""
+    return np.moveaxis(images, -3, -1)
+
+
+def channels_first(images: np.ndarray) -> np.ndarray:
+    """Return images of shape (..., H, W, C) as a view of shape (..., C, H, W)."""
+    return np.moveaxis(images, -1, -3)

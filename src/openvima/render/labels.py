@@ -10,8 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.render.indexed import KernelBuffers, indexed, matrix_3x4
-from openvima.render.kernels import stamp_triangles
+from openvima.render.kernels import KernelBuffers, indexed, matrix_3x4, stamp_triangles
 from openvima.scene import WORKSPACE_LOW, Placement, Scene
 
 CELL_M = 0.003125

@@ -10,10 +10,16 @@ import numpy as np
 
 from openvima.catalog.geometry import Assets, TriangleMesh
 from openvima.errors import ShapeError
-from openvima.render.camera import CAMERAS, VIEWS, Camera, View
-from openvima.render.image_layout import channels_last
-from openvima.render.indexed import IndexedMesh, KernelBuffers, indexed, magnified, matrix_3x4
-from openvima.render.kernels import MICROMETRES, draw_triangles
+from openvima.render.camera import CAMERAS, VIEWS, Camera, View, channels_last
+from openvima.render.kernels import (
+    MICROMETRES,
+    IndexedMesh,
+    KernelBuffers,
+    draw_triangles,
+    indexed,
+    magnified,
+    matrix_3x4,
+)
 from openvima.scene import (
     BACKGROUND_ID,
     FLOOR_ID,

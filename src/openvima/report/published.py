@@ -7,7 +7,7 @@ from functools import cache
 from importlib import resources
 
 from openvima.evaluation.results import Results
-from openvima.scene.command import PRIMITIVES
+from openvima.scene.action import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 
 # The only model whose success by task was published for all levels.

@@ -1,19 +1,24 @@
 """Frozen dataclasses: poses, scenes, prompts, goals, episodes, actions."""
 
 from openvima.scene.action import ACTION_SHAPES, Action
-from openvima.scene.constraint import (
+from openvima.scene.episode import COMPOSED, HOST_TASK, Episode, Outcome, Problem
+from openvima.scene.goal import (
+    AtPose,
+    Condition,
     Constraint,
     DistractorsApart,
     EveryStepCounts,
+    Goal,
     InOrder,
+    InZone,
     NeverTouches,
     StepConstraint,
     StepContext,
+    Tolerance,
+    Zone,
     ZoneKeptClear,
+    block_points,
 )
-from openvima.scene.episode import COMPOSED, HOST_TASK, Episode, Outcome, Problem
-from openvima.scene.goal import AtPose, Condition, Goal, InZone, Tolerance, Zone, block_points
-from openvima.scene.pose import Pose, angle_difference
 from openvima.scene.prompt import (
     ObjectImage,
     ObjectRecord,
@@ -34,7 +39,9 @@ from openvima.scene.scene import (
     WORKSPACE_LOW,
     EndEffector,
     Placement,
+    Pose,
     Scene,
+    angle_difference,
     in_workspace,
 )
 

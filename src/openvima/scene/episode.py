@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from openvima.errors import SceneError, brief_repr
 from openvima.html import notebook_html
-from openvima.scene.constraint import Constraint
-from openvima.scene.goal import AtPose, Goal, is_condition
+from openvima.scene.goal import AtPose, Constraint, Goal, is_condition
 from openvima.scene.prompt import Prompt
 from openvima.scene.scene import Scene
 
@@ -21,7 +20,7 @@ class Problem:
         scene: All objects at their start, at rest.
         prompt: The prompt.
         goals: The goals, in the order of the oracle unless it may choose; anything with `is_met(scene)`.
-        constraints: The constraints, in the order of their tests; those of `scene.constraint`, or anything
+        constraints: The constraints, in the order of their tests; those of `scene.goal`, or anything
             with `is_met(scene)`.
         stages: Sizes of groups of consecutive goals. After a step only goals of the first group with an open
             one are tested, so a step never completes goals of two groups. Empty: all goals are one group.

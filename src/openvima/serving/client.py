@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 from openvima.errors import MessageError, PolicyError, ServerError, echo
 from openvima.policies.base import Policy
 from openvima.scene import RenderedPrompt
-from openvima.scene.command import PRIMITIVES
+from openvima.scene.action import PRIMITIVES
 from openvima.serving.protocol import (
     DEFAULT_MODALITIES,
     PROTOCOL,

@@ -19,7 +19,7 @@ from openvima.imports import import_extra
 from openvima.policies.naming import SERVER_SCHEMES
 from openvima.render.camera import VIEWS
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
-from openvima.scene.command import COMMAND_NAMES, CONTROLS, END_EFFECTOR, PRIMITIVES
+from openvima.scene.action import COMMAND_NAMES, CONTROLS, END_EFFECTOR, PRIMITIVES
 
 DTYPES = {
     dtype.str: dtype

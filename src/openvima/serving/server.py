@@ -23,7 +23,7 @@ from openvima.errors import ConfigError, MessageError, OpenVimaError, echo, unkn
 from openvima.policies.base import Policy, PromptLimits
 from openvima.policies.loading import checked_policy
 from openvima.scene import RenderedPrompt
-from openvima.scene.command import PRIMITIVES
+from openvima.scene.action import PRIMITIVES
 from openvima.serving.protocol import (
     DEFAULT_MODALITIES,
     MAX_LENGTH,

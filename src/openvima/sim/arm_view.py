@@ -13,8 +13,16 @@ import numpy as np
 from openvima.catalog.geometry import TriangleMesh, Vector3
 from openvima.render.rasteriser import Drawable
 from openvima.scene import EndEffector, Pose
-from openvima.sim.end_effectors import PROBE_BELOW_TIP_M, SPATULA_BELOW_TIP_M, SPATULA_HALF_SIZE_M
-from openvima.sim.ur5 import FLANGE_M, FOREARM_M, TOOL_M, UPPER_ARM_M, link_frames
+from openvima.sim.ur5 import (
+    FLANGE_M,
+    FOREARM_M,
+    PROBE_BELOW_TIP_M,
+    SPATULA_BELOW_TIP_M,
+    SPATULA_HALF_SIZE_M,
+    TOOL_M,
+    UPPER_ARM_M,
+    link_frames,
+)
 
 _LIGHT = (204, 204, 204)
 _DARK = (51, 51, 51)

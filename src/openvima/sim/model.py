@@ -24,7 +24,7 @@ import numpy as np
 
 from openvima.catalog.geometry import CollisionBox, CollisionShape, Geometry, Vector3
 from openvima.catalog.objects import ObjectSpec, object_spec
-from openvima.sim.end_effectors import PROBE_RADIUS_M, SPATULA_HALF_SIZE_M
+from openvima.sim.ur5 import PROBE_RADIUS_M, SPATULA_HALF_SIZE_M
 
 # By default MuJoCo writes warnings to a file in the working directory.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)

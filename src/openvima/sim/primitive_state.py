@@ -1,14 +1,166 @@
-"""State of one primitive: bodies, arm and monitor."""
+"""State of one primitive: bodies, monitor, settling, and the path of the arm with frames for a video."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+
+import numpy as np
 
 from openvima.scene import Placement, Pose, Scene
-from openvima.sim import settling
-from openvima.sim.arm_path import ArmPath
-from openvima.sim.bodies import Bodies
-from openvima.sim.contacts import body_gap
-from openvima.sim.model import FLOOR_Z_M
+from openvima.sim.bodies import Bodies, body_gap
+from openvima.sim.model import FLOOR_Z_M, TICK_S
+from openvima.sim.ur5 import REACH_RESERVE_M, highest_tip_z, inverse
+
+SETTLED_SPEED = 5e-3  # m/s, as in VIMA-Bench
+SETTLED_TURNING = 0.05  # rad/s: a body that topples rotates before its centre moves
+SETTLE_LIMIT_TICKS = 1000
+MONITOR_TICKS = 25  # interval of constraint checks
+STRIDE_TICKS = 5  # interval of speed checks; divides MONITOR_TICKS
+_QUIET_STRIDES = 2  # consecutive, so that a body that reverses its motion does not count as settled
+
+
+class Settling:
+    """Physics until every free body has been slow for 10 ticks, or the limit is reached.
+
+    Args:
+        bodies: The bodies.
+        apart_from: Index of a body to ignore, such as a parked one.
+        max_speed: Bound of the horizontal speed in m/s, for bodies that overlap at the start.
+        sleeping: See `Bodies.tick`.
+    """
+
+    def __init__(
+        self,
+        bodies: Bodies,
+        *,
+        apart_from: int | None = None,
+        max_speed: float | None = None,
+        sleeping: Collection[int] = (),
+    ) -> None:
+        self._bodies = bodies
+        self._apart_from = apart_from
+        self._max_speed = max_speed
+        self._sleeping = sleeping
+        self._quiet = 0
+        self.num_ticks = 0
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether every body has been slow for long enough."""
+        return self._quiet >= _QUIET_STRIDES
+
+    @property
+    def is_over(self) -> bool:
+        """Whether everything is at rest, or the limit is reached."""
+        return self.is_at_rest or self.num_ticks >= SETTLE_LIMIT_TICKS
+
+    def run(self, num_ticks: int = STRIDE_TICKS) -> None:
+        """Run one stride; where it is the last one, stop all bodies."""
+        before = self._bodies.coordinates()
+        self._bodies.tick(num_ticks, sleeping=self._sleeping)
+        if self._max_speed is not None:
+            self._bodies.limit_speed(self._max_speed)
+        self.num_ticks += num_ticks
+        speed, turning = self._bodies.mean_speeds(before, num_ticks * TICK_S, apart_from=self._apart_from)
+        is_slow = speed < SETTLED_SPEED and turning < SETTLED_TURNING
+        self._quiet = self._quiet + 1 if is_slow else 0
+        if self.is_over:
+            self._bodies.stop()
+            self._bodies.refresh()
+
+
+FREE_SPEED = 2.4  # rad/s, Euclidean norm over the joints, as in VIMA-Bench
+SWEEP_SPEED = 0.48
+
+RecordFrame = Callable[[Scene, np.ndarray], None]
+
+
+def reachable_joints(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
+    """Joint angles, shape (6,), for a tip above (x, y), at height `z` or as high as the arm reaches.
+
+    Far from the base the arm does not reach its hover height with the tool vertical.
+
+    Raises:
+        ReachError: The arm does not reach (x, y) at any height.
+    """
+    return inverse(x, y, min(z, highest_tip_z(x, y) - REACH_RESERVE_M), yaw_rad)
+
+
+class ArmPath:
+    """The path of the arm during one primitive.
+
+    Frames are computed only with a recorder.
+
+    Args:
+        joints: Joint angles at the start, shape (6,), radians.
+        record: Called with scene and joints for every video frame, or None.
+        frames_per_second: Frame rate of the video.
+    """
+
+    def __init__(self, joints: np.ndarray, record: RecordFrame | None, frames_per_second: float) -> None:
+        self.waypoints = [np.array(joints, dtype=np.float64)]
+        self._record = record
+        self._frame_s = 1 / frames_per_second
+        self._since_frame_s = 0.0
+        self._stored: list[Scene] = []
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Current joint angles, shape (6,), radians."""
+        return self.waypoints[-1]
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether frames are recorded."""
+        return self._record is not None
+
+    def move(
+        self, joints: np.ndarray, *, scene: Callable[[np.ndarray], Scene], speed: float = FREE_SPEED
+    ) -> None:
+        """Move in a straight line in joint space.
+
+        Args:
+            joints: Target joint angles, shape (6,), radians.
+            scene: Returns the scene for the joints of a frame; stored scenes come first.
+            speed: In rad/s, Euclidean norm over the joints.
+        """
+        start = self.joints
+        self.waypoints.append(joints)
+        if self._record is None:
+            return
+        duration_s = max(math.dist(joints, start) / speed, 1e-9)
+        stored, self._stored = self._stored, []
+        now = start
+        for time_s in self._frame_times(duration_s):
+            now = start + (joints - start) * (time_s / duration_s)
+            self._record(stored.pop(0) if stored else scene(now), now)
+        for late in stored:
+            self._record(late, joints)
+
+    def stay(self, num_ticks: int, *, scene: Callable[[], Scene], joints: Callable[[], np.ndarray]) -> None:
+        """Record the frames of some physics ticks, with the arm at `joints()`."""
+        for _ in self._frame_times(num_ticks * TICK_S):
+            if self._record is not None:
+                self._record(scene(), joints())
+
+    def store(self, num_ticks: int, *, scene: Callable[[], Scene]) -> None:
+        """Store the frames of some physics ticks for the arm's next move, which happens meanwhile."""
+        for _ in self._frame_times(num_ticks * TICK_S):
+            self._stored.append(scene())
+
+    def array(self) -> np.ndarray:
+        """Waypoints, shape (W, 6), float32, radians."""
+        return np.array(self.waypoints, dtype=np.float32)
+
+    def _frame_times(self, duration_s: float) -> Iterator[float]:
+        """Times within the coming `duration_s` seconds at which a frame is due."""
+        if self._record is None:
+            return
+        due_s = self._frame_s - self._since_frame_s
+        count = max(0, math.floor((duration_s - due_s) / self._frame_s + 1e-9) + 1)
+        self._since_frame_s += duration_s - count * self._frame_s
+        for index in range(count):
+            yield due_s + index * self._frame_s
+
 
 RESTING_GAP_M = 5e-4  # bodies nearer than this may support each other
 LEVEL_RAD = 0.03  # the pan rests tilted by 0.01
@@ -52,7 +204,7 @@ class PrimitiveState:
         """Count up to `STRIDE_TICKS` physics ticks, and call the monitor when it is due."""
         self.num_ticks += num_ticks
         self._unmonitored_ticks += num_ticks
-        is_time = self._unmonitored_ticks + settling.STRIDE_TICKS > settling.MONITOR_TICKS
+        is_time = self._unmonitored_ticks + STRIDE_TICKS > MONITOR_TICKS
         if is_time and self._monitor is not None:
             self._unmonitored_ticks = 0
             self._monitor(self.scene(held))
@@ -71,16 +223,13 @@ class PrimitiveState:
         sleeping: Collection[int] = (),
     ) -> None:
         """Run physics until everything is at rest; the arm's next move happens meanwhile."""
-
-        def each(num_ticks: int) -> None:
-            self.count_ticks(num_ticks, held)
-            self.path.store(num_ticks, scene=lambda: self.scene(held))
-
-        held_index = held[0] if held else None
-        _, completed = settling.settle(
-            self.bodies, apart_from=held_index, max_speed=max_speed, sleeping=sleeping, each=each
-        )
-        self.completed = self.completed and completed
+        apart_from = held[0] if held else None
+        settling = Settling(self.bodies, apart_from=apart_from, max_speed=max_speed, sleeping=sleeping)
+        while not settling.is_over:
+            settling.run()
+            self.count_ticks(STRIDE_TICKS, held)
+            self.path.store(STRIDE_TICKS, scene=lambda: self.scene(held))
+        self.completed = self.completed and settling.is_at_rest
 
     def finish(self) -> Scene:
         """Reset bodies that hardly moved; monitor and return the final scene."""

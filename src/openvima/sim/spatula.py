@@ -10,13 +10,21 @@ import numpy as np
 
 from openvima.catalog.geometry import Vector3
 from openvima.scene import Pose
-from openvima.scene.pose import rotate
-from openvima.sim import end_effectors as tools
-from openvima.sim import settling, ur5
-from openvima.sim.arm_path import SWEEP_SPEED, reachable_joints
-from openvima.sim.contacts import distance_to_contact
+from openvima.scene.scene import rotate
+from openvima.sim import ur5
+from openvima.sim.bodies import distance_to_contact
 from openvima.sim.model import TICK_S
-from openvima.sim.primitive_state import PrimitiveState
+from openvima.sim.primitive_state import (
+    MONITOR_TICKS,
+    SETTLE_LIMIT_TICKS,
+    SETTLED_SPEED,
+    SETTLED_TURNING,
+    STRIDE_TICKS,
+    SWEEP_SPEED,
+    PrimitiveState,
+    Settling,
+    reachable_joints,
+)
 
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
 MAX_SPEED = 0.5  # m/s, of bodies squeezed out between the spatula and a fixed body
@@ -27,7 +35,7 @@ CARRIED_ROTATION_RAD = 0.02  # … than this …
 _CARRIED_STRIDES = 4  # … in so many strides of physics are carried
 _MAX_CARRY_M = 0.2  # then physics runs again, to catch slow slipping
 _MIN_CARRY_M = 0.003  # the contact query costs as much as a few ticks
-_STRIDE_M = MAX_SPEED * settling.STRIDE_TICKS * TICK_S  # no body moves farther in a stride …
+_STRIDE_M = MAX_SPEED * STRIDE_TICKS * TICK_S  # no body moves farther in a stride …
 _SLIDE_M = 0.045  # … or slides farther at friction 0.3
 _LOW_TIP_Z_M = 0.035  # the spatula's edge is then just above the blocks
 _PATH_STEP_M = 0.004  # length of the straight segments of a joint-space path
@@ -52,7 +60,7 @@ class Spatula:
         self._bodies = state.bodies
         self._yaw_rad = yaw_rad
         self._in_joint_space = in_joint_space
-        self._tip: Vector3 = (0.0, 0.0, tools.SWEEP_HOVER_TIP_Z_M)
+        self._tip: Vector3 = (0.0, 0.0, ur5.SWEEP_HOVER_TIP_Z_M)
         self._recent: list[tuple[np.ndarray, Vector3]] = []  # coordinates and tip before the last strides
         self._sleeping = set(() if awake else state.bodies.rigid)  # at rest, and far from all that moves
         self._pushed = tuple(geom for index in state.bodies.rigid for geom in state.bodies.geoms(index))
@@ -60,8 +68,8 @@ class Spatula:
     def lower(self, x: float, y: float) -> None:
         """Lower the spatula at a point and displace bodies there."""
         path, scene = self._state.path, self._state.start
-        hover = self._joints_at(x, y, tools.SWEEP_HOVER_TIP_Z_M)
-        down = self._joints_at(x, y, tools.SWEEP_TIP_Z_M)
+        hover = self._joints_at(x, y, ur5.SWEEP_HOVER_TIP_Z_M)
+        down = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
         path.move(hover, scene=lambda _: scene)
         path.move(down, scene=lambda _: scene)
         way = (
@@ -69,7 +77,7 @@ class Spatula:
             if self._in_joint_space
             else []
         )
-        self._tip, *rest = [*way, (x, y, tools.SWEEP_TIP_Z_M)]
+        self._tip, *rest = [*way, (x, y, ur5.SWEEP_TIP_Z_M)]
         in_the_way = [index for index in self._bodies.rigid if self._displace(index)]
         if in_the_way:
             self._wait()
@@ -78,15 +86,15 @@ class Spatula:
 
     def push(self, x: float, y: float) -> None:
         """Move the lowered spatula to a point."""
-        target = self._joints_at(x, y, tools.SWEEP_TIP_Z_M)
+        target = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
         for point in _joint_space_path(self._joints(), target) if self._in_joint_space else []:
             self._push_to(point)
-        self._push_to((x, y, tools.SWEEP_TIP_Z_M))
+        self._push_to((x, y, ur5.SWEEP_TIP_Z_M))
         self._state.path.waypoints.append(target)
 
     def engage(self, x: float, y: float) -> None:
         """Press the spatula to the table where it is, displacing bodies there."""
-        self._tip = (x, y, tools.SWEEP_TIP_Z_M)
+        self._tip = (x, y, ur5.SWEEP_TIP_Z_M)
         for index in self._bodies.rigid:
             self._displace(index)
 
@@ -94,24 +102,24 @@ class Spatula:
         """Move the pressed spatula with physics, to a pose that it reaches after some ticks."""
         time_s = num_ticks * TICK_S
         dx, dy, turn = x - self._tip[0], y - self._tip[1], yaw_rad - self._yaw_rad
-        for done in range(0, num_ticks, settling.STRIDE_TICKS):
-            ticks = min(settling.STRIDE_TICKS, num_ticks - done)
+        for done in range(0, num_ticks, STRIDE_TICKS):
+            ticks = min(STRIDE_TICKS, num_ticks - done)
             self._run(ticks, (dx / time_s, dy / time_s, 0.0), turn / time_s)
             share = ticks / num_ticks
             self._tip = _moved(self._tip, (dx, dy, 0.0), share)
             self._yaw_rad += turn * share
         self._tip, self._yaw_rad = (x, y, self._tip[2]), yaw_rad
 
-    def release(self) -> settling.Settling:
+    def release(self) -> Settling:
         """Take the spatula off the table; return the settling of the bodies that it moved."""
         self._bodies.park_spatula()
         self._wake(_SLIDE_M)
-        return settling.Settling(self._bodies, max_speed=MAX_SPEED, sleeping=self._sleeping)
+        return Settling(self._bodies, max_speed=MAX_SPEED, sleeping=self._sleeping)
 
     def lift(self) -> None:
         """Lift the spatula and let everything settle."""
         state = self._state
-        hover = self._joints_at(self._tip[0], self._tip[1], tools.SWEEP_HOVER_TIP_Z_M)
+        hover = self._joints_at(self._tip[0], self._tip[1], ur5.SWEEP_HOVER_TIP_Z_M)
         for point in _joint_space_path(self._joints(), hover) if self._in_joint_space else []:
             if point[2] > _LOW_TIP_Z_M:
                 break
@@ -129,11 +137,11 @@ class Spatula:
         Squeezed between spatula and floor, the physics would fling it away; VIMA-Bench nudges it.
         """
         pose, spatula = self._bodies.pose(index), self._pose()
-        reach = self._bodies.shapes[index].radius_m + tools.SPATULA_HALF_SIZE_M[1]
+        reach = self._bodies.shapes[index].radius_m + ur5.SPATULA_HALF_SIZE_M[1]
         if pose.planar_distance(spatula) > math.sqrt(2) * reach:
             return False
         corners = spatula.inverse().transform(pose.transform(self._bodies.shapes[index].points[:, :3]))
-        half = np.array(tools.SPATULA_HALF_SIZE_M)
+        half = np.array(ur5.SPATULA_HALF_SIZE_M)
         low, high = corners.min(axis=0) - half, corners.max(axis=0) + half  # body grown by the spatula
         if (low[:2] >= 0).any() or (high[:2] <= 0).any():
             return False
@@ -145,8 +153,8 @@ class Spatula:
 
     def _wait(self) -> None:
         """Run physics with the spatula at rest until everything is at rest."""
-        for _ in range(settling.SETTLE_LIMIT_TICKS // settling.STRIDE_TICKS):
-            self._run(settling.STRIDE_TICKS, (0.0, 0.0, 0.0))
+        for _ in range(SETTLE_LIMIT_TICKS // STRIDE_TICKS):
+            self._run(STRIDE_TICKS, (0.0, 0.0, 0.0))
             if self._is_calm():
                 return
 
@@ -158,7 +166,7 @@ class Spatula:
                 left = self._move_freely(direction, left)
             elif left > _MIN_CARRY_M and (carried := self._carried_bodies()) is not None:
                 left -= self._carry(carried, direction, min(left, _MAX_CARRY_M))
-            ticks = min(settling.STRIDE_TICKS, max(1, math.ceil(left / (SWEEP_M_S * TICK_S) - 1e-9)))
+            ticks = min(STRIDE_TICKS, max(1, math.ceil(left / (SWEEP_M_S * TICK_S) - 1e-9)))
             way = min(left, ticks * SWEEP_M_S * TICK_S)
             if way > 0:
                 self._push_with_physics(direction, way, ticks)
@@ -201,7 +209,7 @@ class Spatula:
         if way < _MIN_CARRY_M:
             return 0.0
         self._state.notify()
-        left, longest = way, settling.MONITOR_TICKS * SWEEP_M_S * TICK_S
+        left, longest = way, MONITOR_TICKS * SWEEP_M_S * TICK_S
         while left > 0:
             piece = min(left, longest)
             self._bodies.shift(carried, _moved((0.0, 0.0, 0.0), direction, piece))
@@ -257,7 +265,7 @@ class Spatula:
             for index, (x, y) in zip(bodies.rigid, bodies.coordinates()[:, :2].tolist(), strict=True)
         }
         awake = [circles[index] for index in bodies.rigid if index not in self._sleeping]
-        awake.append((*self._tip[:2], tools.SPATULA_HALF_SIZE_M[1]))
+        awake.append((*self._tip[:2], ur5.SPATULA_HALF_SIZE_M[1]))
         while awake:
             x, y, reach = awake.pop()
             for index in tuple(self._sleeping):
@@ -278,7 +286,7 @@ class Spatula:
 
     def _is_calm(self) -> bool:
         speed, turning = self._bodies.speeds()
-        return speed < settling.SETTLED_SPEED and turning < settling.SETTLED_TURNING
+        return speed < SETTLED_SPEED and turning < SETTLED_TURNING
 
     def _joints(self) -> np.ndarray:
         return self._joints_at(*self._tip)
@@ -288,7 +296,7 @@ class Spatula:
 
     def _pose(self) -> Pose:
         x, y, tip_z = self._tip
-        return Pose.planar(x, y, self._yaw_rad, z=tools.spatula_centre_z(tip_z))
+        return Pose.planar(x, y, self._yaw_rad, z=ur5.spatula_centre_z(tip_z))
 
 
 def _direction(start: Vector3, end: Vector3, distance: float) -> Vector3:

@@ -5,11 +5,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from openvima.scene import Action, EndEffector, Pose
-from openvima.scene.command import MAX_MOVE_M, MAX_TURN_RAD, STAY, ToolCommand, ToolPose
-from openvima.scene.pose import angle_difference
-from openvima.sim import end_effectors as tools
-from openvima.sim.primitives import SweepPlan, sweep_plan
+from openvima.scene.action import MAX_MOVE_M, MAX_TURN_RAD, STAY, ToolCommand, ToolPose
+from openvima.scene.scene import angle_difference
+from openvima.sim import ur5
 from openvima.sim.tool_world import PRESS_WITHIN_M, ToolWorld
+from openvima.sim.world import SweepPlan, sweep_plan
 
 _REACHED = 1e-6  # m and rad
 _NEAR_M = 0.02  # from where a path is taken up, rather than begun anew
@@ -46,7 +46,7 @@ def tool_path(action: Action, end_effector: EndEffector, *, compat: bool = False
     if end_effector == "spatula":
         plan = sweep_plan(action, compat=compat)
         return [] if plan is None else _sweep(plan)
-    hover = tools.HOVER_TIP_Z_M
+    hover = ur5.HOVER_TIP_Z_M
     pick = ToolPose(*action.pose0_position, hover, action.yaw0_rad)
     return _pick_and_place(pick, ToolPose(*action.pose1_position, hover, action.yaw1_rad))
 
@@ -65,7 +65,7 @@ def onward_path(action: Action, object_id: int, world: ToolWorld, *, compat: boo
     """
     pose, tool = world.pose, world.scene.end_effector
     if world.is_moving and not world.holds:
-        return [Waypoint(replace(pose, z=tools.HOVER_TIP_Z_M), tool=False)]
+        return [Waypoint(replace(pose, z=ur5.HOVER_TIP_Z_M), tool=False)]
     if tool == "spatula":
         plan = sweep_plan(action, compat=compat)
         return [] if plan is None else _sweep(plan)[_passed(plan, world) :]
@@ -74,7 +74,7 @@ def onward_path(action: Action, object_id: int, world: ToolWorld, *, compat: boo
         above, *rest = path
         return rest if _is_above(above.pose, pose) else [_approach(above, pose), *rest]
     place = _carried(world.grasp, action) if world.grasped == object_id else pose
-    path = _pick_and_place(pose, replace(place, z=tools.HOVER_TIP_Z_M))[2:]
+    path = _pick_and_place(pose, replace(place, z=ur5.HOVER_TIP_Z_M))[2:]
     if _is_above(place, pose):
         return path[3 if world.is_down else 2 :]
     lift, above, *rest = path
@@ -104,7 +104,7 @@ def _pick_and_place(pick: ToolPose, place: ToolPose) -> list[Waypoint]:
 
 def _sweep(plan: SweepPlan) -> list[Waypoint]:
     yaw_rad = math.remainder(plan.yaw_rad, math.pi)  # both faces of the spatula are alike
-    hover, low = tools.SWEEP_HOVER_TIP_Z_M, tools.SWEEP_TIP_Z_M
+    hover, low = ur5.SWEEP_HOVER_TIP_Z_M, ur5.SWEEP_TIP_Z_M
     return [
         Waypoint(ToolPose(*plan.start, hover, yaw_rad), tool=False),
         Waypoint(ToolPose(*plan.start, low, yaw_rad), tool=False),
@@ -140,7 +140,7 @@ def _passed(plan: SweepPlan, world: ToolWorld) -> int:
         return 0
     if world.holds:
         return 3
-    return 2 if pose.z < tools.SWEEP_TIP_Z_M + PRESS_WITHIN_M else 1
+    return 2 if pose.z < ur5.SWEEP_TIP_Z_M + PRESS_WITHIN_M else 1
 
 
 class PathFollower:

@@ -9,24 +9,27 @@ import numpy as np
 from openvima.catalog.geometry import Assets
 from openvima.errors import ReachError
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Pose, Scene
-from openvima.scene.command import CONTROL_HZ, HIGHEST_TIP_Z_M, ToolCommand, ToolPose
-from openvima.sim import end_effectors as tools
+from openvima.scene.action import CONTROL_HZ, HIGHEST_TIP_Z_M, ToolCommand, ToolPose
 from openvima.sim import ur5
-from openvima.sim.arm_path import ArmPath, RecordFrame
 from openvima.sim.bodies import Bodies
 from openvima.sim.model import FLOOR_Z_M, TICK_S
-from openvima.sim.primitive_state import PrimitiveState, is_at_rest
-from openvima.sim.primitives import HeldBody, body_under_probe, take_out
-from openvima.sim.settling import STRIDE_TICKS, Settling
+from openvima.sim.primitive_state import (
+    STRIDE_TICKS,
+    ArmPath,
+    PrimitiveState,
+    RecordFrame,
+    Settling,
+    is_at_rest,
+)
 from openvima.sim.spatula import SWEEP_M_S, Spatula
-from openvima.sim.world import SEPARATION_SPEED
+from openvima.sim.world import SEPARATION_SPEED, HeldBody, body_under_probe, take_out
 
 MAX_JOINT_SPEED = math.pi  # rad/s, of every joint, as in the UR5's data sheet
 PRESS_WITHIN_M = 0.01  # the spatula is pressed to the table from at most this height above its lowest
-_MARGIN_M = tools.SPATULA_RUN_UP_M  # by which the tool leaves the workspace
+_MARGIN_M = ur5.SPATULA_RUN_UP_M  # by which the tool leaves the workspace
 _NUM_PARTS = 3  # of a command, in each of which contacts are tested; also the video frames of 1/30 s
 _PART_TICKS = round(1 / (CONTROL_HZ * _NUM_PARTS * TICK_S))
-_LOWEST_CUP_Z_M = FLOOR_Z_M + tools.PROBE_BELOW_TIP_M
+_LOWEST_CUP_Z_M = FLOOR_Z_M + ur5.PROBE_BELOW_TIP_M
 _TOUCH_M = 5e-4  # the cup grasps what is this near below it
 _BISECTIONS = 12
 _ROUNDING_M = 1e-9  # of the greatest height that the arm reaches
@@ -150,16 +153,16 @@ class ToolWorld:
         """Grasp the body below the cup, or press the spatula to the table, if it is near enough."""
         pose, state = self._pose, self._state or self._new_state(monitor)
         if self._scene.end_effector == "spatula":
-            if pose.z > tools.SWEEP_TIP_Z_M + PRESS_WITHIN_M:
+            if pose.z > ur5.SWEEP_TIP_Z_M + PRESS_WITHIN_M:
                 return
             awake = self._settling is not None
             self._state, self._settling = state, None
-            self._go(replace(pose, z=tools.SWEEP_TIP_Z_M))
+            self._go(replace(pose, z=ur5.SWEEP_TIP_Z_M))
             self._spatula = Spatula(state, pose.yaw_rad, awake=awake)
             self._spatula.engage(pose.x, pose.y)
             return
         caught, surface_z = body_under_probe(self._bodies, pose.x, pose.y)
-        if caught not in self._bodies.rigid or pose.z > surface_z + tools.PROBE_BELOW_TIP_M + _TOUCH_M:
+        if caught not in self._bodies.rigid or pose.z > surface_z + ur5.PROBE_BELOW_TIP_M + _TOUCH_M:
             return
         self._state = state
         self._held = HeldBody(caught, self._bodies.pose(caught), pose)
@@ -231,8 +234,8 @@ class ToolWorld:
 
     def _within_height(self, x: float, y: float, z: float) -> float:
         """The nearest height at which the tool may be above a point."""
-        highest = min(HIGHEST_TIP_Z_M, ur5.highest_tip_z(x, y) - tools.REACH_RESERVE_M)
-        lowest = tools.SWEEP_TIP_Z_M if self._scene.end_effector == "spatula" else _LOWEST_CUP_Z_M
+        highest = min(HIGHEST_TIP_Z_M, ur5.highest_tip_z(x, y) - ur5.REACH_RESERVE_M)
+        lowest = ur5.SWEEP_TIP_Z_M if self._scene.end_effector == "spatula" else _LOWEST_CUP_Z_M
         return max(min(z, highest), lowest)
 
     def _can_reach(self, pose: ToolPose) -> bool:
@@ -265,7 +268,7 @@ class ToolWorld:
         """Height of the tip at which the cup, or the held body, lowered at a pose comes into contact."""
         held = self._held
         if held is None:
-            return body_under_probe(self._bodies, pose.x, pose.y)[1] + tools.PROBE_BELOW_TIP_M
+            return body_under_probe(self._bodies, pose.x, pose.y)[1] + ur5.PROBE_BELOW_TIP_M
         set_down_at, _ = held.lowest(self._bodies, pose.x, pose.y, pose.yaw_rad)
         self._bodies.park(held.index)
         return held.grasp.z + set_down_at.z - held.carried(pose.x, pose.y, pose.yaw_rad).z

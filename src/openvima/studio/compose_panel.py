@@ -16,7 +16,7 @@ from openvima.env.episode_file import load_episode, save_episode
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
-from openvima.scene.pose import quaternion_yaw
+from openvima.scene.scene import quaternion_yaw
 from openvima.studio.browser_session import BrowserSession, hit_of, move
 
 _GIZMO, _REFUSED = "/compose/gizmo", "refused"

@@ -18,7 +18,7 @@ from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, Pose
 from openvima.scene.explanation import Explanation
 from openvima.studio.browser_session import YOU, BrowserSession, Table, clicked_action, hit_of, pose_after
 from openvima.tasks import list_tasks, sample_episode, task_spec
-from openvima.tasks.seeding import MAX_SEED
+from openvima.tasks.sampling import MAX_SEED
 from openvima.video.explanation import (
     HEAT_COLOURS,
     LEAST_SHOWN,

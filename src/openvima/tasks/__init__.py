@@ -3,8 +3,7 @@
 from openvima.tasks.goals import Progress, advance, begin, monitor
 from openvima.tasks.oracle import OracleDecision, oracle_action
 from openvima.tasks.registry import TaskSpec, list_tasks, register_task, task_spec
-from openvima.tasks.sampling import sample_episode
-from openvima.tasks.seeding import DOMAINS, make_rng
+from openvima.tasks.sampling import DOMAINS, make_rng, sample_episode
 from openvima.tasks.table import TableSampler
 
 __all__ = [

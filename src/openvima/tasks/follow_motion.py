@@ -12,15 +12,15 @@ import math
 from itertools import accumulate
 
 from openvima.scene import EveryStepCounts, ObjectImage, Placement, Pose, Problem, Prompt
-from openvima.tasks.frames import (
+from openvima.tasks.options import check_num_distractors
+from openvima.tasks.registry import register_task
+from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
     checked_num_frames,
     frame_images,
     goals_between,
     with_frame_slots,
 )
-from openvima.tasks.options import check_num_distractors
-from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Follow this motion for {dragged_obj}: {frames}."

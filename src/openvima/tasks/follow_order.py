@@ -13,7 +13,9 @@ import itertools
 from collections.abc import Iterator
 
 from openvima.scene import WORKSPACE_LOW, EveryStepCounts, Placement, Pose, Problem, Prompt
-from openvima.tasks.frames import (
+from openvima.tasks.options import check_count, check_num_distractors
+from openvima.tasks.registry import register_task
+from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
     Frame,
     checked_num_frames,
@@ -21,8 +23,6 @@ from openvima.tasks.frames import (
     goals_between,
     with_frame_slots,
 )
-from openvima.tasks.options import check_count, check_num_distractors
-from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Stack objects in this order {frames}."

@@ -10,15 +10,16 @@ Source:   VIMA paper, task list of the appendix, "Novel adjective".
 from collections.abc import Sequence
 
 from openvima.scene import Problem, Prompt
-from openvima.tasks.comparisons import (
+from openvima.tasks.novel_words import (
+    ADJECTIVES,
     MEANINGS,
     NUM_COMPARISONS,
     comparison_text,
+    gray_image,
     place_base_and_pair,
     sample_adjective_example,
 )
-from openvima.tasks.into_base import into_base
-from openvima.tasks.novel_words import ADJECTIVES, gray_image
+from openvima.tasks.placing import into_base
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 

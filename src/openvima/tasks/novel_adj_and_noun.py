@@ -11,15 +11,19 @@ Source:   VIMA paper, task list of the appendix, "Novel adjective and noun".
 from collections.abc import Sequence
 
 from openvima.scene import Problem, Prompt
-from openvima.tasks.comparisons import (
+from openvima.tasks.novel_words import (
+    ADJECTIVES,
     MEANINGS,
+    NOUNS,
     NUM_COMPARISONS,
+    choose_words,
     comparison_text,
+    gray_image,
+    in_any_order,
     place_base_and_pair,
     sample_adjective_example,
 )
-from openvima.tasks.into_base import into_base
-from openvima.tasks.novel_words import ADJECTIVES, NOUNS, choose_words, gray_image, in_any_order
+from openvima.tasks.placing import into_base
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 

@@ -10,9 +10,9 @@ Source:   VIMA paper, task list of the appendix, "Novel noun".
 from collections.abc import Sequence
 
 from openvima.scene import Problem, Prompt
-from openvima.tasks.into_base import into_base, of_a_third_shape, place_base_and_target, place_distractors
 from openvima.tasks.novel_words import NOUNS, choose_words, gray_image, in_any_order
 from openvima.tasks.options import check_num_distractors, textures_by_difficulty
+from openvima.tasks.placing import into_base, of_a_third_shape, place_base_and_target, place_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 

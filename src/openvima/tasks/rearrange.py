@@ -9,8 +9,8 @@ Source:   VIMA paper, task list of the appendix, "Rearrange".
 """
 
 from openvima.scene import DistractorsApart, Problem, Prompt
-from openvima.tasks.rearranging import CONFLICT_RATE, sample_arrangement
 from openvima.tasks.registry import register_task
+from openvima.tasks.scene_prompts import CONFLICT_RATE, sample_arrangement
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Rearrange to this {scene}."

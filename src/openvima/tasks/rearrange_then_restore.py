@@ -8,8 +8,8 @@ Source:   VIMA paper, task list of the appendix, "Rearrange then restore".
 """
 
 from openvima.scene import AtPose, DistractorsApart, Problem, Prompt
-from openvima.tasks.rearranging import CONFLICT_RATE, TOLERANCE, sample_arrangement
 from openvima.tasks.registry import register_task
+from openvima.tasks.scene_prompts import CONFLICT_RATE, TOLERANCE, sample_arrangement
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Rearrange objects to this setup {scene} and then restore."

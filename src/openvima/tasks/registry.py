@@ -6,11 +6,13 @@ import importlib
 import importlib.metadata
 import inspect
 import itertools
+import json
 import os
 import pkgutil
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -270,3 +272,24 @@ def _all_or_no_tasks() -> Iterator[None]:
         _TASKS.clear()
         _TASKS.update(before)
         raise
+
+
+ORACLE_FILE = "oracle_success.json"
+
+
+def oracle_record(task: str) -> Mapping[str, Mapping[str, int]]:
+    """Return the number of evaluation episodes of a task that the oracle solved.
+
+    Args:
+        task: Name of the task.
+
+    Returns:
+        Level to {"episodes", "successes"}; empty for a task without a measurement. `benchmarks/oracle.py`
+        writes the record.
+    """
+    return _records().get(task, {})
+
+
+@functools.cache
+def _records() -> dict[str, dict[str, dict[str, int]]]:
+    return json.loads((files("openvima.tasks") / ORACLE_FILE).read_text(encoding="utf-8"))["tasks"]

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, ObjectImage, Problem, Prompt
 from openvima.tasks.options import check_difficulty, check_num_distractors
+from openvima.tasks.placing import ANGLES_DEG, check_angles, check_asymmetric, rotation_goal
 from openvima.tasks.registry import register_task
-from openvima.tasks.rotation import ANGLES_DEG, check_angles, check_asymmetric, rotation_goal
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Rotate the {dragged_obj} {angle_in_degree} degrees."

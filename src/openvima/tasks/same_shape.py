@@ -11,7 +11,7 @@ Source:   VIMA paper, task list of the appendix, "Visual reasoning".
 from openvima.catalog import Pool, object_spec
 from openvima.errors import ConfigError
 from openvima.scene import Problem
-from openvima.tasks.gathering import gathering_problem, object_counts
+from openvima.tasks.placing import gathering_problem, object_counts
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 

@@ -8,8 +8,8 @@ Source:   VIMA paper, task list of the appendix, "Scene understanding".
 """
 
 from openvima.scene import Placement, Problem, Prompt, SceneImage
-from openvima.tasks.into_base import APART_M, into_base, place_base_and_target
 from openvima.tasks.options import check_count, check_num_distractors, textures_by_difficulty
+from openvima.tasks.placing import APART_M, into_base, place_base_and_target
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 

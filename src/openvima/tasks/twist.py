@@ -13,14 +13,14 @@ from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, Placement, Pose, Problem, Prompt, SceneImage
 from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
-from openvima.tasks.registry import register_task
-from openvima.tasks.rotation import (
+from openvima.tasks.placing import (
     ANGLES_DEG,
     check_angles,
     check_asymmetric,
     rotated_clockwise,
     rotation_goal,
 )
+from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = (

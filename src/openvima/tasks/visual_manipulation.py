@@ -8,8 +8,8 @@ Source:   VIMA paper, task list of the appendix, "Simple object manipulation".
 """
 
 from openvima.scene import ObjectImage, Problem, Prompt
-from openvima.tasks.into_base import into_base, place_base_and_target, place_distractors
 from openvima.tasks.options import check_num_distractors, textures_by_difficulty
+from openvima.tasks.placing import into_base, place_base_and_target, place_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 

@@ -25,8 +25,7 @@ from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
 from openvima.policies.variants import image_tokens, with_variant
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
-from openvima.tasks.paraphrasing import training_paraphrases
-from openvima.tasks.prompts import description_of, synonyms
+from openvima.tasks.prompts import description_of, synonyms, training_paraphrases
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.augmentation.prompts import DEFINITION, motion_text, text_of
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, AugmentationConfig, TrainingConfig

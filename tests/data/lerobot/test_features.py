@@ -8,7 +8,7 @@ from openvima.data.lerobot_frames import FrameLayout, action_from_row, frame_lay
 from openvima.env import TabletopEnv
 from openvima.errors import ActionError
 from openvima.scene import END_EFFECTORS, Action
-from openvima.scene.command import ToolCommand
+from openvima.scene.action import ToolCommand
 
 
 @pytest.mark.parametrize("has_joints", [True, False])

@@ -7,8 +7,7 @@ from openvima.errors import SamplingError
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, Prompt, RenderedPrompt
 from openvima.tasks.prompts import MULTIMODAL, rewritten
-from openvima.tasks.sampling import sample_episode
-from openvima.tasks.seeding import make_rng
+from openvima.tasks.sampling import make_rng, sample_episode
 
 NEUTRAL_PROMPT = RenderedPrompt(".", {})  # not empty, as policies may refuse a prompt without any token
 _MAX_TRIES = 100  # for tasks whose placeholders vary; those of the benchmark's own tasks never do

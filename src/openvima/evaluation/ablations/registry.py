@@ -33,7 +33,7 @@ from openvima.evaluation.oracle_demonstration import demonstrated
 from openvima.evaluation.phrasings import has_phrasings, in_held_out_phrasing
 from openvima.policies.naming import ORACLE, RANDOM
 from openvima.tasks.options import MAX_DISTRACTORS
-from openvima.tasks.seeding import make_rng
+from openvima.tasks.sampling import make_rng
 
 DETECTED_BOXES = "detected_boxes"
 NOISY_BOXES = "noisy_boxes"

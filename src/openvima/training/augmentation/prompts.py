@@ -19,8 +19,7 @@ from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, i
 from openvima.policies.tokenizer import UNKNOWN
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS
-from openvima.tasks.paraphrasing import rephrased, training_paraphrases
-from openvima.tasks.prompts import synonyms, with_phrases
+from openvima.tasks.prompts import rephrased, synonyms, training_paraphrases, with_phrases
 from openvima.tasks.registry import task_spec
 from openvima.tasks.sweep_table import NUMBER_WORDS
 

@@ -1,5 +1,7 @@
-"""Rearrangement: objects, their targets, and a distractor that may block a target."""
+"""Shared parts of tasks whose prompts show scenes: frames of a video, and goal images of rearrangements."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from openvima.catalog import TEXTURE_SETS
@@ -8,7 +10,51 @@ from openvima.scene import AtPose, Placement, SceneImage, Tolerance
 from openvima.tasks.options import check_count, check_difficulty, check_fraction, check_num_distractors
 from openvima.tasks.table import Reject, TableSampler, is_in_the_way
 
+NUM_FRAMES = {"easy": 3, "medium": 4, "hard": 5}
 TOLERANCE = Tolerance(position_m=0.1)
+
+Frame = Sequence[Placement]
+"""The objects to imitate, in the same order in all frames, with their ids on the table."""
+
+
+def checked_num_frames(num_frames: int | None, difficulty: str, *, high: int) -> int:
+    """Return the number of frames, by default that of the difficulty.
+
+    Raises:
+        ConfigError: The difficulty is unknown, or the number is not in 2 … `high`.
+    """
+    check_difficulty(difficulty)
+    if num_frames is None:
+        return NUM_FRAMES[difficulty]
+    check_count("num_frames", num_frames, low=2, high=high)
+    return num_frames
+
+
+def with_frame_slots(template: str, num_frames: int) -> str:
+    """Replace the slot {frames} of a template by {frame_0} {frame_1} …."""
+    slots = " ".join(f"{{{name}}}" for name in _names(num_frames))
+    return template.replace("{frames}", slots)
+
+
+def frame_images(frames: Sequence[Frame]) -> dict[str, SceneImage]:
+    """Return the images of the slots frame_0, frame_1, …."""
+    return {name: SceneImage.of(frame) for name, frame in zip(_names(len(frames)), frames, strict=True)}
+
+
+def goals_between(frames: Sequence[Frame]) -> tuple[AtPose, ...]:
+    """Return a goal for each object that moves between consecutive frames."""
+    return tuple(
+        AtPose(after.id, after.pose, TOLERANCE)
+        for earlier, later in itertools.pairwise(frames)
+        for before, after in zip(earlier, later, strict=True)
+        if before.pose != after.pose
+    )
+
+
+def _names(num_frames: int) -> list[str]:
+    return [f"frame_{index}" for index in range(num_frames)]
+
+
 NUM_OBJECTS_WEIGHTS = (0.4, 0.4, 0.2)
 MAX_OBJECTS = len(NUM_OBJECTS_WEIGHTS)
 CONFLICT_RATE = 0.5  # probability that the distractor is on the target

@@ -1,0 +1,231 @@
+"""Shared parts of tasks: one object into a base, several into it, and rotations in place."""
+
+import math
+from collections.abc import Callable, Sequence
+
+from openvima.catalog import Pool
+from openvima.catalog.objects import NO_SYMMETRY, object_spec
+from openvima.errors import ConfigError
+from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
+from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
+from openvima.tasks.table import TableSampler, is_in_the_way
+
+TOLERANCE = Tolerance(position_m=0.1)
+APART_M = TOLERANCE.position_m  # below this the episode is decided at the start
+
+
+def place_base_and_target(
+    table: TableSampler, *, dragged_textures: Sequence[str], base_textures: Sequence[str]
+) -> tuple[Placement, Placement]:
+    """Place a base and the target.
+
+    Args:
+        table: Sampler of the scene.
+        dragged_textures: Textures of the target.
+        base_textures: Textures of the base.
+
+    Returns:
+        Base and target.
+    """
+    base_texture = table.choose(base_textures)
+    target_texture = table.choose(dragged_textures)
+    base = table.place_one("base", lambda: (table.choose(table.pool.base_objects), base_texture))
+    target = table.place_one(
+        "target", lambda: (table.choose(table.pool.dragged_objects), target_texture), apart_m=APART_M
+    )
+    return base, target
+
+
+def place_distractors(
+    table: TableSampler, draw: Callable[[], tuple[str, str]], *, count: int
+) -> list[Placement]:
+    """Place distractors; `draw` returns object and texture."""
+    return table.place("distractor", draw, count=count, tries=count + 10, apart_m=APART_M)
+
+
+def of_a_third_shape(
+    table: TableSampler, base: Placement, target: Placement, textures: Sequence[str]
+) -> Callable[[], tuple[str, str]]:
+    """Return a function that draws distractors of any shape but those of base and target.
+
+    Args:
+        table: Source of the shapes.
+        base: The base.
+        target: The target.
+        textures: Textures; duplicates count twice.
+
+    Returns:
+        A function that draws object and texture.
+    """
+    shapes = [
+        shape
+        for shape in (*table.pool.dragged_objects, *table.pool.base_objects)
+        if shape not in (base.object, target.object)
+    ]
+    return lambda: (table.choose(shapes), table.choose(textures))
+
+
+def into_base(
+    table: TableSampler,
+    prompt: Prompt,
+    *,
+    target: Placement,
+    base: Placement,
+    distractors: Sequence[Placement],
+) -> Problem:
+    """Return the problem: target into base, distractors apart."""
+    return Problem(
+        scene=table.scene(),
+        prompt=prompt,
+        goals=(AtPose(target.id, base.pose, TOLERANCE, relative_to=base.id),),
+        constraints=(DistractorsApart(tuple(distractor.id for distractor in distractors)),),
+    )
+
+
+TOLERANCE_M, BOWL_TOLERANCE_M = 0.125, 0.0875
+NUM_DRAGGED = {"easy": 2, "medium": 2, "hard": 3}
+NUM_DISTRACTORS = {"easy": 1, "medium": 2, "hard": 3}
+_TRIES = 20  # for all objects together
+_SPARE_STEPS = 2
+
+
+def object_counts(difficulty: str, num_dragged: int | None, num_distractors: int | None) -> tuple[int, int]:
+    """Return the number of objects to gather and of distractors.
+
+    Args:
+        difficulty: Default for numbers that are None.
+        num_dragged: 1 … 3.
+        num_distractors: 0 … 6.
+
+    Raises:
+        ConfigError: An option is invalid.
+    """
+    check_difficulty(difficulty)
+    num_dragged = NUM_DRAGGED[difficulty] if num_dragged is None else num_dragged
+    num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
+    check_count("num_dragged", num_dragged, low=1, high=3)
+    check_num_distractors(num_distractors)
+    return num_dragged, num_distractors
+
+
+def gathering_problem(
+    table: TableSampler,
+    template: str,
+    *,
+    base: Placement,
+    dragged_appearances: tuple[Sequence[str], Sequence[str]],
+    distractor_objects: Sequence[str],
+    counts: tuple[int, int],
+    after_bowl: bool | None,
+) -> Problem:
+    """Place the objects and build the problem.
+
+    Distractors have textures of the pool's dragged ones that no dragged object has.
+
+    Args:
+        table: Sampler of the scene, with the base placed.
+        template: The prompt with the slot `base_obj`.
+        base: The base.
+        dragged_appearances: Shapes and textures of the dragged objects, drawn independently.
+        distractor_objects: Shapes of distractors.
+        counts: Number of dragged objects and of distractors.
+        after_bowl: Whether the bowl's smaller tolerance applies to every base, as in VIMA-Bench after the
+            first bowl of an environment. None: with `compat` if the pool contains a bowl.
+
+    Returns:
+        The problem; without `compat`, it is undecided at the start.
+    """
+    if after_bowl is None:
+        after_bowl = table.compat and "bowl" in table.pool.base_objects
+    tolerance = Tolerance(BOWL_TOLERANCE_M if after_bowl or base.object == "bowl" else TOLERANCE_M)
+    num_dragged, _ = counts
+    dragged: list[Placement] = []
+
+    def draw() -> tuple[str, str]:
+        dragged[:] = table.placements[1 : 1 + num_dragged]
+        if len(dragged) < num_dragged:
+            objects, textures = dragged_appearances
+        else:
+            used = {placement.texture for placement in dragged}
+            objects = distractor_objects
+            textures = [texture for texture in table.pool.dragged_textures if texture not in used]
+        return table.choose(objects), table.choose(textures)
+
+    def reject(new: Placement) -> bool:
+        if is_in_the_way(new, base):
+            return True
+        near = (base, *dragged) if len(dragged) == num_dragged else (base,)
+        return not table.compat and any(tolerance.accepts(new.pose, other.pose) for other in near)
+
+    placed = table.place("object", draw, count=sum(counts), tries=_TRIES, reject=reject)
+    return Problem(
+        scene=table.scene(),
+        prompt=Prompt.parse(template, base_obj=ObjectImage(base)),
+        goals=tuple(AtPose(p.id, base.pose, tolerance, relative_to=base.id) for p in placed[:num_dragged]),
+        constraints=(DistractorsApart(tuple(p.id for p in placed[num_dragged:])),),
+        oracle_max_steps=num_dragged + _SPARE_STEPS,
+    )
+
+
+ANGLES_DEG = (30, 60, 90, 120, 150)  # clockwise seen from above, i.e. negative yaw
+TOLERANCE_DEG = 15
+
+
+def rotated_clockwise(pose: Pose, angle_deg: float) -> Pose:
+    """Rotate a pose in place, clockwise seen from above for positive angles."""
+    return pose.rotated(-math.radians(angle_deg))
+
+
+def rotation_goal(placement: Placement, angle_deg: float, *, position_m: float) -> AtPose:
+    """Return the goal of a rotation in place, within 15 degrees.
+
+    Args:
+        placement: The object at its start.
+        angle_deg: Positive is clockwise seen from above.
+        position_m: Position tolerance in metres.
+    """
+    tolerance = Tolerance(position_m, yaw_rad=math.radians(TOLERANCE_DEG))
+    return AtPose(
+        placement.id, rotated_clockwise(placement.pose, angle_deg), tolerance, relative_to=placement.id
+    )
+
+
+def check_angles(angles_deg: object) -> None:
+    """Check that all angles are numbers beyond the tolerance.
+
+    Raises:
+        ConfigError: An angle is within 15 degrees of 0, or this is not a list of numbers.
+    """
+    if not isinstance(angles_deg, Sequence) or isinstance(angles_deg, str):
+        raise ConfigError(
+            f"angles_deg is {angles_deg!r}; give a list of degrees, such as {list(ANGLES_DEG)}."
+        )
+    wrong = [str(angle) for angle in angles_deg if not _is_large(angle)]
+    if wrong or not angles_deg:
+        given = ", ".join(wrong) or "nothing"
+        raise ConfigError(
+            f"angles_deg holds {given}; each angle must be larger than {TOLERANCE_DEG} degrees."
+        )
+
+
+def _is_large(angle: object) -> bool:
+    if not isinstance(angle, int | float) or not math.isfinite(angle):
+        return False
+    return abs(math.remainder(angle, 360)) > TOLERANCE_DEG
+
+
+def check_asymmetric(pool: Pool) -> None:
+    """Check that the objects of a pool have no rotational symmetry and at least two textures.
+
+    Raises:
+        ConfigError: An object has a rotational symmetry, or there are fewer than two textures.
+    """
+    symmetric = [name for name in pool.dragged_objects if object_spec(name).symmetry_rad != NO_SYMMETRY]
+    if symmetric:
+        raise ConfigError(
+            f"{', '.join(symmetric)} have a rotational symmetry; give objects without one, such as letters."
+        )
+    if len(set(pool.dragged_textures)) < 2:
+        raise ConfigError(
+            f"the pool's dragged textures are {pool.dragged_textures}; distractors need a second one."
+        )
