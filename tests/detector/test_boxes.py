@@ -8,7 +8,20 @@ import pytest
 import naive_detection as naive
 
 torch = pytest.importorskip("torch")
-from openvima.detector.boxes import box_iou, clip_boxes, decode_boxes, encode_boxes, nms  # noqa: E402
+
+
+from openvima.detector.boxes import (  # noqa: E402
+    box_iou,
+    cell_anchors,
+    clip_boxes,
+    decode_boxes,
+    encode_boxes,
+    level_anchors,
+    match,
+    nms,
+    pyramid_anchors,
+    subsample,
+)
 
 ROI_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
 
@@ -88,3 +101,66 @@ def test_nms_acts_in_each_group_alone_and_drops_boxes_without_area():
 
 def test_nms_of_no_boxes_is_empty():
     assert nms(torch.zeros(0, 4), torch.zeros(0), 0.5).tolist() == []
+
+
+def test_the_anchors_of_a_cell_have_one_area_and_three_shapes():
+    # sizes 8 · √2 by 8 / √2, 8 by 8, 8 / √2 by 8 · √2
+    long, short = 4 * 2**0.5, 2 * 2**0.5
+    expected = [[-long, -short, long, short], [-4, -4, 4, 4], [-short, -long, short, long]]
+    assert np.allclose(cell_anchors(8.0), expected)
+
+
+def test_the_anchors_of_a_level_agree_with_the_naive_twin():
+    made = level_anchors(20.0, stride=8, height=3, width=5)
+    assert np.allclose(made, naive.anchors(20.0, stride=8, height=3, width=5), atol=1e-5)
+
+
+def test_strides_double_from_level_to_level():
+    first, second = pyramid_anchors((16.0, 32.0), [(2, 4), (1, 2)], first_stride=4)
+    assert np.allclose(first, naive.anchors(16.0, stride=4, height=2, width=4), atol=1e-5)
+    assert np.allclose(second, naive.anchors(32.0, stride=8, height=1, width=2), atol=1e-5)
+
+
+OBJECTS = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60]])
+
+
+def test_boxes_are_foreground_background_or_ignored():
+    boxes = torch.tensor(
+        [[0.0, 0, 10, 8], [0, 0, 10, 5], [0, 0, 5, 4], [50, 50, 61, 60]]
+    )  # 0.8, 0.5, 0.2, 0.91
+    numbers, labels = match(boxes, OBJECTS, low=0.3, high=0.7)
+    assert labels.tolist() == [1, -1, 0, 1]
+    assert numbers.tolist() == [0, 0, 0, 1]
+
+
+def test_low_quality_matches_label_the_best_boxes_of_each_object():
+    boxes = torch.tensor([[0.0, 0, 10, 2], [0, 0, 2, 10], [0, 0, 1, 1], [50, 50, 60, 60]])
+    _, labels = match(boxes, OBJECTS, low=0.3, high=0.7, allow_low_quality=True)
+    assert labels.tolist() == [1, 1, 0, 1]
+
+
+def test_without_objects_everything_is_background():
+    numbers, labels = match(OBJECTS, torch.zeros(0, 4), low=0.3, high=0.7, allow_low_quality=True)
+    assert numbers.tolist() == labels.tolist() == [0, 0]
+
+
+def test_an_object_without_intersecting_box_matches_none():
+    _, labels = match(OBJECTS[:1], OBJECTS[1:], low=0.3, high=0.7, allow_low_quality=True)
+    assert labels.tolist() == [0]
+
+
+def test_boxes_are_sampled_with_a_fraction_of_foreground():
+    labels = torch.tensor([1] * 10 + [0] * 50 + [-1] * 5)
+    draw = lambda seed: subsample(  # noqa: E731
+        labels, count=20, positive_fraction=0.25, generator=torch.Generator().manual_seed(seed)
+    )
+    positive, negative = draw(0)
+    assert (labels[positive] == 1).all() and (labels[negative] == 0).all()
+    assert (len(positive), len(negative)) == (5, 15)
+    assert torch.equal(draw(0)[1], negative) and not torch.equal(draw(1)[1], negative)
+
+
+def test_background_replaces_missing_foreground():
+    labels = torch.tensor([1] + [0] * 50)
+    positive, negative = subsample(labels, count=20, positive_fraction=0.5, generator=torch.Generator())
+    assert (len(positive), len(negative)) == (1, 19)

@@ -1,5 +1,6 @@
 """A run folder has one writer, and what a killed one left behind goes with the next."""
 
+import json
 import subprocess
 import sys
 import threading
@@ -9,9 +10,14 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from lock_holders import holding  # noqa: E402
+from openvima.data import Dataset  # noqa: E402
 from openvima.errors import FolderLockedError  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.run_folder import RunFolder  # noqa: E402
+from openvima.training.run_folder import (  # noqa: E402
+    RunFolder,
+    git_state,
+    provenance,
+)
 
 
 def test_a_second_run_in_a_folder_is_refused_at_once_and_writes_nothing(settings) -> None:
@@ -45,3 +51,34 @@ def test_temporary_files_of_a_killed_run_go_with_the_next(tmp_path) -> None:
     leftover.write_text("half")
     RunFolder(tmp_path, {"a": 1})
     assert not leftover.exists()
+
+
+@pytest.mark.slow
+def test_every_session_of_a_run_is_logged(settings, data):
+    config = TrainingConfig.of({**settings, "schedule.checkpoint_every": 3})
+    train(config)
+    train(config)
+    lines = [json.loads(line) for line in (config.out / "sessions_log.jsonl").read_text().splitlines()]
+    assert [(line["stage"], line["step"]) for line in lines] == [(0, 0), (1, 6)]
+    assert all(line["data"]["content_hash"] == Dataset(data).manifest["content_hash"] for line in lines)
+    assert {"openvima", "torch", "numpy"} <= set(lines[0]["versions"])
+
+
+def test_data_are_named_by_their_content(data):
+    known = provenance(Dataset(data))["data"]
+    assert known["counts"]["episodes"] == 24
+    assert len(known["manifest_sha256"]) == 64
+
+
+def test_the_commit_of_a_checkout_is_known_and_elsewhere_nothing(tmp_path):
+    assert git_state(tmp_path) is None
+    run = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    (tmp_path / "file").write_text("one")
+    for words in (["init", "-q"], ["add", "file"], ["commit", "-qm", "One"]):
+        subprocess.run([*run, *words], check=True)
+    state = git_state(tmp_path)
+    assert state is not None
+    assert len(state["commit"]) == 40
+    assert not state["changed"]
+    (tmp_path / "file").write_text("two")
+    assert git_state(tmp_path) == {**state, "changed": True}

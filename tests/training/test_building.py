@@ -7,9 +7,14 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.data import Dataset  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
+from openvima.data import (  # noqa: E402
+    Dataset,
+    GenerateConfig,
+    generate,
+)
+from openvima.env import EnvConfig, TabletopEnv  # noqa: E402
 from openvima.errors import CheckpointError, UnknownWordWarning  # noqa: E402
+from openvima.evaluation import score  # noqa: E402
 from openvima.evaluation.sources import policy_sources  # noqa: E402
 from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
@@ -127,3 +132,18 @@ def test_words_of_the_augmentation_are_in_the_vocabulary(data: Path, settings) -
     added = {"this", "is", "a", "dax", "blicket", "wug", "zup", "follow", "motion", ":"}
     assert set(augmented.words) - set(plain.words) == added - set(plain.words)
     assert added <= set(benchmark_vocabulary().words)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::openvima.errors.UnknownWordWarning")  # textures beyond these few
+@pytest.mark.parametrize("prompts", ["text", "mixed"])
+def test_a_network_learns_from_text_and_is_scored_on_it(settings: dict, tmp_path, prompts: str) -> None:
+    config = GenerateConfig(
+        out=tmp_path / "demos", tasks=("rotate",), episodes=6, env_config=EnvConfig(prompts=prompts)
+    )
+    changes = {"data": generate(config), "pretraining.steps": 0, "schedule.steps": 2, "loader.batch_size": 2}
+    run = train(TrainingConfig.of({**settings, **changes}))
+    results = score(
+        {"mine": load_policy(str(run))}, tasks=("rotate",), levels=("L1",), episodes=1, prompts=prompts
+    )
+    assert results.config["prompts"] == prompts
