@@ -92,6 +92,12 @@ def test_public_names_are_those_of_every_package_and_the_errors() -> None:
     assert sum(map(len, names.values())) > 250
 
 
+def test_modules_that_pages_import_are_in_the_reference() -> None:
+    names = public_names()
+    assert {"openvima.wrappers", "openvima.perception.objects"} <= names.keys()
+    assert "ObjectExtractor" in names["openvima.perception.objects"]
+
+
 def test_links_out_of_docs_lead_to_pages_of_the_site(tmp_path: Path) -> None:
     pages = Pages(tmp_path)
     block = "```python no-run\nx[0](1)\n```"

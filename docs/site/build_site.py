@@ -1,6 +1,6 @@
 """Build the documentation site: `python docs/site/build_site.py --out site`.
 
-Pages of `docs`, recorded results and what they link to are staged in `build/site` beside generated
+Pages of `docs`, recorded results and what they link to are staged in a temporary folder beside generated
 pages: tasks, Python API, notebooks with their outputs. Zensical turns them into HTML. Warnings, such as
 a link without a target, are errors.
 """
@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -20,7 +21,6 @@ from reference_pages import public_names, reference_pages
 from task_pages import write_task_pages
 
 ROOT = Path(__file__).parents[2]
-STAGE = ROOT / "build" / "site"
 NAMED = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
@@ -133,7 +133,8 @@ def stage(folder: Path, *, execute: bool) -> dict:
         pages.write(f"notebooks/{notebook.stem}.md", notebook_page(notebook, execute=execute))
     write_task_pages(folder / "tasks")
     shutil.copy(Path(__file__).parent / "site.css", folder)
-    settings = yaml.load((Path(__file__).parent / "site.yml").read_text("utf-8"), yaml.UnsafeLoader)
+    text = (Path(__file__).parent / "site.yml").read_text("utf-8").replace("../..", ROOT.as_posix())
+    settings = yaml.load(text, yaml.UnsafeLoader)
     settings["nav"] = navigation(settings["nav"], folder)
     return settings
 
@@ -163,12 +164,14 @@ def build(out: Path, *, execute: bool = True) -> None:
         out: Folder of the HTML; replaced.
         execute: Whether to run the notebooks.
     """
-    settings = stage(STAGE / "pages", execute=execute)
-    settings |= {"docs_dir": "pages", "site_dir": "html"}
-    (STAGE / "mkdocs.yml").write_text(yaml.dump(settings, sort_keys=False), encoding="utf-8")
-    command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
-    subprocess.run([*command, "--config-file", str(STAGE / "mkdocs.yml")], check=True)
-    shutil.copytree(STAGE / "html", out, dirs_exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        settings = stage(folder / "pages", execute=execute)
+        settings |= {"docs_dir": "pages", "site_dir": "html"}
+        (folder / "mkdocs.yml").write_text(yaml.dump(settings, sort_keys=False), encoding="utf-8")
+        command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
+        subprocess.run([*command, "--config-file", str(folder / "mkdocs.yml")], check=True)
+        shutil.copytree(folder / "html", out, dirs_exist_ok=True)
 
 
 if __name__ == "__main__":

@@ -1,22 +1,51 @@
-"""Reference pages: one for each package, with an entry for every public name."""
+"""Reference pages: one for each package and each module that pages import, with every public name."""
 
 import importlib
 import pkgutil
+import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from types import ModuleType
 
 import openvima
 from openvima import errors
 
+ROOT = Path(__file__).parents[2]
+_IMPORT = re.compile(r"^\s*(?:from|import) (openvima(?:\.\w+)+)", re.MULTILINE)
+
 
 def public_names() -> dict[str, tuple[str, ...]]:
-    """Map each package with `__all__` to its names, and `openvima.errors` to its exceptions."""
+    """Map each package with `__all__` to its names, and each module that pages import to its definitions.
+
+    Of `openvima.errors`, which holds functions for the package too, these are the exceptions alone.
+    """
     names = {module.__name__: tuple(sorted(module.__all__)) for module in _packages()}
-    kinds = {name: kind for name, kind in vars(errors).items() if isinstance(kind, type)}
     names[errors.__name__] = tuple(
-        sorted(name for name in kinds if kinds[name].__module__ == errors.__name__)
+        name for name in _definitions(errors) if isinstance(vars(errors)[name], type)
     )
+    for module in sorted(_imported_by_pages() - names.keys()):
+        if defined := _definitions(importlib.import_module(module)):
+            names[module] = defined
     return dict(sorted(names.items()))
+
+
+def _imported_by_pages() -> set[str]:
+    """Names of the modules that pages, notebooks and examples import."""
+    files = [
+        ROOT / "README.md",
+        *ROOT.glob("docs/*.md"),
+        *ROOT.glob("notebooks/*.py"),
+        *ROOT.glob("examples/*.py"),
+    ]
+    return {name for file in files for name in _IMPORT.findall(file.read_text(encoding="utf-8"))}
+
+
+def _definitions(module: ModuleType) -> tuple[str, ...]:
+    """Public classes and functions that a module defines itself."""
+    found = (
+        name for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__
+    )
+    return tuple(sorted(name for name in found if not name.startswith("_") and callable(vars(module)[name])))
 
 
 def _packages() -> Iterator[ModuleType]:
