@@ -66,7 +66,8 @@ class FlatAction(gymnasium.ActionWrapper):
         """
         try:
             values = np.asarray(action)
-        except (TypeError, ValueError):  # such as nested lists of unequal lengths, or a tensor on a device
+        except (TypeError, ValueError, RuntimeError):
+            # Such as nested lists of unequal lengths, or a tensor on a device or with gradients.
             values = np.empty(0, object)
         if values.shape != (ACTION_SIZE,) or values.dtype.kind != "f":
             raise ActionError(

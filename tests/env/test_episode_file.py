@@ -245,3 +245,14 @@ def assert_refused(folder: Path, content: bytes) -> None:
     with pytest.raises(OpenVimaError) as caught:
         openvima.load_episode(path)
     assert len(str(caught.value)) < 1000 and "\n" not in str(caught.value)
+
+
+def test_files_of_episodes_and_videos_may_lie_at_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    episode = openvima.compose([("heart", "red swirl", (0.5, -0.2))], "Turn the {a}.")
+    assert openvima.save_episode(episode, "~/turn.yaml") == tmp_path / "turn.yaml"
+    assert openvima.load_episode("~/turn.yaml") == episode
+    assert not Path("~").exists()

@@ -23,7 +23,7 @@ from openvima.catalog import LEVELS, Assets, load_assets, object_spec, texture_s
 from openvima.env.composed_objects import MAX_ENTRIES, WORKSPACE, odd_character, shown
 from openvima.env.composing import MAX_STEPS, composed, read_photo
 from openvima.errors import InputFileError, OpenVimaError, SceneError, echo, unknown_name
-from openvima.input_files import read_json, read_yaml
+from openvima.input_files import as_path, read_json, read_yaml
 from openvima.perception.objects import MAX_OBJECTS
 from openvima.perception.preprocessing import image_names
 from openvima.scene import (
@@ -78,7 +78,7 @@ def save_episode(episode: Episode, path: str | Path) -> Path:
         InputFileError: The path ends in none of these, the episode has a goal of a class of one's own, or
             `load_episode` would refuse it; no file is written.
     """
-    path = Path(path)
+    path = as_path(path)
     is_json, values = _checked_suffix(path) == ".json", episode_values(episode)
     try:
         same = episode_values(episode_from_values(values)) == values
@@ -121,7 +121,7 @@ def load_episode(path: str | Path, *, assets: str | Path | Assets = "procedural"
         SceneError, UnknownObjectError, UnknownTextureError: The scene is not possible.
         ConfigError: The seed of the episode is not allowed, or a function for the assets fails.
     """
-    path = Path(path)
+    path = as_path(path)
     read = read_json if _checked_suffix(path) == ".json" else read_yaml
     try:
         values = read(path, max_bytes=MAX_EPISODE_BYTES)

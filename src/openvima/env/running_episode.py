@@ -72,7 +72,7 @@ def _arrays(action: Action | ToolCommand) -> Any:  # Any: as `from_arrays` or `f
     """Return the arrays of an action, whose values its constructor does not check."""
     try:
         return action.to_arrays() if isinstance(action, Action) else action.to_array()
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         raise ActionError(
             f"the action is {echo(repr(action))}; its values must be numbers. Nothing was moved."
         ) from None

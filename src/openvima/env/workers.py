@@ -66,6 +66,7 @@ class AsyncTabletopEnvs(VectorEnv):
     ) -> None:
         self.num_envs, self._validator = len(env_fns), validator
         self._pending: str | None = None  # what was sent and not yet answered
+        self._have_started = False
         self._pipes: list[Connection] = []
         self.processes: list[BaseProcess] = []
         first = env_fns[0]()
@@ -92,6 +93,7 @@ class AsyncTabletopEnvs(VectorEnv):
                     there.close()
             with self._close_on_error():
                 self._receive(None)  # that they have started
+            self._have_started = True
         except BaseException:
             self.close(terminate=True)
             raise
@@ -246,11 +248,12 @@ class AsyncTabletopEnvs(VectorEnv):
             if process.exitcode is not None:
                 to = f" to {part.stop - 1}" if part.stop - part.start > 1 else ""
                 dead.append(f"{part.start}{to} (exit code {process.exitcode})")
-        return (
-            f"the worker of sub-environment {', '.join(dead) or '?'} died; all others were terminated. "
-            "Exit code -9 often means out of memory; 1 that it could not start: scripts need "
-            '`if __name__ == "__main__":`, because workers import them.'
-        )
+        which = f"the worker of sub-environment {', '.join(dead) or '?'}"
+        if not self._have_started:
+            return (
+                f'{which} could not start: scripts need `if __name__ == "__main__":`, as workers import them.'
+            )
+        return f"{which} died; all others were terminated. Exit code -9 often means out of memory."
 
 
 _OPEN: weakref.WeakSet[AsyncTabletopEnvs] = weakref.WeakSet()

@@ -15,6 +15,7 @@ from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, RolloutPolicy, load_rollout_policy
 from openvima.evaluation.session import EpisodeSession
 from openvima.evaluation.sources import PolicySource
+from openvima.input_files import as_path
 from openvima.policies.base import Policy
 from openvima.policies.naming import ORACLE
 from openvima.render.rasteriser import Rasteriser, front_above_top
@@ -95,10 +96,11 @@ def play(
         True
     """
     if not isinstance(episode, Episode):
-        episode = load_episode(Path(episode), assets=assets)
+        episode = load_episode(episode, assets=assets)
     if policy == ORACLE:
         require_goals(episode.problem)
-    if video is not None and Path(video).suffix.lower() != ".mp4":
+    video = None if video is None else as_path(video)
+    if video is not None and video.suffix.lower() != ".mp4":
         raise ConfigError(f"video is {str(video)!r}; videos are MP4 files; give a name that ends in .mp4.")
     rollout_policy = _load(policy, episode, device=device, boxes=boxes, trust_code=trust_code)
     if explain:
@@ -113,7 +115,7 @@ def play(
         caption = f"{episode.task} · {Path(name).name}" if title is None else title
         with EpisodeRecorder(
             session.env,
-            Path(video),
+            video,
             title=caption,
             explain=partial(_explanation, session) if explain else None,
         ) as recorder:

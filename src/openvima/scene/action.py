@@ -149,7 +149,8 @@ def _key_problems(action: Mapping[str, object]) -> list[str]:
 def _checked(key: str, value: object, length: int) -> tuple[tuple[float, ...], list[str]]:
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError):  # such as nested lists of unequal lengths, or a tensor on a device
+    except (TypeError, ValueError, RuntimeError):
+        # Such as nested lists of unequal lengths, or a tensor on a device or with gradients.
         return (), [f"{key} is a {type(value).__name__} that NumPy cannot convert; give {length} numbers."]
     if not np.issubdtype(array.dtype, np.floating):
         return (), [f"{key} has dtype {array.dtype}; it must be floating-point (float32)."]
@@ -244,7 +245,7 @@ class ToolCommand:
         names = ", ".join(COMMAND_NAMES)
         try:
             array = np.asarray(command)
-        except (TypeError, ValueError):  # such as a tensor on a device
+        except (TypeError, ValueError, RuntimeError):  # such as a tensor on a device, or with gradients
             array = np.empty(0, object)
         if not np.issubdtype(array.dtype, np.floating) or array.shape != (len(COMMAND_NAMES),):
             given = f"shape {array.shape}, dtype {array.dtype}"
