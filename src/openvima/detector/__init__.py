@@ -33,9 +33,7 @@ def detector_folder(folder: str | Path | None = None) -> Path:
     )
 
 
-def load_detector(
-    folder: str | Path | None = None, **options: Any
-) -> "FrameDetector":  # Any: of several kinds
+def load_detector(folder: str | Path | None = None, **options: Any) -> "FrameDetector":
     """Load a trained detector.
 
     Args:
@@ -56,7 +54,7 @@ def load_detector(
     return FrameDetector(load_network(detector_folder(folder)), **options)
 
 
-def load_extractor(folder: str | Path | None = None, **options: Any) -> "DetectedObjects":  # Any: as above
+def load_extractor(folder: str | Path | None = None, **options: Any) -> "DetectedObjects":
     """Load a trained detector as an object extractor for policies; see `load_detector`.
 
     Example:

@@ -207,7 +207,7 @@ _SETTINGS = {
 }
 _STRIDE_FIRST = "MODEL.RESNETS.STRIDE_IN_1X1"
 # Settings with a single supported value.
-_FIXED: dict[str, Any] = {  # Any: numbers, words and lists of them
+_FIXED: dict[str, Any] = {
     "MODEL.ANCHOR_GENERATOR.ASPECT_RATIOS": [[0.5, 1.0, 2.0]],
     "MODEL.ANCHOR_GENERATOR.OFFSET": 0.0,
     "MODEL.FPN.FUSE_TYPE": "sum",
@@ -249,7 +249,7 @@ def load_detectron2(file: str | Path) -> MaskRCNN:
 
 def detectron2_config(
     weights: Mapping[str, torch.Tensor],
-    settings: Mapping[str, Any] | None = None,  # Any: as stored
+    settings: Mapping[str, Any] | None = None,
 ) -> DetectorConfig:
     """Return the config that matches these weights: ResNet-50 with their number of classes.
 
@@ -282,7 +282,7 @@ def from_detectron2(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tens
     }
 
 
-def _translate_settings(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: as stored
+def _translate_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Translate Detectron2's settings to fields of `DetectorConfig`."""
     for path, expected in _FIXED.items():
         value = _setting(settings, path)
@@ -309,14 +309,14 @@ def _translate_settings(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: 
     return chosen
 
 
-def _setting(settings: Mapping[str, Any], path: str) -> Any:  # Any: as stored
+def _setting(settings: Mapping[str, Any], path: str) -> Any:
     value: Any = settings
     for name in path.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
     return value
 
 
-def _as_list(value: Any) -> Any:  # Any: as stored
+def _as_list(value: Any) -> Any:
     return [_as_list(part) for part in value] if isinstance(value, list | tuple) else value
 
 
@@ -339,7 +339,7 @@ def _class_of_settings(module: str) -> type:
     return type("CfgNode", (), {"__module__": module, "__new__": lambda cls: OrderedDict()})
 
 
-def _values_in(file: Path) -> Mapping[str, Any]:  # Any: any content
+def _values_in(file: Path) -> Mapping[str, Any]:
     if not file.exists():
         raise CheckpointError(f"there is no file {file}.")
     try:
@@ -354,7 +354,7 @@ def _values_in(file: Path) -> Mapping[str, Any]:  # Any: any content
     return values
 
 
-def _weights_in(values: Mapping[str, Any], file: Path) -> dict[str, torch.Tensor]:  # Any: as above
+def _weights_in(values: Mapping[str, Any], file: Path) -> dict[str, torch.Tensor]:
     values = values.get("model", {name: value for name, value in values.items() if name != "cfg"})
     if not isinstance(values, Mapping) or not values:
         raise CheckpointError(f"{file} contains no weights by name.")

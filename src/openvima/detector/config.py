@@ -125,12 +125,12 @@ class DetectorConfig:
         if problems:
             raise ConfigError(" ".join(problems))
 
-    def to_dict(self) -> dict[str, Any]:  # Any: plain YAML values
+    def to_dict(self) -> dict[str, Any]:
         """Return nested dictionaries of plain values."""
         return _plain(asdict(self))
 
     @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> "DetectorConfig":  # Any: as read from a file
+    def from_dict(values: Mapping[str, Any]) -> "DetectorConfig":
         """Build a config from the output of `to_dict`.
 
         Raises:
@@ -194,7 +194,7 @@ def detector_config(name: str) -> DetectorConfig:
     return DETECTORS[name]()
 
 
-def _plain(value: Any) -> Any:  # Any: nested plain values
+def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _plain(part) for name, part in value.items()}
     return list(value) if isinstance(value, tuple) else value

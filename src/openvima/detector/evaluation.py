@@ -21,7 +21,7 @@ from openvima.render import channels_last
 _CATEGORY = 1  # of all objects
 _AP, _AP50, _AP75, _RECALL = 0, 1, 2, 8  # positions in COCOeval.stats
 
-Record = dict[str, Any]  # Any: numbers, lists and run-length encodings, as COCO has them
+Record = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +127,10 @@ def _metrics(
     return CocoMetrics(ap, ap50, ap75, recall)
 
 
-def _coco(images: list[Record], annotations: list[Record]) -> Any:  # Any: pycocotools has no types
+def _coco(images: list[Record], annotations: list[Record]) -> Any:
     from pycocotools.coco import COCO
 
-    coco: Any = COCO()  # Any: as above
+    coco: Any = COCO()
     categories = [{"id": _CATEGORY, "name": "object"}]
     coco.dataset = {"info": {}, "images": images, "annotations": annotations, "categories": categories}
     coco.createIndex()

@@ -141,9 +141,7 @@ def held_out_frames(sampler: FrameSampler, count: int, *, seed: int) -> Iterator
         yield from sampler.sample(int(order[index % len(order)]), rng)
 
 
-def _both_views(
-    values: Mapping[str, Any], index: int, ids: Sequence[int], *, prefix: str
-) -> list[Frame]:  # Any: columns of several types
+def _both_views(values: Mapping[str, Any], index: int, ids: Sequence[int], *, prefix: str) -> list[Frame]:
     return [
         frame_of(
             np.ascontiguousarray(channels_first(values[f"{prefix}rgb_{view}"][index])),

@@ -86,7 +86,7 @@ class BoxJitter:
     pixels: int
     rng: np.random.Generator
 
-    def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:  # Any: as the environment's
+    def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return an observation with its objects, found beforehand."""
         if "segm" not in observation or "rgb" not in observation:
             return observation  # of a policy on whole frames

@@ -123,9 +123,7 @@ class BehaviourCloning:
         workers = min(config.loader.num_workers, num_cpus())
         return iter(read_batches(self._order, make, first=step, num_workers=workers))
 
-    def _call(
-        self, batch: Any, module: nn.Module
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: a learner's own
+    def _call(self, batch: Any, module: nn.Module) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         device = self._parallel.device
         with self._parallel.autocast(self._config.runtime.precision):
             loss, metrics = module(batch if device.type == "cpu" else batch.to(device))

@@ -325,11 +325,11 @@ class RunConfig:
             raise ConfigError(" ".join(problems))
 
     @classmethod
-    def of(cls, settings: Mapping[str, Any]) -> Self:  # Any: values of any setting
+    def of(cls, settings: Mapping[str, Any]) -> Self:
         """Make a configuration from settings by dotted name, such as "optimizer.learning_rate"."""
         return from_settings(cls, settings)
 
-    def identity(self) -> dict[str, Any]:  # Any: YAML
+    def identity(self) -> dict[str, Any]:
         """Return the settings that identify the run, nested, as plain values."""
         values = {"": asdict(self)}
         values |= {name: section for name, section in values[""].items() if isinstance(section, dict)}

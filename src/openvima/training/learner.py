@@ -51,7 +51,7 @@ class Learner(nn.Module):
         """
         raise NotImplementedError
 
-    def forward(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: its own batch
+    def forward(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Return the loss and metrics by name, means over all steps of the batch."""
         raise NotImplementedError
 
@@ -91,7 +91,7 @@ class Learner(nn.Module):
         except RuntimeError as error:
             raise CheckpointError(f"{file} does not fit: {error}") from None
 
-    def description(self) -> dict[str, Any]:  # Any: plain YAML values
+    def description(self) -> dict[str, Any]:
         """Return the sizes of the network, for the run's `config.yaml`."""
         return {"learner": f"{type(self).__module__}:{type(self).__qualname__}"}
 
@@ -161,7 +161,7 @@ class PolicyLearner(Learner):
                 )
         load_weights(self.network, read_safetensors(file), source=str(file))
 
-    def description(self) -> dict[str, Any]:  # Any: plain YAML values
+    def description(self) -> dict[str, Any]:
         """Return all sizes of the network, and which vocabulary it has."""
         tokenizer, sizes = self.processor.tokenizer, config_to_dict(self.network.config)
         if not isinstance(tokenizer, WordTokenizer):

@@ -186,7 +186,7 @@ class Trainer:
         rollout: Rollout | None = None,
         rollout_every: int | None = None,
         animate: Animate | None = None,
-        demonstrations: dict[str, Any] | None = None,  # Any: YAML
+        demonstrations: dict[str, Any] | None = None,
         going_on: str = "",
     ) -> None:
         self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel

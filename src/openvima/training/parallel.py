@@ -307,7 +307,7 @@ def set_whole_state(
     set_optimizer_state_dict(module, optimizer, whole, options=StateDictOptions(full_state_dict=True))
 
 
-def _shard(module: nn.Module, device: torch.device) -> Any:  # Any: the module, of a class made for it
+def _shard(module: nn.Module, device: torch.device) -> Any:
     """Shard the layers of stacks one by one, and the rest together."""
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
@@ -327,17 +327,13 @@ def _layers(module: nn.Module) -> list[nn.Module]:
     return [layer for stack in stacks for layer in stack if not isinstance(layer, nn.Linear | nn.Sequential)]
 
 
-def named_state(
-    module: nn.Module, optimizer: torch.optim.Optimizer
-) -> dict[str, Any]:  # Any: as torch has it
+def named_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     """Return the state of each parameter of a module, by its name."""
     names = {id(parameter): name for name, parameter in module.named_parameters()}
     return {names[id(parameter)]: values for parameter, values in optimizer.state.items()}
 
 
-def load_named_state(
-    module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Any]
-) -> None:  # Any: as above
+def load_named_state(module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
     """Load what `named_state` returned; the optimizer may have its parameters in another order.
 
     Moments get the memory format of their parameters, as the fused optimizer requires.

@@ -132,7 +132,7 @@ def _variants(config: TrainingConfig, boxes: Boxes | None) -> list[tuple[Variant
     return [*stored, *detected, *rerendered]
 
 
-def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:  # Any: YAML
+def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:
     """Return what identifies the demonstrations besides their index."""
     seen = {*held_out_demonstrations(dataset), *(held_out_data(config.init_from) if config.init_from else ())}
     return {**({"boxes": boxes.name} if boxes else {}), **({"held_out": sorted(seen)} if seen else {})}

@@ -307,7 +307,7 @@ def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 _PACKAGES = ("torch", "numpy", "pyarrow", "safetensors", "transformers")
 
 
-def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
+def provenance(dataset: Dataset) -> dict[str, Any]:
     """Return versions, the git commit of the package if it is in a checkout, and digests of the data."""
     content = (dataset.path / MANIFEST_NAME).read_bytes()
     return {
@@ -340,7 +340,7 @@ def index_hash(folder: Path) -> str:
     return hashlib.blake2b((folder / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
 
 
-def git_state(folder: Path) -> dict[str, Any] | None:  # Any: JSON
+def git_state(folder: Path) -> dict[str, Any] | None:
     """Return the commit of the checkout that contains a folder, and whether it has changes.
 
     Returns:
@@ -379,7 +379,7 @@ def _versions() -> dict[str, str]:
 _TIMES = ("seconds_since_start", "cpu_seconds_since_start")
 
 
-def read_costs(run: Path) -> dict[str, Any]:  # Any: JSON
+def read_costs(run: Path) -> dict[str, Any]:
     """Return steps, time and CPU time of a run.
 
     Work that was repeated after an interruption counts twice; what was lost after the last line of the log
@@ -407,6 +407,6 @@ def read_costs(run: Path) -> dict[str, Any]:  # Any: JSON
     }
 
 
-def _records(file: Path) -> list[dict[str, Any]]:  # Any: JSON
+def _records(file: Path) -> list[dict[str, Any]]:
     """Read a log; empty without one."""
     return [values for _, values in whole_lines(file)] if file.is_file() else []

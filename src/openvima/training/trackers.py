@@ -68,11 +68,11 @@ class TensorBoardTracker(Tracker):
 
     def __init__(self, run: Path, first: int) -> None:
         self._run, self._first = run, first
-        self._events: Any = None  # Any: an optional package
+        self._events: Any = None
         self._has_failed = False
 
     @property
-    def _writer(self) -> Any:  # Any: as above
+    def _writer(self) -> Any:
         if self._events is None:  # restarting a finished run writes no empty file
             from torch.utils.tensorboard import SummaryWriter
 
@@ -130,9 +130,9 @@ class WandbTracker(Tracker):
         MissingExtraError: `wandb` is not installed.
     """
 
-    def __init__(self, run: Path, project: str, settings: Mapping[str, Any]) -> None:  # Any: plain values
+    def __init__(self, run: Path, project: str, settings: Mapping[str, Any]) -> None:
         needs = f"runtime.wandb is {project!r}; install wandb: pip install 'openvima[wandb]'"
-        self._wandb: Any = import_extra("wandb", needs)  # Any: an optional package
+        self._wandb: Any = import_extra("wandb", needs)
         folder = run / WANDB_FOLDER
         folder.mkdir(parents=True, exist_ok=True)
         self._session = self._wandb.init(

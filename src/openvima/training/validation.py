@@ -49,7 +49,7 @@ def problems_of(settings: object, prefix: str = "") -> Iterator[str]:
             yield problem
 
 
-def flatten(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML values
+def flatten(values: Any, prefix: str = "") -> dict[str, Any]:
     """Flatten nested settings; names are joined by dots."""
     if not isinstance(values, Mapping):
         return {prefix: values}
@@ -59,7 +59,7 @@ def flatten(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML
     return result
 
 
-def setting_types(kind: type, prefix: str = "") -> dict[str, Any]:  # Any: types
+def setting_types(kind: type, prefix: str = "") -> dict[str, Any]:
     """Return the type of every setting of a dataclass by its dotted name."""
     types: dict[str, Any] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
@@ -96,15 +96,15 @@ def _build_nested(kind: type[Settings], settings: Mapping[str, Any], prefix: str
     return kind(**values)
 
 
-def _is_section(hint: Any) -> TypeGuard[type]:  # Any: a type
+def _is_section(hint: Any) -> TypeGuard[type]:
     return is_dataclass(hint)
 
 
-def _values(section: Any) -> dict[str, Any]:  # Any: a dataclass
+def _values(section: Any) -> dict[str, Any]:
     return {field.name: getattr(section, field.name) for field in fields(section)}
 
 
-def convert(value: Any, hint: Any) -> Any:  # Any: what YAML holds, and types
+def convert(value: Any, hint: Any) -> Any:
     """Convert text to paths and numbers; YAML reads 1e-4, without a point, as text."""
     kinds = {_plain(option)[0] for option in _options(hint)}
     if not isinstance(value, str) or not {Path, float} & kinds:
@@ -115,16 +115,16 @@ def convert(value: Any, hint: Any) -> Any:  # Any: what YAML holds, and types
         return value
 
 
-def _options(hint: Any) -> tuple[Any, ...]:  # Any: types
+def _options(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
 
-def _plain(hint: Any) -> tuple[Any, Range | None]:  # Any: types
+def _plain(hint: Any) -> tuple[Any, Range | None]:
     """Return a type without its annotation, and the range of its values."""
     return get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, None)
 
 
-def _problem(name: str, value: Any, hint: Any) -> str | None:  # Any: a value may be anything; types
+def _problem(name: str, value: Any, hint: Any) -> str | None:
     options = _options(hint)
     plain, limits = _plain(options[0])
     if value is None and NoneType in options:
@@ -139,7 +139,7 @@ def _problem(name: str, value: Any, hint: Any) -> str | None:  # Any: a value ma
     return _out_of_range(name, value, limits) if limits else None
 
 
-def _out_of_range(name: str, value: Any, limits: Range) -> str | None:  # Any: a number
+def _out_of_range(name: str, value: Any, limits: Range) -> str | None:
     low, high = limits.low, limits.high
     if low <= value and (high is None or value <= high):
         return None

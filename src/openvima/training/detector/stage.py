@@ -113,7 +113,7 @@ class DetectorLearner(Learner):
         """Load the weights of a checkpoint."""
         load_weights(self.network, folder / WEIGHTS_FILE)
 
-    def description(self) -> dict[str, Any]:  # Any: plain YAML values
+    def description(self) -> dict[str, Any]:
         """Return all sizes of the network."""
         return self.network.config.to_dict()
 
