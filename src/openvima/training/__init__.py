@@ -3,13 +3,14 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from openvima.multiprocess import Report
 from openvima.training.config import TrainingConfig
 from openvima.video.animation import Animation
 
 
 def train(
     config: TrainingConfig,
-    report: Callable[[int, int, str], None] | None = None,
+    report: Report | None = None,
     rollout: Callable[[Path], dict[str, float]] | None = None,
     animate: Callable[[Path], list[Animation]] | None = None,
 ) -> Path:

@@ -21,6 +21,7 @@ from torch import nn
 
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, Terminated
+from openvima.multiprocess import Report
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
 from openvima.training.parallel import Parallel, load_named_state, named_state, set_whole_state, whole_state
@@ -88,8 +89,6 @@ def note_sigterm() -> Iterator[Callable[[], bool]]:
 
 
 Metrics = dict[str, float]
-# Called with steps done, steps in all, and a note.
-Report = Callable[[int, int, str], None]
 # From a checkpoint folder to metrics. It is passed in, since training does not import the simulator.
 Rollout = Callable[[Path], Metrics]
 Animate = Callable[[Path], Sequence[Animation]]

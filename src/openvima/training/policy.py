@@ -16,6 +16,7 @@ from openvima.data.object_cache import (
 from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
+from openvima.multiprocess import Report
 from openvima.policies.base import torch_threads
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
@@ -25,7 +26,7 @@ from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, 
 from openvima.training.building import build_learner, resolve, training_texts
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
-from openvima.training.loop import Animate, PlannedStage, Report, Rollout, Stage, Trainer, num_steps
+from openvima.training.loop import Animate, PlannedStage, Rollout, Stage, Trainer, num_steps
 from openvima.training.parallel import Parallel, compile_layers, join_processes
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations

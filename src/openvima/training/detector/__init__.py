@@ -1,14 +1,12 @@
 """Training a detector on the segmentation of demonstrations."""
 
-from collections.abc import Callable
 from pathlib import Path
 
+from openvima.multiprocess import Report
 from openvima.training.detector.config import DetectorTrainingConfig
 
 
-def train_detector(
-    config: DetectorTrainingConfig, report: Callable[[int, int, str], None] | None = None
-) -> Path:
+def train_detector(config: DetectorTrainingConfig, report: Report | None = None) -> Path:
     """Train a detector, or resume a run; see `openvima.training.detector.stage.train_detector`.
 
     Raises:

@@ -14,6 +14,7 @@ from openvima.detector.config import detector_config
 from openvima.detector.frames import Frame, FrameSampler, augment_frame, held_out_frames
 from openvima.detector.network import Instances, MaskRCNN
 from openvima.errors import ConfigError, DatasetError
+from openvima.multiprocess import Report
 from openvima.policies.base import torch_threads
 from openvima.policies.naming import WEIGHTS_FILE
 from openvima.training.batches import BatchOrder
@@ -22,7 +23,6 @@ from openvima.training.learner import Learner
 from openvima.training.loop import (
     Metrics,
     PlannedStage,
-    Report,
     Trainer,
     num_steps,
     step_generator,

@@ -20,7 +20,7 @@ from openvima.catalog.objects import object_spec
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random
-from openvima.multiprocess import imap_unordered
+from openvima.multiprocess import Report, imap_unordered
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.policies.nn.layers import TensorRecord, map_tensors
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
@@ -258,7 +258,7 @@ def render_pairs(
     assets: str,
     augmentation: SceneAugmentation = NO_AUGMENTATION,
     with_attributes: bool = False,
-    report: Callable[[int, int, str], None] | None = None,
+    report: Report | None = None,
     parallel: Parallel = ONE_PROCESS,
     workers: int = 1,
 ) -> Pairs:
