@@ -157,9 +157,9 @@ def number_images(
         episodes: The demonstrations, as `preprocess` numbers them.
         first_images: Images before those of each, where the stack holds still more; None if it does not.
     """
-    if first_images is None:
-        first_images = np.cumsum([0, *(len(episode.images) for episode in episodes)])[:-1].tolist()
-    return [episode.with_image_offset(first) for episode, first in zip(episodes, first_images, strict=True)]
+    counts = np.array([len(episode.images) for episode in episodes])
+    firsts = (np.cumsum(counts) - counts).tolist() if first_images is None else first_images
+    return [episode.with_image_offset(first) for episode, first in zip(episodes, firsts, strict=True)]
 
 
 def empty_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:

@@ -258,16 +258,10 @@ class Processor:
         grasps = positions.copy()
         positions[place, slot] = _table_points(objects, objects.boxes[..., :2])
         grasps[place, slot] = _table_points(objects, objects.grasps)
-        return HistoryBatch(
-            *(
-                torch.from_numpy(array.reshape(*steps.shape, *array.shape[1:]))
-                for array in (crop_index, boxes, masks.astype(np.bool_))
-            ),
-            torch.from_numpy(slots_BT),
-            *(torch.from_numpy(array.reshape(*steps.shape, num_slots, 2)) for array in (positions, grasps)),
-            torch.from_numpy(steps.pad(end_effectors)),
-            torch.from_numpy(steps.exist()),
-        )
+        flat = (crop_index, boxes, masks.astype(np.bool_), slots_BT.reshape(-1), positions, grasps)
+        padded = [array.reshape(*steps.shape, *array.shape[1:]) for array in flat]
+        arrays = (*padded, steps.pad(end_effectors), steps.exist())
+        return HistoryBatch(*(torch.from_numpy(array) for array in arrays))
 
     def _slots_of(self, ids: np.ndarray, objects: ObjectTable, counts: np.ndarray) -> np.ndarray:
         """Return the slot of the object that has the id of its step, shape (T,), -1 where there is none."""
