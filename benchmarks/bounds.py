@@ -39,7 +39,7 @@ from openvima.env import TabletopEnv
 from openvima.env.config import EnvConfig
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
-from openvima.evaluation.statistics.proportions import wilson_interval
+from openvima.evaluation.statistics import wilson_interval
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.perception.preprocessing import extract_observation
 from openvima.policies.inference import NetworkPolicy

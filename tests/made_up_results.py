@@ -6,7 +6,7 @@ from PIL import Image
 
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
-from openvima.video.clips import Clip, png
+from openvima.video.encoder import Clip, png
 
 VERSIONS = {"openvima": "9.8.7", "mujoco": "1.2.3"}
 CONFIG = {"policies": ["mine", "oracle", "random"], "tasks": ["all"], "levels": ["L1", "L3"], "episodes": 10}

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
-from openvima.evaluation.in_context import in_context_prompt
+from openvima.evaluation.prompt_ablations import in_context_prompt
 from openvima.policies import preset
 from openvima.policies.nn.action_head import encode_bins
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range

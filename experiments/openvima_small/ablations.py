@@ -34,7 +34,7 @@ from openvima.policies.pointer.config import ObjectHeadConfig, PointerConfig
 from openvima.policies.presets import PRESETS
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import with_variant
-from openvima.report.typesetting import Estimate, Line, Table, markdown
+from openvima.report.table import Estimate, Line, Table, markdown
 from openvima.training import TrainingConfig, train
 from openvima.training.recipes import override, recipe_settings
 from openvima.training.run_folder import read_costs

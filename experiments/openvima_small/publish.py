@@ -29,7 +29,7 @@ from openvima.evaluation.actions import ACTIONS_NAME
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.sources import weights_hash
 from openvima.policies.naming import BUNDLED, SMALL
-from openvima.report.typesetting import Line, Table, markdown
+from openvima.report.table import Line, Table, markdown
 from tables import tables
 from weights import facts, settings, ship, shipped
 

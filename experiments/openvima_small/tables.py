@@ -16,10 +16,10 @@ from findings import (
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.naming import BUNDLED
-from openvima.report.paper import paper_tables
 from openvima.report.published import PublishedModel, leading_models, published_models
+from openvima.report.table import Estimate, Line, Table, markdown
+from openvima.report.tables import paper_tables
 from openvima.report.text import ablation_name, counted
-from openvima.report.typesetting import Estimate, Line, Table, markdown
 from weights import shipped
 
 _BESIDE = (("MIDAS", "92M"), ("VIMA", "200M"), ("VIMA", "9M"))  # best, best known, of similar size

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
-from openvima.evaluation.statistics.proportions import mean_of_rates
+from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
 from openvima.policies.naming import find_checkpoint

@@ -12,8 +12,8 @@ import openvima
 from openvima.env import EnvConfig
 from openvima.errors import ActionError, ConfigError, PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
-from openvima.evaluation.merging import merge
-from openvima.evaluation.scoring import score
+from openvima.evaluation.comparison import merge
+from openvima.evaluation.runner import score
 from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy
 from openvima.scene.action import COMMAND_HIGH, STEPS_PER_PRIMITIVE, ToolCommand

@@ -5,7 +5,7 @@ import pytest
 
 from openvima.env import TabletopEnv
 from openvima.evaluation.ablations import ABLATIONS, ablate
-from openvima.evaluation.ablations.images import NEUTRAL_PROMPT
+from openvima.evaluation.prompt_ablations import NEUTRAL_PROMPT
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.perception.objects import observe, observe_prompt_image

@@ -15,8 +15,8 @@ from openvima.evaluation.ablations import (
     applies_to,
     canonical_ablation,
 )
-from openvima.evaluation.ablations.words import gibberish, masked, swapped
 from openvima.evaluation.config import cells, plan
+from openvima.evaluation.prompt_ablations import gibberish, masked, swapped
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies import RandomPolicy, load_policy

@@ -9,7 +9,7 @@ from openvima.errors import ConfigError, PromptError
 from openvima.evaluation import EvaluationConfig, Results
 from openvima.evaluation.ablations import ABLATIONS, EXAMPLE_PROMPTS, IN_CONTEXT, ablate
 from openvima.evaluation.config import cells
-from openvima.evaluation.in_context import IN_CONTEXT_TASKS, in_context_prompt
+from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, in_context_prompt
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
 from openvima.tasks import task_spec

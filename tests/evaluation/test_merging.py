@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from openvima.errors import ConfigError
-from openvima.evaluation.merging import merge
+from openvima.evaluation.comparison import merge
 from openvima.evaluation.results import EpisodeOutcome, Results
 
 

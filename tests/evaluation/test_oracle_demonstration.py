@@ -7,7 +7,7 @@ from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError
 from openvima.evaluation.ablations import ORACLE_DEMONSTRATION, ablate
-from openvima.evaluation.in_context import IN_CONTEXT_TASKS
+from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies import RandomPolicy

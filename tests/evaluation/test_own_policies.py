@@ -18,7 +18,7 @@ from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy, load_policy
 from openvima.policies.loading import parameters_hash
-from openvima.report.assets import record_clip
+from openvima.report.videos import record_clip
 
 CODE = """
 from openvima.policies import RandomPolicy

@@ -10,8 +10,8 @@ from openvima.evaluation.statistics import (
     mean_difference,
     mean_of_rates,
     mean_over_seeds,
+    student_quantile,
 )
-from openvima.evaluation.statistics.seeds import student_quantile
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 4, 7, 30])

@@ -9,9 +9,8 @@ from openvima.catalog import load_assets
 from openvima.env.composition import Composition
 from openvima.env.episode_file import load_episode, save_episode
 from openvima.errors import ActionError, EpisodeError
-from openvima.evaluation.free_play import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, load_own_rollout_policy
-from openvima.evaluation.session import EpisodeSession, first_difference
+from openvima.evaluation.session import EpisodeSession, first_difference, play
 from openvima.policies import RandomPolicy
 from openvima.policies.naming import SMALL
 from openvima.scene import Action

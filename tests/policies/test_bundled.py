@@ -29,8 +29,8 @@ from openvima.policies.naming import (  # noqa: E402
     SMALL,
     find_checkpoint,
 )
-from openvima.report import assets  # noqa: E402
-from openvima.report.assets import find_metrics  # noqa: E402
+from openvima.report import videos  # noqa: E402
+from openvima.report.videos import find_metrics  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
@@ -177,7 +177,7 @@ def test_quickstart_scores_it_beside_the_policy_that_it_trains(
     monkeypatch.setattr(quickstart, "_first_look", lambda *_: None)
     monkeypatch.setattr(quickstart, "_generate", lambda *_: Path("demonstrations"))
     monkeypatch.setattr(quickstart, "_train", lambda *_: bundled)
-    monkeypatch.setattr(assets, "recording_jobs", lambda *_: [])  # other tests record
+    monkeypatch.setattr(videos, "recording_jobs", lambda *_: [])  # other tests record
     assert quickstart.main(out=Path("quick"), episodes=1, workers=1) == 0
     shown = capsys.readouterr().out.splitlines()
     names = ["trained", SMALL, "oracle", "untrained", "random"]

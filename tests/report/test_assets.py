@@ -8,14 +8,15 @@ import pytest
 from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation import EvaluationConfig, Results
 from openvima.evaluation.sources import PolicySource
-from openvima.report import VideoSelection, assets, evaluate_and_report
+from openvima.report import VideoSelection, evaluate_and_report
+from openvima.report import videos as report_videos
 from openvima.report.page import default_command
-from openvima.video.clips import load_clips
+from openvima.video.encoder import load_clips
 
 
 def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(results):
     config = EvaluationConfig(("mine=runs/a", "oracle", "random"))
-    jobs = assets.recording_jobs(config, VideoSelection(2), results)
+    jobs = report_videos.recording_jobs(config, VideoSelection(2), results)
     recorded = [(job.batch.policy, job.batch.task, job.batch.level, job.batch.first_seed) for job in jobs]
     assert recorded == [
         *(("mine", "rotate", "L1", seed) for seed in (0, 1, 9)),
@@ -29,19 +30,19 @@ def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(resul
 
 
 def test_without_trained_policies_all_are_recorded(results):
-    jobs = assets.recording_jobs(EvaluationConfig(("random",)), VideoSelection(), results)
+    jobs = report_videos.recording_jobs(EvaluationConfig(("random",)), VideoSelection(), results)
     assert {job.batch.policy for job in jobs} == {"random"}
 
 
 def test_no_videos_are_recorded_if_none_are_requested(results):
-    assert assets.recording_jobs(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
+    assert report_videos.recording_jobs(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
 
 
 def test_requested_episodes_are_recorded_of_every_policy(results):
     settings = {"tasks": ("rotate",), "levels": ("L1", "L3"), "episodes": 10}
     config = EvaluationConfig(("mine=runs/a", "oracle"), **settings)
     videos = VideoSelection(0, ("rotate/4", "rotate/L3/5"))
-    assert [job.episode for job in assets.recording_jobs(config, videos, results)] == [
+    assert [job.episode for job in report_videos.recording_jobs(config, videos, results)] == [
         *(("mine", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
         *(("oracle", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
     ]
@@ -51,7 +52,7 @@ def test_requested_episodes_are_recorded_of_every_policy(results):
 def test_requested_episodes_outside_the_evaluation_are_refused(text):
     config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=10)
     with pytest.raises(ConfigError, match=f"record_video is '{text}'"):
-        assets.requested_episodes(config, VideoSelection(record_video=(text,)))
+        report_videos.requested_episodes(config, VideoSelection(record_video=(text,)))
 
 
 def test_further_videos_are_added_to_those_recorded_before(tmp_path):
@@ -80,13 +81,15 @@ def test_training_curves_are_those_of_the_first_trained_policy(tmp_path):
     oracle = PolicySource("oracle", "oracle")
     run = PolicySource("mine", str(tmp_path))
     checkpoint = PolicySource("mine", str(tmp_path / "checkpoints" / "step-1"))
-    assert assets.find_metrics([oracle, run]) == tmp_path / "metrics.jsonl"
-    assert assets.find_metrics([checkpoint]) == tmp_path / "metrics.jsonl"
-    assert assets.find_metrics([oracle]) is None
+    assert report_videos.find_metrics([oracle, run]) == tmp_path / "metrics.jsonl"
+    assert report_videos.find_metrics([checkpoint]) == tmp_path / "metrics.jsonl"
+    assert report_videos.find_metrics([oracle]) is None
 
 
 def test_a_missing_extra_is_named_before_any_episode(tmp_path, monkeypatch):
-    monkeypatch.setattr(assets.importlib.util, "find_spec", lambda name: None if name == "av" else object())
+    monkeypatch.setattr(
+        report_videos.importlib.util, "find_spec", lambda name: None if name == "av" else object()
+    )
     with pytest.raises(MissingExtraError, match=r"needs av; install with: pip install 'openvima\[report\]'"):
         evaluate_and_report(EvaluationConfig(("oracle",), out=tmp_path / "new"))
     assert not (tmp_path / "new").exists()

@@ -7,12 +7,10 @@ import pytest
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.report import write_report
-from openvima.report.families import FAMILIES, family_table
-from openvima.report.level_drop import level_drop_table, level_figure
-from openvima.report.published import models_by_task, published_tasks
-from openvima.report.published_tasks import published_task_table
-from openvima.report.rated_ablations import rate_figures, rated
-from openvima.report.typesetting import Estimate, Table
+from openvima.report.ablations import rate_figures, rated
+from openvima.report.published import models_by_task, published_task_table, published_tasks
+from openvima.report.table import Estimate, Table
+from openvima.report.tables import FAMILIES, family_table, level_drop_table, level_figure
 from openvima.tasks import list_tasks, task_spec
 
 

@@ -12,14 +12,12 @@ from openvima.errors import DatasetError
 from openvima.evaluation.comparison import compare
 from openvima.evaluation.results import BAD_ACTION, POLICY_ERROR, EpisodeOutcome, Results, Row
 from openvima.report import write_report
-from openvima.report.confirmation import Confirmation
 from openvima.report.curves import read_charts, read_run_charts, run_labels
 from openvima.report.figures import curve_chart
 from openvima.report.page import default_command
 from openvima.report.published import published_tasks
-from openvima.report.reasons import plain_reason
-from openvima.report.text import role
-from openvima.video.clips import load_clips, save_clips
+from openvima.report.text import Confirmation, plain_reason, role
+from openvima.video.encoder import load_clips, save_clips
 
 
 def outcomes(num_solved: int) -> tuple[EpisodeOutcome, ...]:
@@ -518,7 +516,7 @@ def test_all_episodes_are_listed_failures_first_and_lead_to_their_videos(text):
 
 
 def test_of_very_many_episodes_failures_alone_are_listed(results, tmp_path, monkeypatch):
-    monkeypatch.setattr("openvima.report.episodes.MOST_EPISODES", 50)
+    monkeypatch.setattr("openvima.report.page.MOST_EPISODES", 50)
     text = write_report(results, tmp_path / "a.html").read_text(encoding="utf-8")
     listed = section(text, "episodes")
     assert "41 failures of 90 episodes" in listed and ">solved<" not in listed

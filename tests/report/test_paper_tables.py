@@ -7,8 +7,8 @@ import pytest
 
 from openvima.evaluation.comparison import compare_pairs
 from openvima.evaluation.results import Results
-from openvima.report.paper import paper_tables
-from openvima.report.typesetting import latex, latex_text, markdown
+from openvima.report.table import latex, latex_text, markdown
+from openvima.report.tables import paper_tables
 
 
 @pytest.fixture

@@ -2,16 +2,16 @@
 
 import re
 
-from openvima.report.fragments import rate_figure_html
-from openvima.report.published_curves import data_fraction_curves, model_size_curves, size_ticks
-from openvima.report.rate_curves import (
+from openvima.report.figures import (
     RateCurve,
     RateFigure,
     RatePanel,
     RatePoint,
+    rate_figure_html,
     rate_table,
 )
-from openvima.report.typesetting import markdown
+from openvima.report.published import data_fraction_curves, model_size_curves, size_ticks
+from openvima.report.table import markdown
 
 
 def figure() -> RateFigure:

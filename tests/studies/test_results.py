@@ -12,9 +12,8 @@ pytest.importorskip("jinja2")
 
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.studies import StudyInputs, make_study, scale_named
-from openvima.studies.page import study_figure, study_page
 from openvima.studies.plan import COST_FILE, Plan, plan_study
-from openvima.studies.results import Point, study_costs, study_points
+from openvima.studies.results import Point, study_costs, study_figure, study_page, study_points
 from openvima.studies.study import Study
 from openvima.tasks.registry import task_spec
 

@@ -6,7 +6,7 @@ import pytest
 
 from openvima.env import TabletopEnv
 from openvima.evaluation.ablations import ablate
-from openvima.evaluation.phrasings import held_out_phrasings
+from openvima.evaluation.prompt_ablations import held_out_phrasings
 from openvima.scene.prompt import PLACEHOLDER
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.prompts import rephrased, training_paraphrases

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 from openvima.catalog.packs import load_assets  # noqa: E402
 from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.evaluation.phrasings import held_out_phrasings  # noqa: E402
+from openvima.evaluation.prompt_ablations import held_out_phrasings  # noqa: E402
 from openvima.policies import presets  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402

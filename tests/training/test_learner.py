@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch")
 from openvima.cli.main import main  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 from openvima.evaluation import Results  # noqa: E402
-from openvima.evaluation.online_eval import OnlineEval  # noqa: E402
+from openvima.evaluation.recording import OnlineEval  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.learner import Learner, make_learner  # noqa: E402
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from openvima.errors import MissingExtraError
-from openvima.video.animation import Animation
+from openvima.video.encoder import Animation
 
 pytest.importorskip("torch")
 

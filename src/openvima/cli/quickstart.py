@@ -40,7 +40,7 @@ def main(
         Exit status.
     """
     from openvima.policies.base import require_torch
-    from openvima.report.assets import require_extra
+    from openvima.report.videos import require_extra
 
     _check(demonstrations=demonstrations, episodes=episodes, workers=workers)
     require_torch("training")

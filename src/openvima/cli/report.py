@@ -11,11 +11,10 @@ import tyro
 from openvima.cli.terminal import parse_list
 
 if TYPE_CHECKING:
-    from openvima.evaluation.comparison import Comparison
-    from openvima.evaluation.merging import Merged
+    from openvima.evaluation.comparison import Comparison, Merged
     from openvima.evaluation.results import Results
-    from openvima.report.confirmation import Confirmation
-    from openvima.video.clips import Clip
+    from openvima.report.text import Confirmation
+    from openvima.video.encoder import Clip
 
 _HTML, _MARKDOWN, _LATEX = (".html", ".htm"), (".md", ".markdown"), (".tex",)
 
@@ -57,10 +56,10 @@ def main(
     """
     from openvima.atomic_io import atomic_write_file
     from openvima.evaluation.comparison import compare_pairs, default_pairs
-    from openvima.report.paper import paper_tables
+    from openvima.report.table import latex as as_latex
+    from openvima.report.table import markdown as as_markdown
+    from openvima.report.tables import paper_tables
     from openvima.report.text import finding
-    from openvima.report.typesetting import latex as as_latex
-    from openvima.report.typesetting import markdown as as_markdown
 
     _check(results, out)
     evaluations = _read(results)
@@ -122,7 +121,7 @@ def _read(paths: Sequence[Path]) -> dict[Path, "Results"]:
 
 
 def _merged(evaluations: dict[Path, "Results"]) -> "Merged":
-    from openvima.evaluation.merging import merge
+    from openvima.evaluation.comparison import merge
     from openvima.report.curves import run_labels
 
     labels = run_labels([_folder(path) for path in evaluations])
@@ -132,8 +131,8 @@ def _merged(evaluations: dict[Path, "Results"]) -> "Merged":
 def _confirmations(evaluations: dict[Path, "Results"]) -> list["Confirmation"]:
     """Say of each evaluation whether its outcomes were confirmed by replay."""
     from openvima.evaluation.verification import is_marked_verified
-    from openvima.report.confirmation import Confirmation
     from openvima.report.curves import run_labels
+    from openvima.report.text import Confirmation
 
     # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
     labels = run_labels([_folder(path) for path in evaluations]) if len(evaluations) > 1 else ["DIR"]
@@ -164,8 +163,8 @@ def _page(
     confirmations: "Sequence[Confirmation]",
 ) -> Path:
     from openvima.report import write_report
-    from openvima.report.assets import require_extra
     from openvima.report.page import default_command
+    from openvima.report.videos import require_extra
 
     require_extra()
     return write_report(
@@ -185,7 +184,7 @@ def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]
     """Videos of all evaluations, under the names that policies have in the common report."""
     from dataclasses import replace
 
-    from openvima.video.clips import load_clips
+    from openvima.video.encoder import load_clips
 
     return [
         replace(clip, policy=names.get(clip.policy, clip.policy))
@@ -196,7 +195,7 @@ def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]
 
 def _default_out(evaluations: dict[Path, "Results"]) -> Path:
     """Beside the results; several have no place in common, and each may have a report of its own."""
-    from openvima.report.assets import REPORT_NAME
+    from openvima.report.videos import REPORT_NAME
 
     return _folder(next(iter(evaluations))) / REPORT_NAME if len(evaluations) == 1 else Path(REPORT_NAME)
 

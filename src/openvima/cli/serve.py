@@ -56,8 +56,8 @@ def main(
     Returns:
         Exit status.
     """
+    from openvima.evaluation.results import versions
     from openvima.evaluation.sources import policy_sources
-    from openvima.evaluation.versions import versions
     from openvima.policies import load_policy
     from openvima.serving import serve
     from openvima.serving.protocol import TOKEN_VARIABLE, require_extra

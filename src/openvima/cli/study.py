@@ -100,7 +100,7 @@ def _print_estimates(plan: "Plan", inputs: "StudyInputs", workers: int) -> None:
     from rich.table import Table
 
     from openvima.studies.estimate import estimate
-    from openvima.studies.page import duration
+    from openvima.studies.results import duration
     from openvima.studies.runner import check_plan
 
     check_plan(plan, inputs)

@@ -354,7 +354,7 @@ def print_table(table: "Table", console: "Console | None" = None, *, num_heads: 
 
 def print_files(files: Mapping[str, Path | bytes]) -> None:
     """Print the card to stdout, and the names and sizes of all files to stderr."""
-    from openvima.publishing.card import CARD_NAME
+    from openvima.publishing.push import CARD_NAME
 
     for name, content in files.items():
         size = len(content) if isinstance(content, bytes) else content.stat().st_size

@@ -15,7 +15,7 @@ from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 
 if TYPE_CHECKING:
-    from openvima.evaluation.online_eval import OnlineEval
+    from openvima.evaluation.recording import OnlineEval
     from openvima.training import TrainingConfig
 
 DESCRIPTION = """Train a policy on demonstrations by behaviour cloning, or resume an interrupted run.
@@ -150,7 +150,7 @@ def _num_processes(config: "TrainingConfig") -> int:
 def _rollout(config: "TrainingConfig") -> "OnlineEval":
     """Return rollouts of a checkpoint on the tasks of the data, with prompts in their form."""
     from openvima.data.reader import Dataset
-    from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
+    from openvima.evaluation.recording import ONLINE_EVAL_LEVEL, OnlineEval
     from openvima.scene import COMPOSED
     from openvima.scene.action import PRIMITIVES
     from openvima.tasks.registry import task_spec

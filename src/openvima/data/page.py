@@ -18,7 +18,7 @@ from openvima.multiprocess import Report
 from openvima.render import channels_last
 from openvima.render.camera import CAMERAS, View, project
 from openvima.scene import BACKGROUND_ID, Action, PromptImage
-from openvima.video.clips import png
+from openvima.video.encoder import png
 
 __all__ = ["write_page"]
 

@@ -5,29 +5,27 @@ from typing import TYPE_CHECKING
 from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
-    from openvima.evaluation.comparison import Comparison, compare
+    from openvima.evaluation.comparison import Comparison, compare, merge
     from openvima.evaluation.config import EvaluationConfig
-    from openvima.evaluation.free_play import PlayResult, play
-    from openvima.evaluation.merging import merge
     from openvima.evaluation.recording import save_episode_image
     from openvima.evaluation.results import EpisodeOutcome, Results, Row
-    from openvima.evaluation.runner import evaluate
-    from openvima.evaluation.scoring import score
+    from openvima.evaluation.runner import evaluate, score
+    from openvima.evaluation.session import PlayResult, play
     from openvima.evaluation.statistics import wilson_interval
 
 _HOMES = {
     "Comparison": "comparison",
     "EpisodeOutcome": "results",
     "EvaluationConfig": "config",
-    "PlayResult": "free_play",
+    "PlayResult": "session",
     "Results": "results",
     "Row": "results",
     "compare": "comparison",
     "evaluate": "runner",
-    "merge": "merging",
-    "play": "free_play",
+    "merge": "comparison",
+    "play": "session",
     "save_episode_image": "recording",
-    "score": "scoring",
+    "score": "runner",
     "wilson_interval": "statistics",
 }
 

@@ -27,7 +27,7 @@ from openvima.evaluation.ablations import (
     applies_to,
     canonical_ablation,
 )
-from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
+from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import PolicySource, policy_sources
 from openvima.input_files import as_path, settle

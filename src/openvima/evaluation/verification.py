@@ -14,10 +14,17 @@ from openvima.errors import ConfigError, DatasetError, OpenVimaError, echo
 from openvima.evaluation.ablations import ablated_environment
 from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import EvaluationConfig, cells
-from openvima.evaluation.results import DECLARED, FILE_NAME, EpisodeOutcome, Results, ResultsFile, Row
+from openvima.evaluation.results import (
+    DECLARED,
+    FILE_NAME,
+    EpisodeOutcome,
+    Results,
+    ResultsFile,
+    Row,
+    versions,
+)
 from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR, play
 from openvima.evaluation.runner import Report
-from openvima.evaluation.versions import versions
 from openvima.input_files import read_json
 from openvima.multiprocess import imap_unordered
 

@@ -5,14 +5,13 @@ from typing import TYPE_CHECKING
 from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
-    from openvima.publishing.demonstrations import demonstrations_card, push_demonstrations
-    from openvima.publishing.policy import policy_card, push_policy
+    from openvima.publishing.push import demonstrations_card, policy_card, push_demonstrations, push_policy
 
 _HOMES = {
-    "demonstrations_card": "demonstrations",
-    "policy_card": "policy",
-    "push_demonstrations": "demonstrations",
-    "push_policy": "policy",
+    "demonstrations_card": "push",
+    "policy_card": "push",
+    "push_demonstrations": "push",
+    "push_policy": "push",
 }
 
 __all__ = ["demonstrations_card", "policy_card", "push_demonstrations", "push_policy"]

@@ -3,33 +3,30 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.config import DEFAULT_BATCH
-from openvima.evaluation.results import Results
+from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
 from openvima.input_files import as_path, names_of
 from openvima.policies.naming import UNTRAINED
-from openvima.report import episodes, figures, fragments, published, reasons, tables, text
-from openvima.report.ablations import ablated_policies
-from openvima.report.confirmation import Confirmation
+from openvima.report import figures, published, tables, text
+from openvima.report.ablations import ablated_policies, rate_figures
 from openvima.report.curves import read_run_charts
-from openvima.report.families import family_table
-from openvima.report.level_drop import level_drop_table, level_figure
-from openvima.report.published_tasks import published_task_table
-from openvima.report.rated_ablations import rate_figures
-from openvima.video.clips import Clip
+from openvima.report.published import published_task_table
+from openvima.report.tables import family_table, level_drop_table, level_figure
+from openvima.report.text import Confirmation, plain_reason
+from openvima.video.encoder import Clip
 
 _FUNCTIONS = (  # that the templates in `html/templates/report/` call
     *(text.percent, text.exact, text.points, text.points_span, text.probability, text.span, text.counted),
     *(text.listed, text.role, text.finding, text.ablation_name, text.ablation_descriptions),
     *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
     *(published.published_rate, published.published_coverage, published.published_rows),
-    *(published.leading_models, fragments.rate_figure_html, fragments.table_html),
-    *(reasons.plain_reason, episodes.disagreements),
+    *(published.leading_models, figures.rate_figure_html, figures.table_html, text.plain_reason),
 )
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
@@ -84,11 +81,12 @@ def write_report(
     out = as_path(out)
     records = [*map(as_path, [*([metrics] if metrics else []), *names_of(runs)])]
     clips = list({clip.file_name: clip for clip in clips}.values())
-    videos = episodes.video_ids(clips)
-    listed, num_episodes = episodes.listed_episodes(results, videos)
+    videos = video_ids(clips)
+    listed, num_episodes = listed_episodes(results, videos)
     page = render_page(
         "report",
         **{function.__name__: function for function in _FUNCTIONS},
+        disagreements=disagreements,
         level_names=text.LEVEL_NAMES,
         level_meanings=text.LEVEL_MEANINGS,
         published_column=with_published
@@ -161,3 +159,78 @@ def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain value
     named = f"{UNTRAINED}:{preset}" if preset else what.get("bundled") or what.get("source")
     source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
     return name if name == source else f"{name}={source}"
+
+
+MOST_EPISODES = 4000  # that are listed; of more, failures alone
+
+
+class ListedEpisode(NamedTuple):
+    """One episode, how it ended, and the id of its video on the page; that is empty without one."""
+
+    policy: str
+    level: str
+    task: str
+    outcome: EpisodeOutcome
+    video: str
+
+    @property
+    def reason(self) -> str:
+        """Why it failed, in plain English; empty on success."""
+        return plain_reason(self.outcome.reason)
+
+    @property
+    def cause(self) -> str:
+        """The same without the names of objects, for a menu."""
+        return plain_reason(self.outcome.kind)
+
+
+class Disagreement(NamedTuple):
+    """Seeds of a task and level that only one of two policies solved."""
+
+    task: str
+    level: str
+    only_a: tuple[int, ...]
+    only_b: tuple[int, ...]
+
+
+def video_ids(clips: Sequence[Clip]) -> dict[tuple[str, str, str, int], str]:
+    """Name each video of the page, by policy, task, level and seed."""
+    return {(c.policy, c.task, c.level, c.seed): f"video-{number}" for number, c in enumerate(clips, 1)}
+
+
+def listed_episodes(
+    results: Results, videos: Mapping[tuple[str, str, str, int], str]
+) -> tuple[list[ListedEpisode], int]:
+    """List the episodes without input ablations, failures first.
+
+    Args:
+        results: The evaluation.
+        videos: Ids of the videos on the page.
+
+    Returns:
+        At most `MOST_EPISODES` episodes, and how many there are.
+    """
+    episodes = [
+        ListedEpisode(r.policy, r.level, r.task, o, videos.get((r.policy, r.task, r.level, o.seed), ""))
+        for r in results.rows
+        if not r.ablation
+        for o in r.outcomes
+    ]
+    ranked = sorted(episodes, key=lambda episode: episode.outcome.success)
+    if len(ranked) > MOST_EPISODES:
+        ranked = [episode for episode in ranked if not episode.outcome.success][:MOST_EPISODES]
+    return ranked, len(episodes)
+
+
+def disagreements(results: Results, comparison: Comparison) -> list[Disagreement]:
+    """List the episodes that only one of two policies solved; none for scores under an input ablation."""
+    found = []
+    for difference in comparison.tasks:
+        rows = [results.row(name, difference.task, difference.level) for name in (comparison.a, comparison.b)]
+        solved = [{o.seed: o.success for o in row.outcomes} for row in rows if row is not None]
+        if len(solved) == 2 and (difference.only_a or difference.only_b):
+            a, b = solved
+            only_a = tuple(seed for seed in a if a[seed] and b.get(seed) is False)
+            only_b = tuple(seed for seed in b if b[seed] and a.get(seed) is False)
+            found.append(Disagreement(difference.task, difference.level, only_a, only_b))
+    return found

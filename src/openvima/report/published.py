@@ -1,12 +1,14 @@
 """Published success rates of the papers' models, for comparison."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
 from openvima.evaluation.results import Results
+from openvima.report.figures import RateCurve, RatePoint
+from openvima.report.table import Estimate, Line, Table
 from openvima.scene.action import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 
@@ -183,3 +185,61 @@ def _by_task() -> list[dict]:
 def _content() -> dict[str, list[dict]]:
     file = resources.files("openvima.report").joinpath("published.json")
     return json.loads(file.read_text(encoding="utf-8"))
+
+
+def published_task_table(results: Results) -> Table | None:
+    """Rates by task of policies and published models, at the evaluated levels; None without any."""
+    models, policies = models_by_task(), results.policy_names()
+    lines = []
+    for level in results.levels():
+        of_level = published_tasks(level)
+        for index, task in enumerate(of_level if of_level.keys() & set(results.tasks(level)) else ()):
+            rows = [results.row(policy, task, level) for policy in policies]
+            own = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
+            elsewhere = [task_rate(model, level, task) for model in models]
+            lines.append(Line(task, (level, *own, *elsewhere), starts_group=index == 0 and bool(lines)))
+    if not lines:
+        return None
+    columns = ("task", "level", *policies, *(f"{model} {size} (published)" for model, size in models))
+    caption = f"Success rates (%) by task, measured ones with 95 % intervals. {BY_TASK}"
+    return Table("published-tasks", caption, columns, tuple(lines))
+
+
+def model_size_curves(level: str) -> list[RateCurve]:
+    """Published success rates of a level over the number of parameters, trained on all data.
+
+    The quantity is the size of the controller, without the text encoder.
+    """
+    models = [model for model in published_models() if model.data_fraction == 1 and not model.aside]
+    return _curves(models, level, name=lambda m: m.model, x=lambda m: m.num_parameters)
+
+
+def data_fraction_curves(level: str) -> list[RateCurve]:
+    """Published success rates of a level over the fraction of the demonstrations used for training."""
+    published = [model for model in published_models() if not model.aside]
+    fewer = {(model.model, model.size) for model in published if model.data_fraction < 1}
+    models = [model for model in published if (model.model, model.size) in fewer]
+    return _curves(models, level, name=lambda m: f"{m.model} {m.size}", x=lambda m: m.data_fraction)
+
+
+def _curves(
+    models: Iterable[PublishedModel],
+    level: str,
+    *,
+    name: Callable[[PublishedModel], str],
+    x: Callable[[PublishedModel], float],
+) -> list[RateCurve]:
+    points: dict[str, list[RatePoint]] = {}
+    for model in models:
+        if level in model.levels:
+            rate = model.levels[level]
+            points.setdefault(name(model), []).append(RatePoint(x(model), rate / 100, mark=model.mark(level)))
+    return [
+        RateCurve(name, tuple(sorted(found, key=lambda point: point.x)), published=True)
+        for name, found in points.items()
+    ]
+
+
+def size_ticks(curves: Sequence[RateCurve]) -> dict[float, str]:
+    """Names of the sizes of curves, as in 2e6: "2M"."""
+    return {point.x: f"{point.x / 1e6:.3g}M" for curve in curves for point in curve.points}

@@ -1,11 +1,29 @@
-"""Contents of the report's tables."""
+"""The tables of an evaluation: means by level, family and task, ablations, differences, failures."""
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
-from openvima.evaluation.results import Results
-from openvima.evaluation.statistics import Interval, mean_of_rates
-from openvima.report.text import counted
+from openvima.errors import UnknownTaskError
+from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
+from openvima.evaluation.results import LevelMean, Results
+from openvima.evaluation.statistics import Interval, difference_of_means, mean_of_rates, ratio_of_means
+from openvima.report.ablations import rate_figures
+from openvima.report.figures import RateCurve, RateFigure, RatePanel, RatePoint, rate_table
+from openvima.report.published import (
+    BESIDE,
+    is_comparable,
+    leading_models,
+    published_coverage,
+    published_rate,
+    published_rows,
+    published_task_table,
+    unpublished_settings,
+)
+from openvima.report.table import Estimate, Line, Table
+from openvima.report.text import ablation_name, counted
+from openvima.tasks.registry import task_spec
 
 _MOST_TASKS = 4  # that are named for a cause of failure
 _MOST_CAUSES = 8  # listed for a policy
@@ -58,3 +76,303 @@ def _by_task(counts: Counter[str]) -> str:
     named = ", ".join(f"{task} {count}" for task, count in ranked[:_MOST_TASKS])
     rest = len(ranked) - _MOST_TASKS
     return f"{named} and {counted(rest, 'other task')}" if rest > 0 else named
+
+
+FAMILIES = (  # in the paper's order
+    "simple_object_manipulation",
+    "visual_goal_reaching",
+    "novel_concept_grounding",
+    "one_shot_video_imitation",
+    "visual_constraint_satisfaction",
+    "visual_reasoning",
+)
+
+
+def family_table(results: Results, *, published: bool = True) -> Table:
+    """Mean success rate of each policy over the tasks of each family, level by level.
+
+    A task of several families counts in each of them; one that is not registered here in none.
+
+    Args:
+        results: The evaluation.
+        published: Whether to add a column of the model whose rates by task were published.
+    """
+    policies = results.policy_names()
+    lines = []
+    for level in results.levels():
+        for index, (family, tasks) in enumerate(_tasks(results, level).items()):
+            cells = [_mean(results, policy, level, tasks) for policy in policies]
+            rate = published_rate(level, tasks) if published else None
+            elsewhere = ["–" if rate is None else f"{rate:.1f}"] if published else []
+            name = f"{family_name(family)} ({len(tasks)})"
+            lines.append(Line(name, (level, *cells, *elsewhere), starts_group=index == 0 and bool(lines)))
+    caption = (
+        "Success rates (%) by task family, means over the tasks of each family (their number in brackets), "
+        "with 95 % intervals. A task of several families counts in each."
+    )
+    elsewhere = (f"{' '.join(BESIDE)} (published)",) if published else ()
+    return Table("families", caption, ("family", "level", *policies, *elsewhere), tuple(lines))
+
+
+def _tasks(results: Results, level: str) -> dict[str, list[str]]:
+    """Evaluated tasks of each family at a level."""
+    found: dict[str, list[str]] = {family: [] for family in FAMILIES}
+    for task in results.tasks(level):
+        for family in _families(task):
+            found.setdefault(family, []).append(task)
+    return {family: tasks for family, tasks in found.items() if tasks}
+
+
+def _families(task: str) -> tuple[str, ...]:
+    try:
+        return task_spec(task).families
+    except UnknownTaskError:
+        return ()
+
+
+def _mean(results: Results, policy: str, level: str, tasks: list[str]) -> Estimate | str:
+    rows = [row for task in tasks if (row := results.row(policy, task, level))]
+    if not rows:
+        return "–"
+    mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
+    fewer = f"{len(rows)} of {len(tasks)} tasks" if len(rows) < len(tasks) else ""
+    return Estimate(mean, interval, mark=fewer)
+
+
+def family_name(family: str) -> str:
+    """Name of a family as words."""
+    return family.replace("_", " ").replace("one shot", "one-shot")
+
+
+def compared_levels(results: Results) -> list[str]:
+    """Evaluated levels of L1 to L4, in this order."""
+    return sorted(level for level in results.levels() if level != "train")
+
+
+def level_drop_table(results: Results, *, published: bool = True) -> Table | None:
+    """Change of each policy from the first to the last level, then that of published models.
+
+    The tasks of two levels differ, so their means count as independent.
+
+    Args:
+        results: The evaluation.
+        published: Whether to add published models that have numbers for the same tasks.
+
+    Returns:
+        The table; None for fewer than two levels.
+    """
+    levels = compared_levels(results)
+    if len(levels) < 2:
+        return None
+    first, last = levels[0], levels[-1]
+    means = results.means()
+    lines = [
+        Line(policy, _cells(means[policy, "", first], means[policy, "", last]))
+        for policy in results.policy_names()
+        if {(policy, "", first), (policy, "", last)} <= means.keys()
+    ]
+    elsewhere = _published_lines(results, first, last) if published else []
+    caption = (
+        f"Change of the mean success rate from {first} to {last}: in percentage points, and relative to "
+        f"{first} (%), with 95 % intervals. The tasks of the two levels differ, so the means are treated as "
+        "independent. A relative change has no bounded interval where the first mean is close to 0."
+    )
+    columns = ("policy", first, last, "change (points)", "relative change (%)")
+    return Table("level-drop", caption, columns, (*lines, *elsewhere))
+
+
+def level_figure(results: Results, *, published: bool = True) -> RateFigure | None:
+    """Success rate of each policy over the levels; None for fewer than two levels."""
+    levels = compared_levels(results)
+    if len(levels) < 2:
+        return None
+    at = {level: float(index) for index, level in enumerate(levels)}
+    own: dict[str, list[RatePoint]] = {}
+    for mean in results.level_means():
+        if mean.level in at and not mean.ablation:
+            own.setdefault(mean.policy, []).append(RatePoint(at[mean.level], mean.mean, mean.interval))
+    curves = [RateCurve(name, tuple(points)) for name, points in own.items()]
+    for model in leading_models() if published else ():
+        rates = {level: published_rate(level, results.tasks(level), model) for level in levels}
+        known = tuple(RatePoint(at[level], r / 100) for level, r in rates.items() if r is not None)
+        if len(known) > 1:
+            curves.append(RateCurve(model.name, known, published=True))
+    panel = RatePanel("Mean success", tuple(curves))
+    ticks = {x: level for level, x in at.items()}
+    return RateFigure("level-means", "Success rates over the levels.", "level", (panel,), ticks)
+
+
+def _cells(first: LevelMean, last: LevelMean) -> tuple[Estimate | str, ...]:
+    a, b = (last.mean, last.interval), (first.mean, first.interval)
+    change = Estimate(*difference_of_means(a, b), signed=True)
+    ratio = ratio_of_means(a, b)
+    relative = "–" if ratio is None else Estimate(ratio[0] - 1, _less_one(ratio[1]), signed=True)
+    return Estimate(*b), Estimate(*a), change, relative
+
+
+def _less_one(interval: tuple[float, float]) -> tuple[float, float]:
+    return interval[0] - 1, interval[1] - 1
+
+
+def _published_lines(results: Results, first: str, last: str) -> list[Line]:
+    lines: list[Line] = []
+    for model in leading_models():
+        a, b = (published_rate(level, results.tasks(level), model) for level in (first, last))
+        if a and b is not None:
+            written = f"{a:.1f}", f"{b:.1f}", f"{b - a:+.1f}", f"{100 * (b / a - 1):+.1f}"
+            cells = tuple(text.replace("-", "−") for text in written)
+            lines.append(Line(f"{model.name} (published)", cells, starts_group=not lines))
+    return lines
+
+
+_Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
+_CONFIRMED = "Measured outcomes are confirmed by replaying the recorded actions; who acted is declared."
+_UNCONFIRMED = "Outcomes are not confirmed by replay, as `openvima verify-results` does."
+_NOISE_MARK = "≈"
+
+
+def paper_tables(
+    results: Results,
+    comparisons: Sequence[Comparison] = (),
+    *,
+    published: bool = True,
+    confirmed: bool = False,
+) -> list[Table]:
+    """Choose what a paper would print: means by level, family and task, ablations, differences.
+
+    Args:
+        results: The evaluation.
+        comparisons: Policies to compare.
+        published: Whether to add published level means of the same tasks, unless prompts or tasks differ.
+        confirmed: Whether all outcomes were confirmed by replay, which captions then say.
+    """
+    means = results.means()
+    published = published and is_comparable(results)
+    by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
+    with_ablations = [
+        _ablation_table(results, means, policy)
+        for policy in results.policy_names()
+        if any(row.policy == policy and row.ablation for row in results.rows)
+    ]
+    chosen = [
+        _mean_table(results, means, published=published),
+        level_drop_table(results, published=published),
+        family_table(results, published=published),
+        *by_policy,
+        published_task_table(results) if published else None,
+        *with_ablations,
+        *map(rate_table, rate_figures(results)),
+        *map(_difference_table, comparisons),
+    ]
+    tables = [table for table in chosen if table and table.lines]
+    if confirmed:
+        return [replace(table, caption=f"{table.caption} {_CONFIRMED}") for table in tables]
+    return [replace(tables[0], caption=f"{tables[0].caption} {_UNCONFIRMED}"), *tables[1:]]
+
+
+def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
+    levels = results.levels()
+    lines = [
+        Line(
+            policy,
+            tuple(_mean_cell(means.get((policy, "", level)), len(results.tasks(level))) for level in levels),
+        )
+        for policy in results.policy_names()
+    ]
+    sizes = ", ".join(f"{len(results.tasks(level))} at {level}" for level in levels)
+    caption = (
+        f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
+        f"{_made_of(results)}"
+    )
+    elsewhere = published_rows(results, leading_models(), keep_marks=False) if published else []
+    if elsewhere:
+        for number, (name, cells) in enumerate(elsewhere):
+            lines.append(Line(f"{name} (published)", cells, starts_group=number == 0))
+        caption += (
+            " Rows marked “published” were not measured here: they are those of the VIMA and MIDAS papers, "
+            f"in another simulator. {published_coverage(results)} Means over all tasks of a level are mostly "
+            "read off figures, to about 0.2 points, those with ~ to about 0.5."
+        )
+    return Table("levels", caption, ("policy", *levels), tuple(lines))
+
+
+def _task_table(results: Results, means: _Means, policy: str) -> Table:
+    levels = [level for level in results.levels() if any(r.level == level for r in _plain(results, policy))]
+    tasks = list(dict.fromkeys(row.task for row in _plain(results, policy)))
+    lines = []
+    for task in tasks:
+        rows = [results.row(policy, task, level) for level in levels]
+        lines.append(Line(task, tuple(Estimate(row.rate, row.interval) if row else "–" for row in rows)))
+    cells = tuple(_mean_cell(means.get((policy, "", level)), 0) for level in levels)
+    lines.append(Line("mean", cells, starts_group=True))
+    caption = f"Success rates of {policy} (%), with 95 % intervals. {_made_of(results, policy)}"
+    return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
+
+
+def _ablation_table(results: Results, means: _Means, policy: str) -> Table:
+    levels = results.levels()
+    ablations = dict.fromkeys(row.ablation for row in results.rows if row.policy == policy)
+    lines = [
+        Line(
+            ablation_name(ablation) if ablation else "none",
+            tuple(
+                _mean_cell(means.get((policy, ablation, level)), len(results.tasks(level)))
+                for level in levels
+            ),
+        )
+        for ablation in ablations
+    ]
+    caption = (
+        f"Success rates of {policy} (%) with input ablations, means over the tasks of each level, with "
+        "95 % intervals."
+    )
+    return Table(f"input-ablations-{policy}", caption, ("ablation", *levels), tuple(lines))
+
+
+def _difference_table(comparison: Comparison) -> Table:
+    first = comparison.levels[0]
+    lines = [
+        _difference_line(difference, starts_group=difference is first)
+        for difference in (*comparison.tasks, *comparison.means)
+    ]
+    a, b = (name.replace(ABLATION_SEPARATOR, ", ") for name in (comparison.a, comparison.b))
+    caption = (
+        f"Success rate of {a} minus that of {b} on the same episodes, in percentage points, with 95 % "
+        "intervals; episodes solved by one of them only; exact McNemar test, p as it is and after Holm for "
+        f"the number of such tests in all comparisons made. {_NOISE_MARK}: not significant, the "
+        "interval contains 0."
+    )
+    columns = ("task", "level", "difference", "one only", "p", "p (Holm)")
+    return Table(f"difference-{a}-{b}".replace(", ", "-"), caption, columns, tuple(lines))
+
+
+def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
+    mark = _NOISE_MARK if difference.verdict == "noise" else ""
+    cells = (
+        difference.level or "all",
+        Estimate(difference.difference, difference.interval, signed=True, mark=mark),
+        f"{difference.only_a} : {difference.only_b}",
+        f"{difference.p_value:.2g}",
+        f"{difference.p_holm:.2g}",
+    )
+    return Line(difference.task or f"mean of {len(difference.pairs)}", cells, starts_group)
+
+
+def _plain(results: Results, policy: str) -> list:
+    return [row for row in results.rows if (row.policy, row.ablation) == (policy, "")]
+
+
+def _mean_cell(mean: LevelMean | None, num_tasks: int) -> Estimate | str:
+    """A mean, with the number of its tasks where it is not that of the level."""
+    if mean is None:
+        return "–"
+    fewer = f"{len(mean.tasks)} of {num_tasks} tasks" if len(mean.tasks) < num_tasks else ""
+    return Estimate(mean.mean, mean.interval, mark=fewer)
+
+
+def _made_of(results: Results, policy: str | None = None) -> str:
+    """Say how many episodes a number is made of."""
+    rows = [row for row in results.rows if not row.ablation and policy in (None, row.policy)]
+    episodes = sorted({row.episodes for row in rows})
+    number = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
+    return f"{number} a task.{unpublished_settings(results)}"

@@ -1,11 +1,15 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
+import re
+import shlex
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from openvima.errors import cut
 from openvima.evaluation.ablations import INPUT_ABLATIONS
 from openvima.evaluation.comparison import Comparison, Difference
-from openvima.evaluation.results import Results
+from openvima.evaluation.results import BAD_ACTION, DECLARED, Results
 from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.report.published import unpublished_settings
 
@@ -208,3 +212,82 @@ def finding(comparison: Comparison, difference: Difference | None = None) -> str
         return f"On {where}, {a} − {b} is {size}: not significant."
     doubt = ", though not by the adjusted exact test" if difference.verdict == "unsure" else ""
     return f"On {where}, {a} is better than {b}: {size}{doubt}."
+
+
+_MAX_CHARACTERS = 300  # results come from anywhere
+_NAMED = re.compile(r"(distractor )?object \d+ \(([^()]*)\)")
+_UNNAMED = re.compile(r"(distractor )?\bobject\b(?: \d+)?")
+_PLAIN = (  # what fits no pattern stays
+    (r"(.*) is within [\d.]+ m of the target of (.*)", r"\1 was left where \2 belongs"),
+    (r"(.*) is where it belongs later", r"\1 was moved to a later place too early"),
+    (r"(.*) is where (.*) is", r"\1 was put where \2 lies"),
+    (r"(.*) came before (.*)", r"\1 was moved before \2"),
+    (r"the step did not bring (.*) to where it had to go next", r"\1 was not moved to its next place"),
+    (r"(\d+) goals? (?:is|are) met instead of (\d+)", r"too much was moved: \1 goals met instead of \2"),
+    (r"not done within the step limit: (\d+) of (\d+) goals were met", r"out of steps, \1 of \2 goals met"),
+    (r"not done within the step limit", "out of steps"),
+    (r"nothing was picked up within the step limit", "out of steps, nothing was picked up"),
+    (
+        r"only wrong objects were picked up within the step limit",
+        "out of steps, only wrong objects picked up",
+    ),
+    (BAD_ACTION, "the policy returned an invalid action"),
+)
+
+
+def plain_reason(reason: str) -> str:
+    """Write the reason of a failure, or a kind of reasons, in plain English.
+
+    Example:
+        >>> plain_reason("distractor object 7 (red ring) is where object 6 (tan star) is")
+        'the red ring, a distractor, was put where the tan star lies'
+        >>> plain_reason("object left the workspace")
+        'an object left the workspace'
+    """
+    text = cut(reason, _MAX_CHARACTERS)
+    text = _NAMED.sub(lambda found: f"the {found[2]}" + (", a distractor," if found[1] else ""), text)
+    text = _UNNAMED.sub(lambda found: "a distractor" if found[1] else "an object", text)
+    for pattern, plain in _PLAIN:
+        if found := re.fullmatch(pattern, text):
+            return found.expand(plain)
+    return text
+
+
+@dataclass(frozen=True, slots=True)
+class Confirmation:
+    """Whether the outcomes of an evaluation were confirmed.
+
+    Args:
+        folder: Name of its folder, for the command that confirms it.
+        confirmed: Whether the folder holds the mark of `verify_results` for just these results.
+        replayable: Whether the actions were recorded.
+    """
+
+    folder: str
+    confirmed: bool
+    replayable: bool = True
+
+    @staticmethod
+    def of(results: Results, folder: str, *, confirmed: bool) -> "Confirmation":
+        """Describe the confirmation of some results."""
+        return Confirmation(folder, confirmed, bool(results.actions_sha256))
+
+    @property
+    def text(self) -> str:
+        """What is known, and how to check it, in two or three sentences."""
+        if self.confirmed:
+            return (
+                "Confirmed by replay: with the recorded actions, every episode ends as stated. Declared, not "
+                f"proven: {DECLARED}. The mark is a file of the folder; if that came from elsewhere, it is a "
+                f"claim until {self.command} confirms it again."
+            )
+        if not self.replayable:
+            return "Not confirmed by replay: the actions were not recorded."
+        return (
+            f"Not confirmed by replay. {self.command} plays the recorded actions again, without the policy."
+        )
+
+    @property
+    def command(self) -> str:
+        """The command that confirms the evaluation."""
+        return f"openvima verify-results {shlex.quote(self.folder)}"

@@ -3,20 +3,22 @@
 from typing import TYPE_CHECKING
 
 from openvima.imports import lazy_names
-from openvima.studies.scales import SCALES, Scale, scale_named
 from openvima.studies.study import (
+    SCALES,
     Demonstrations,
     EvaluationSettings,
     PublishedPoint,
     Run,
+    Scale,
     Study,
     StudyInputs,
     published_points,
+    scale_named,
 )
 
 if TYPE_CHECKING:
-    from openvima.studies.registry import STUDIES, check_options, make_study
     from openvima.studies.runner import Execution, run_study
+    from openvima.studies.study import STUDIES, check_options, make_study
 
 __all__ = [
     "SCALES",
@@ -41,8 +43,8 @@ __getattr__, __dir__ = lazy_names(
     {
         "Execution": "runner",
         "run_study": "runner",
-        "STUDIES": "registry",
-        "check_options": "registry",
-        "make_study": "registry",
+        "STUDIES": "study",
+        "check_options": "study",
+        "make_study": "study",
     },
 )

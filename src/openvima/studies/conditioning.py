@@ -1,7 +1,6 @@
 """How should the decoder read the prompt: by cross-attention, or as a prefix of its own sequence?"""
 
-from openvima.studies.scales import NANO_POINTER
-from openvima.studies.study import Run, Study, StudyInputs
+from openvima.studies.study import NANO_POINTER, Run, Study, StudyInputs
 
 CONDITIONINGS = ("cross-attention", "prefix")
 

@@ -1,7 +1,6 @@
 """How does success fall when words of the prompt are masked, swapped or replaced?"""
 
-from openvima.studies.scales import L4_TASKS, TRAINING_TASKS
-from openvima.studies.study import Study, StudyInputs
+from openvima.studies.study import L4_TASKS, TRAINING_TASKS, Study, StudyInputs
 
 ABLATIONS = (
     "masked_words:0.1",

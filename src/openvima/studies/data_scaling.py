@@ -3,9 +3,8 @@
 Every fraction is trained for the same number of steps, and each training seed draws its own fraction.
 """
 
-from openvima.report.published_curves import data_fraction_curves
-from openvima.studies.scales import NANO_POINTER
-from openvima.studies.study import Run, Study, StudyInputs, published_points
+from openvima.report.published import data_fraction_curves
+from openvima.studies.study import NANO_POINTER, Run, Study, StudyInputs, published_points
 
 FRACTIONS = (0.001, 0.01, 0.1, 1.0)
 

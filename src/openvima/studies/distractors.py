@@ -1,7 +1,6 @@
 """How does success fall with the number of distractors on the table?"""
 
-from openvima.studies.scales import L4_TASKS, TRAINING_TASKS
-from openvima.studies.study import Study, StudyInputs
+from openvima.studies.study import L4_TASKS, TRAINING_TASKS, Study, StudyInputs
 
 COUNTS = (0, 1, 2, 4, 6)
 WITHOUT_OPTION = "pick_in_order_then_restore"

@@ -1,8 +1,7 @@
 """Can a policy solve a task that it was not trained on, from an example in the prompt?"""
 
-from openvima.evaluation.in_context import IN_CONTEXT_TASKS
-from openvima.studies.scales import NANO_POINTER
-from openvima.studies.study import Run, Settings, Study, StudyInputs
+from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS
+from openvima.studies.study import NANO_POINTER, Run, Settings, Study, StudyInputs
 
 # Of several steps too, whose motions are worth following.
 NANO_TASKS = (

@@ -2,8 +2,7 @@
 
 from openvima.policies.presets import PUBLISHED
 from openvima.report.published import leading_models
-from openvima.studies.scales import NANO_POINTER
-from openvima.studies.study import PublishedPoint, Run, Study, StudyInputs
+from openvima.studies.study import NANO_POINTER, PublishedPoint, Run, Study, StudyInputs
 
 
 def level_drop(inputs: StudyInputs) -> Study:

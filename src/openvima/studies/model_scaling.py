@@ -1,7 +1,7 @@
 """How does success depend on the size of the network?"""
 
 from openvima.policies.presets import PUBLISHED, SIZE_NAMES
-from openvima.report.published_curves import model_size_curves, size_ticks
+from openvima.report.published import model_size_curves, size_ticks
 from openvima.studies.study import Run, Study, StudyInputs, published_points
 
 NANO_WIDTHS = (32, 64, 128)  # of the decoder of vima-nano

@@ -3,8 +3,7 @@
 from openvima.env.config import EnvConfig
 from openvima.errors import ConfigError
 from openvima.report.published import published_models
-from openvima.studies.scales import L4_TASKS, TRAINING_TASKS
-from openvima.studies.study import PublishedPoint, Run, Study, StudyInputs
+from openvima.studies.study import L4_TASKS, TRAINING_TASKS, PublishedPoint, Run, Study, StudyInputs
 
 LEVELS = ("L1", "L2", "L3", "L4")
 

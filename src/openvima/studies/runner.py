@@ -17,10 +17,9 @@ from openvima.evaluation.runner import evaluate_prepared, prepare
 from openvima.input_files import as_path, read_json
 from openvima.multiprocess import check_workers, imap_unordered
 from openvima.policies.base import require_torch
-from openvima.report.assets import require_extra
-from openvima.studies.page import study_page
+from openvima.report.videos import require_extra
 from openvima.studies.plan import COST_FILE, Evaluation, Plan, Subset, Training, plan_study, record_of
-from openvima.studies.results import study_costs, study_points
+from openvima.studies.results import study_costs, study_page, study_points
 from openvima.studies.study import Demonstrations, Study, StudyInputs
 from openvima.training.validation import flatten
 

@@ -1,15 +1,111 @@
-"""A study as data: a question, a list of runs, how they are evaluated, and published numbers beside."""
+"""A study as data: its runs, how they are evaluated, published numbers beside, and the scales it comes in."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
+from types import MappingProxyType
 from typing import Any, Literal
 
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, unknown_name
 from openvima.evaluation.sources import policy_sources
 from openvima.policies.naming import SMALL
-from openvima.report.rate_curves import RateCurve
-from openvima.studies.scales import Scale
+from openvima.policies.presets import SIZE_NAMES
+from openvima.report.figures import RateCurve
+from openvima.user_code import is_code, load_function
+
+NANO = "nano"
+TRAINING_TASKS = (  # of the papers
+    "visual_manipulation",
+    "scene_understanding",
+    "rotate",
+    "rearrange",
+    "rearrange_then_restore",
+    "novel_adj",
+    "novel_noun",
+    "twist",
+    "follow_order",
+    "sweep_without_exceeding",
+    "same_shape",
+    "manipulate_old_neighbor",
+    "pick_in_order_then_restore",
+)
+L4_TASKS = ("novel_adj_and_noun", "follow_motion", "sweep_without_touching", "same_texture")
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Sizes of a study.
+
+    Args:
+        name: A size of the presets: "nano", "2m" to "200m".
+        recipe: Training settings; `settings` take precedence.
+        settings: Training settings by dotted name.
+        tasks: Tasks to train on.
+        new_tasks: Tasks that are evaluated and not trained on, at L4.
+        demonstrations: Demonstrations of each task.
+        levels: Levels to evaluate.
+        episodes: Episodes of each task, level and training seed.
+    """
+
+    name: str
+    recipe: str
+    settings: Mapping[str, Any]  # Any: values of any setting
+    tasks: tuple[str, ...]
+    new_tasks: tuple[str, ...]
+    demonstrations: int
+    levels: tuple[str, ...] = ("L1", "L2", "L3", "L4")
+    episodes: int = 200
+
+    @property
+    def is_nano(self) -> bool:
+        """Whether it is the scale of two cores, with networks that have their own vocabulary."""
+        return self.name == NANO
+
+
+# Contrastive pretraining takes most of a training: it is shorter than in the recipe, and equal for all runs.
+NANO_POINTER: Mapping[str, Any] = MappingProxyType(  # Any: values of any setting
+    {"preset": NANO, "pretraining.steps": 150, "pretraining.num_scenes": 1200}
+)
+# Two cores: one training takes minutes.
+_NANO = Scale(
+    name=NANO,
+    recipe="nano",
+    settings=MappingProxyType({"schedule.steps": 400, "loader.batch_size": 64, "runtime.tensorboard": False}),
+    tasks=("visual_manipulation", "scene_understanding", "rotate", "novel_noun"),
+    new_tasks=("novel_adj_and_noun",),
+    demonstrations=1000,
+    episodes=50,
+)
+
+
+def _published(size: str) -> Scale:
+    """Everything as in the papers, save the size of the network."""
+    return Scale(
+        name=size,
+        recipe="paper",
+        settings=MappingProxyType({"schedule.steps": 47_000}),  # 10 epochs of 600,000, in batches of 128
+        tasks=TRAINING_TASKS,
+        new_tasks=L4_TASKS,
+        demonstrations=50_000,
+    )
+
+
+SCALES: Mapping[str, Scale] = MappingProxyType(
+    {NANO: _NANO, **{size: _published(size) for size in SIZE_NAMES if size != NANO}}
+)
+
+
+def scale_named(name: str) -> Scale:
+    """Return a scale.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    if name not in SCALES:
+        raise ConfigError(unknown_name("scale", name, SCALES))
+    return SCALES[name]
+
 
 Settings = Mapping[str, Any]  # of `TrainingConfig`, by dotted name. Any: values of any setting
 
@@ -168,7 +264,7 @@ class PublishedPoint:
 def published_points(
     levels: Iterable[str], curves_of: Callable[[str], Iterable[RateCurve]]
 ) -> tuple[PublishedPoint, ...]:
-    """Return the points of published curves, such as those of `openvima.report.published_curves`.
+    """Return the points of published curves, such as those of `openvima.report.published`.
 
     Args:
         levels: Levels.
@@ -234,3 +330,59 @@ class Study:
                 raise ConfigError(
                     f"run {run.label!r} trains, but has no demonstrations; give the study `data`."
                 )
+
+
+# Name → what it asks. Each is a function of the same name in a module of the same name, with underscores.
+STUDIES: Mapping[str, str] = MappingProxyType(
+    {
+        "model-scaling": "success by the size of the network, all architectures",
+        "data-scaling": "success by the fraction of the demonstrations",
+        "image-tokens": "objects, perceivers, patches or one token",
+        "conditioning": "cross-attention to the prompt, or the prompt as a prefix",
+        "text-encoder": "sizes of T5, and how many of its layers are trained",
+        "distractors": "success of policies by the number of distractors",
+        "corrupted-prompts": "success of policies with masked, swapped or replaced words",
+        "level-drop": "from L1 to L4, by architecture",
+        "midas": "autoregressive actions, visual residual, pretraining",
+        "in-context": "examples in prompts of tasks left out of the training",
+        "published": "a public checkpoint with the original assets, beside its published numbers",
+    }
+)
+
+# Options that not every study takes.
+_TAKERS = {"policy": ("distractors", "corrupted-prompts"), "checkpoint": ("published",)}
+
+
+def check_options(name: str, inputs: StudyInputs) -> None:
+    """Check that a study takes the options; those of users take all.
+
+    Raises:
+        ConfigError: An option has no effect on the study.
+    """
+    given = {"policy": inputs.policies, "checkpoint": inputs.checkpoint}
+    for option, takers in _TAKERS.items():
+        if given[option] and name in STUDIES and name not in takers:
+            raise ConfigError(f"study {name!r} takes no --{option}; {' and '.join(takers)} do.")
+    if inputs.t5 is not None and inputs.scale.is_nano and name in STUDIES:
+        raise ConfigError("scale nano has its own vocabulary and no T5; leave --t5 out.")
+
+
+def make_study(name: str, inputs: StudyInputs) -> Study:
+    """Return a study.
+
+    Args:
+        name: One of `STUDIES`, or FILE.py:FUNCTION or MODULE:FUNCTION, a function of `StudyInputs`.
+        inputs: Scale and options.
+
+    Raises:
+        ConfigError: There is no such study, it lacks an option, or the function returns something else.
+    """
+    if is_code(name):
+        study = load_function(name, what="study")(inputs)
+        if not isinstance(study, Study):
+            raise ConfigError(f"study is {name!r}, which returned a {type(study).__name__}; return a Study.")
+        return study
+    if name not in STUDIES:
+        raise ConfigError(unknown_name("study", name, STUDIES))
+    module = name.replace("-", "_")
+    return getattr(import_module(f"openvima.studies.{module}"), module)(inputs)

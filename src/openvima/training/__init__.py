@@ -5,7 +5,7 @@ from pathlib import Path
 
 from openvima.multiprocess import Report
 from openvima.training.config import TrainingConfig
-from openvima.video.animation import Animation
+from openvima.video.encoder import Animation
 
 
 def train(

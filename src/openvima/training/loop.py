@@ -35,7 +35,7 @@ from openvima.training.run_folder import (
     provenance,
 )
 from openvima.training.trackers import Tracker, open_trackers
-from openvima.video.animation import Animation
+from openvima.video.encoder import Animation
 
 
 def learning_rate_at(step: int, schedule: ScheduleConfig, *, peak: float, num_steps: int) -> float:

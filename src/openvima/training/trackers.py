@@ -13,7 +13,7 @@ from openvima.errors import InputFileError
 from openvima.imports import import_extra
 from openvima.input_files import read_text
 from openvima.training.config import RunConfig
-from openvima.video.animation import Animation
+from openvima.video.encoder import Animation
 
 BOARD_FOLDER = "tensorboard_log"  # events hold times, so they differ between machines
 WANDB_FOLDER = "wandb_log"

@@ -1,39 +1,158 @@
-"""The input ablations: what each changes, its rate, and how names are read."""
+"""Input ablations: each removes, replaces or corrupts one input of a policy, or makes the episodes harder.
 
-from collections.abc import Callable
+An ablation is named NAME or NAME:RATE. Names joined by "+", such as `masked_words:0.2+noisy_boxes:3`, are one
+ablation of all of them. `INPUT_ABLATIONS` lists them; those that change the prompt are functions of
+`prompt_ablations.py`. Under other task options a seed stands for another scene, so these episodes are not
+paired with the plain ones.
+
+Random choices follow from the episode's task, level and seed and the ablation's name, not from the batch or
+the number of workers. They are the same at every rate: what a low rate masks or swaps, a high one does too.
+"""
+
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from openvima.env.config import EnvConfig
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ConfigError, echo, unknown_name
-from openvima.evaluation.ablations.environments import (
-    allows_num_distractors,
-    has_form,
-    with_num_distractors,
-    with_paraphrased_prompts,
-    with_text_prompts,
-)
-from openvima.evaluation.ablations.images import NEUTRAL_PROMPT, with_images_of_another
-from openvima.evaluation.ablations.inputs import AblatedInput
-from openvima.evaluation.ablations.objects import jittered, shuffled, with_shuffled_prompt_objects
-from openvima.evaluation.ablations.words import (
+from openvima.evaluation.prompt_ablations import (
+    NEUTRAL_PROMPT,
+    demonstrated,
     gibberish,
+    has_phrasings,
+    in_context_prompt,
+    in_held_out_phrasing,
     masked,
     names_attribute,
     scrambled,
     swapped,
+    with_images_of_another,
     with_other_attribute,
 )
-from openvima.evaluation.in_context import in_context_prompt
-from openvima.evaluation.oracle_demonstration import demonstrated
-from openvima.evaluation.phrasings import has_phrasings, in_held_out_phrasing
-from openvima.policies.naming import ORACLE, RANDOM
-from openvima.tasks.options import MAX_DISTRACTORS
-from openvima.tasks.sampling import make_rng
+from openvima.evaluation.sources import ORACLE, RANDOM
+from openvima.perception.boxes import BoxJitter
+from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
+from openvima.tasks.options import MAX_DISTRACTORS, TaskOptions
+from openvima.tasks.sampling import check_task_options, make_rng, takes_prompts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AblatedInput:
+    """Inputs of a policy in one episode.
+
+    Args:
+        prompt: The prompt.
+        id_map: Maps each object id to that in observations, shape (256,), uint8; None is the identity.
+        jitter: Moves the boxes of observations; None leaves them.
+    """
+
+    prompt: RenderedPrompt
+    id_map: np.ndarray | None = None
+    jitter: BoxJitter | None = None
+
+    def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:  # Any: as the environment's
+        """Return the next observation of the episode, with mapped ids and moved boxes."""
+        if self.id_map is not None and "segm" in observation:
+            observation = {**observation, "segm": renumbered(observation["segm"], self.id_map)}
+        return observation if self.jitter is None else self.jitter.observation(observation)
+
+
+def renumbered(segm: Mapping[str, np.ndarray], id_map: np.ndarray) -> dict[str, np.ndarray]:
+    """Map the ids of a segmentation, view by view."""
+    return {view: id_map[ids] for view, ids in segm.items()}
+
+
+_NUM_DISTRACTORS = "num_distractors"
+
+
+def with_text_prompts(env_config: EnvConfig, _: float) -> EnvConfig:
+    """Describe all objects in prompts; synonyms stay if they are asked for."""
+    _form, comma, synonyms = env_config.prompts.partition(",")
+    return replace(env_config, prompts=f"text{comma}{synonyms}")
+
+
+def with_paraphrased_prompts(env_config: EnvConfig, _: float) -> EnvConfig:
+    """Describe objects by synonyms: all of them, or some where prompts are mixed."""
+    form = "mixed" if env_config.prompts.startswith("mixed") else "text"
+    return replace(env_config, prompts=f"{form},paraphrased")
+
+
+def has_form(task: str, env_config: EnvConfig) -> bool:
+    """Whether a task takes the prompts of an environment, with an object image to describe."""
+    return takes_prompts(task, "text") and takes_prompts(task, env_config.prompts)
+
+
+def with_num_distractors(env_config: EnvConfig, count: float) -> EnvConfig:
+    """Put so many distractors on the table, in place of the number that the settings name."""
+    others = [
+        entry for entry in TaskOptions.parse(env_config.task_options).entries if entry[1] != _NUM_DISTRACTORS
+    ]
+    options = TaskOptions((*others, ("", _NUM_DISTRACTORS, str(int(count)))))
+    return replace(env_config, task_options=str(options))
+
+
+def allows_num_distractors(task: str, env_config: EnvConfig) -> bool:
+    """Whether a task has the option and takes as many."""
+    entries = TaskOptions.parse(env_config.task_options).entries
+    (own,) = (entry for entry in entries if entry[1] == _NUM_DISTRACTORS)
+    try:
+        check_task_options((task,), str(TaskOptions((own,))))
+    except ConfigError:
+        return False
+    return True
+
+
+def shuffled(env: TabletopEnv, seen: AblatedInput, rng: np.random.Generator) -> AblatedInput:
+    """Permute the ids of the objects on the table, and of those in the scenes of the prompt.
+
+    The order in which a prompt lists the objects of an image stays: a policy that ignores ids and their order
+    acts exactly as before.
+    """
+    prompt = seen.prompt
+    id_map = _permutation({placement.id for placement in env.episode.problem.scene.placements}, rng)
+    scenes = [image for image in prompt.images.values() if image.kind == "scene"]
+    # One permutation for all images, as in the environment: an object keeps its id from frame to frame.
+    prompt_id_map = _permutation({record.object_id for image in scenes for record in image.objects}, rng)
+    images = {
+        name: _relabelled(image, prompt_id_map) if image.kind == "scene" else image
+        for name, image in prompt.images.items()
+    }
+    return replace(seen, prompt=RenderedPrompt(prompt.text, images), id_map=id_map)
+
+
+def with_shuffled_prompt_objects(prompt: RenderedPrompt, rng: np.random.Generator) -> RenderedPrompt:
+    """Let each prompt image list its objects in an order of its own; an object keeps its id."""
+    images = {
+        name: replace(image, objects=tuple(image.objects[k] for k in rng.permutation(len(image.objects))))
+        for name, image in prompt.images.items()
+    }
+    return replace(prompt, images=images)
+
+
+def jittered(seen: AblatedInput, pixels: int, rng: np.random.Generator) -> AblatedInput:
+    """Move the borders of all boxes, in prompt images and observations."""
+    jitter = BoxJitter(pixels, rng)
+    images = {name: jitter.prompt_image(image) for name, image in seen.prompt.images.items()}
+    return replace(seen, prompt=RenderedPrompt(seen.prompt.text, images), jitter=jitter)
+
+
+def _permutation(ids: set[int], rng: np.random.Generator) -> np.ndarray:
+    table = np.arange(256, dtype=np.uint8)
+    table[sorted(ids)] = rng.permutation(sorted(ids))
+    return table
+
+
+def _relabelled(image: PromptImage, id_map: np.ndarray) -> PromptImage:
+    records = tuple(
+        ObjectRecord(int(id_map[record.object_id]), record.object, record.texture) for record in image.objects
+    )
+    return replace(image, segm=renumbered(image.segm, id_map), objects=records)
+
 
 DETECTED_BOXES = "detected_boxes"
 NOISY_BOXES = "noisy_boxes"

@@ -15,11 +15,11 @@ from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
 from openvima.multiprocess import imap_unordered
-from openvima.policies.naming import BUNDLED, ORACLE
-from openvima.report.confirmation import Confirmation
+from openvima.policies.naming import BUNDLED
 from openvima.report.curves import METRICS_FILE
 from openvima.report.page import default_command, write_report
-from openvima.video.clips import Clip, load_clips, png, save_clips
+from openvima.report.text import Confirmation
+from openvima.video.encoder import Clip, load_clips, png, save_clips
 
 REPORT_NAME = "report.html"
 _EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")

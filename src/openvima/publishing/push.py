@@ -1,17 +1,31 @@
-"""A checkpoint on the Hugging Face Hub, with a model card."""
+"""Checkpoints and demonstrations on the Hugging Face Hub, each with a card."""
 
 import json
+import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from openvima import __version__
-from openvima.errors import CheckpointError, ConfigError, InputFileError, OpenVimaError
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, fingerprint
+from openvima.data.reader import Dataset
+from openvima.errors import (
+    CheckpointError,
+    ConfigError,
+    HubError,
+    InputFileError,
+    OpenVimaError,
+    ShardError,
+    echo,
+)
 from openvima.evaluation.results import FILE_NAME, Results
 from openvima.evaluation.sources import weights_hash
 from openvima.evaluation.verification import is_marked_verified
-from openvima.hub import HubName, commit
+from openvima.hub import HubName, commit, hub_name
 from openvima.input_files import as_path, read_text, read_yaml
 from openvima.policies.base import require_torch
 from openvima.policies.naming import (
@@ -21,19 +35,10 @@ from openvima.policies.naming import (
     WEIGHTS_FILE,
     find_checkpoint,
 )
-from openvima.publishing.card import (
-    CARD_NAME,
-    TAGS,
-    checked_licence,
-    facts,
-    fenced,
-    front_matter,
-    repository,
-)
 from openvima.report.page import default_command
-from openvima.report.paper import paper_tables
+from openvima.report.table import Line, Table, markdown
+from openvima.report.tables import paper_tables
 from openvima.report.text import role
-from openvima.report.typesetting import markdown
 
 _SESSIONS_FILE = "sessions_log.jsonl"
 _BUNDLED_RUN = "training"  # settings of the run beside a bundled checkpoint
@@ -135,7 +140,7 @@ def policy_card(
         f"## Network\n\n{_network(folder)}",
         f"## Training\n\n{_training(folder)}",
         f"## Scores\n\n{_scores(scores, target, confirmed=confirmed)}",
-        f"## Use\n\n{_use(target)}",
+        f"## Use\n\n{_use_policy(target)}",
         f"## Licence\n\nWeights: {checked_licence(licence)}. openvima: MIT.\n",
     ]
     return "\n".join(parts)
@@ -267,7 +272,154 @@ def _scores(scores: Results | None, name: HubName, *, confirmed: bool) -> str:
     return f"{role(scores, policy)} `{FILE_NAME}` holds every outcome ({versions}).\n\n{command}\n{tables}"
 
 
-def _use(name: HubName) -> str:
+def _use_policy(name: HubName) -> str:
     shell = f"pip install 'openvima[train,hub]'\nopenvima evaluate --policy {name} --out scores"
     python = f'from openvima.policies import load_policy\n\npolicy = load_policy("{name}")'
     return f"{fenced(shell, 'sh')}\n{fenced(python, 'python')}"
+
+
+_SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
+
+
+def push_demonstrations(
+    folder: str | Path, name: str, *, private: bool = False, message: str = ""
+) -> HubName:
+    """Push a finished data set to the Hugging Face Hub in one commit, with a dataset card.
+
+    Shards, index and manifest are pushed; failed episodes and object caches are not.
+
+    Args:
+        folder: Folder of demonstrations.
+        name: The repository, as OWNER/NAME or OWNER/NAME@BRANCH; it is created if there is none.
+        private: Whether a new repository is private.
+        message: Of the commit.
+
+    Returns:
+        The repository at the new commit; `Dataset` takes it with "hf://" in front.
+
+    Raises:
+        DatasetError: The folder is no finished data set.
+        ShardError: A shard is not the one that the manifest describes.
+        HubError: The Hub refuses or cannot be reached.
+        MissingExtraError: `huggingface_hub` is not installed.
+    """
+    target, files = repository(name), demonstrations_files(folder, name)
+    note = message or f"Push with openvima {__version__}"
+    return commit(target, files, kind="dataset", message=note, private=private)
+
+
+def demonstrations_files(folder: str | Path, name: str) -> dict[str, Path | bytes]:
+    """Return what `push_demonstrations` pushes: path in the repository to a local file or content."""
+    dataset = Dataset(folder)
+    for shard, entry in dataset.manifest["shards"].items():
+        if fingerprint(dataset.path / shard)["sha256"] != entry["sha256"]:
+            raise ShardError(
+                f"{dataset.path / shard} is damaged: its checksum is not that of the manifest. "
+                f"`openvima data verify {shlex.quote(str(dataset.path))}` says more."
+            )
+    files: dict[str, Path | bytes] = {CARD_NAME: demonstrations_card(dataset, name).encode()}
+    names = (MANIFEST_NAME, INDEX_NAME, *dataset.manifest["shards"])
+    return files | {file: dataset.path / file for file in names}
+
+
+def demonstrations_card(dataset: Dataset, name: str) -> str:
+    """Write the card of a data set: contents by task, provenance, licence.
+
+    Args:
+        dataset: The data set.
+        name: The repository, as for `push_demonstrations`.
+
+    Returns:
+        Markdown with the metadata of the Hub in front.
+
+    Raises:
+        ConfigError: The licence of the data set is no identifier.
+    """
+    manifest, target = dataset.manifest, repository(name)
+    counts = manifest["counts"]
+    metadata = {
+        "license": [checked_licence(licence) for licence in manifest["licence"].split(" AND ")],
+        "task_categories": ["robotics"],
+        "tags": TAGS,
+        "size_categories": [next((s for n, s in _SIZES.items() if counts["episodes"] < n), "1M<n<10M")],
+    }
+    provenance = {
+        "episodes": f"{counts['episodes']:,}",
+        "steps": f"{counts['steps']:,}",
+        "content hash": manifest["content_hash"],
+        "written by": manifest["command"],
+        **{package: f"version {version}" for package, version in sorted(manifest["versions"].items())},
+    }
+    lines = tuple(
+        Line(task, (f"{row['episodes']:,}", f"{row['steps']:,}", f"{100 * row['success_rate']:.1f}"))
+        for task, row in manifest["tasks"].items()
+    )
+    columns = ("task", "episodes", "steps", "oracle success (%)")
+    contents = Table("tasks", "Demonstrations by task.", columns, lines)
+    parts = [
+        front_matter(metadata),
+        f"# {target.repo.partition('/')[2]}\n",
+        "Demonstrations of VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.\n",
+        f"## Contents\n\n{markdown([contents])}",
+        f"## Provenance\n\n{facts('What the manifest records.', provenance)}",
+        "Settings that decide the content:\n",
+        fenced(json.dumps(manifest["config"], indent=1, sort_keys=True, ensure_ascii=False), "json"),
+        f"## Use\n\n{_use_demonstrations(target)}",
+        f"## Licence\n\n{manifest['licence']}\n",
+    ]
+    return "\n".join(parts)
+
+
+def _use_demonstrations(name: HubName) -> str:
+    shell = (
+        f"pip install 'openvima[train,hub]'\nopenvima data info hf://{name}\n"
+        f"openvima train --data hf://{name} --preset nano --out run"
+    )
+    python = f'from openvima.data import Dataset\n\nepisode = Dataset("hf://{name}")[0]'
+    return f"{fenced(shell, 'sh')}\n{fenced(python, 'python')}"
+
+
+CARD_NAME = "README.md"
+TAGS = ["openvima", "vima-bench", "multimodal-prompts", "imitation-learning"]
+_LICENCE = re.compile(r"[a-z0-9][a-z0-9.+-]{0,63}")
+
+
+def repository(text: str) -> HubName:
+    """Read the name of the repository to push to.
+
+    Raises:
+        HubError: It is none.
+    """
+    name = hub_name(text if text.startswith("hf:") else f"hf://{text}")
+    if name is None:
+        raise HubError(f"{text!r} names no repository on the Hub; give OWNER/NAME or OWNER/NAME@BRANCH.")
+    return name
+
+
+def checked_licence(licence: str) -> str:
+    """Return the identifier of a licence as the Hub writes it.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    if not _LICENCE.fullmatch(licence.lower()):
+        raise ConfigError(f"licence is {echo(repr(licence))}; give an identifier such as mit or cc-by-4.0.")
+    return licence.lower()
+
+
+def front_matter(values: Mapping[str, Any]) -> str:  # Any: plain values
+    """Write the metadata of a card."""
+    return f"---\n{yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)}---\n"
+
+
+def facts(caption: str, values: Mapping[str, object]) -> str:
+    """Write a table of facts in Markdown, without those that are None or empty."""
+    lines = tuple(
+        Line(name, (echo(str(value)),)) for name, value in values.items() if value not in (None, "", [])
+    )
+    return markdown([Table("facts", caption, ("", ""), lines)])
+
+
+def fenced(text: str, language: str = "") -> str:
+    """Write a block of code, which nothing in the text can end."""
+    return f"```{language}\n{text.replace('`', chr(39)).rstrip()}\n```\n"

@@ -1,0 +1,284 @@
+"""Prompts under input ablations: other words, other images, or an example in place of the description.
+
+Words: image slots and their order stay. A word is a run of letters, with hyphens inside, or a whole number.
+Source of masked and swapped words: VIMA (Jiang et al. 2023), robustness against incomplete and corrupted
+prompts; the rates are free here. Held-out phrasings: twenty of each of five tasks, never trained on.
+
+In-context evaluation: prompts of three tasks, edited to contain an example, as inverse dynamics does.
+
+| task | edited prompt |
+|---|---|
+| `twist` | "Follow this motion: {before} {after} for all red swirl objects." |
+| `follow_motion` | "Follow this motion for {object}: {frames}.", its own prompt |
+| `follow_order` | "Follow this motion: {frames}." |
+
+All images are those of the task's own prompt, of `twist` the first pair. Policies are trained without these
+tasks. Source: MIDAS (Li et al. 2023); which pair of `twist` it shows is not published.
+
+Oracle demonstration: the oracle's observations in the very episode become the prompt "Follow this motion:
+frame … frame". It contains the answer, so this measures whether a policy reproduces what it sees.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import ConfigError, OracleError, PromptError, SamplingError, echo, unknown_name
+from openvima.policies.tokenizer import UNKNOWN, benchmark_vocabulary
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import Episode, ObjectRecord, Prompt, RenderedPrompt
+from openvima.tasks import twist
+from openvima.tasks.prompts import MULTIMODAL, Phrasings, read_phrasings, rephrased, rewritten
+from openvima.tasks.registry import task_spec
+from openvima.tasks.sampling import make_rng, sample_episode
+from openvima.training.augmentation.prompts import MOTION_TEXT, motion_prompt
+
+_SLOT_OR_WORD = re.compile(rf"\{{\w+\}}|{UNKNOWN}|[^\W\d_]+(?:-[^\W\d_]+)*|[0-9]+")
+_SLOT_OR_PIECE = re.compile(r"\{\w+\}|[A-Za-z]+(?:-[A-Za-z]+)*|\d+|\S")
+_COMPARED = re.compile(r"(?<=\bsame )(texture|profile)\b")
+_LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+
+def masked(text: str, rate: float, rng: np.random.Generator) -> str:
+    """Replace each word by the unknown token with a probability.
+
+    Example:
+        >>> masked("Put the {a} into it.", 1, np.random.default_rng(0))
+        '<unknown> <unknown> {a} <unknown> <unknown>.'
+    """
+    words = _words(text)
+    return _with_words(text, [UNKNOWN if rng.random() < rate else word.group() for word in words])
+
+
+def swapped(text: str, rate: float, rng: np.random.Generator) -> str:
+    """Swap neighbouring words, from left to right, each pair with a probability.
+
+    Neighbours have nothing but space between them, so no word crosses an image or a mark. A word may be
+    carried on by the next swap; on average that fraction of the neighbouring pairs is swapped.
+
+    Example:
+        >>> swapped("Put the {a} into it.", 1, np.random.default_rng(0))
+        'the Put {a} it into.'
+    """
+    places = _words(text)
+    words = [place.group() for place in places]
+    for i in range(len(words) - 1):
+        are_neighbours = not text[places[i].end() : places[i + 1].start()].strip()
+        if are_neighbours and rng.random() < rate:
+            words[i], words[i + 1] = words[i + 1], words[i]
+    return _with_words(text, words)
+
+
+def gibberish(text: str, rng: np.random.Generator) -> str:
+    """Replace the letters of each word by random ones, in each place of a word by the same."""
+    known: dict[str, str] = {}
+
+    def replaced(word: str) -> str:
+        if word.isdecimal() or word == UNKNOWN:
+            return word
+        if word.lower() not in known:
+            drawn = iter(rng.choice(list(_LETTERS), len(word)).tolist())
+            known[word.lower()] = "".join(next(drawn) if letter != "-" else "-" for letter in word)
+        new = known[word.lower()]
+        return new.capitalize() if word[0].isupper() else new
+
+    return _with_words(text, [replaced(word.group()) for word in _words(text)])
+
+
+def scrambled(text: str, rng: np.random.Generator) -> str:
+    """Replace each word, number and mark by a random word of the benchmark."""
+    pieces = _SLOT_OR_PIECE.findall(text)
+    drawn = rng.choice(_benchmark_words(), len(pieces)).tolist()
+    return " ".join(piece if piece[0] == "{" else word for piece, word in zip(pieces, drawn, strict=True))
+
+
+def with_other_attribute(text: str) -> str:
+    """Compare objects by the other attribute: by profile in place of texture, by texture in place of profile.
+
+    Example:
+        >>> with_other_attribute("Put all objects with the same texture as {a} into it.")
+        'Put all objects with the same profile as {a} into it.'
+    """
+    return _COMPARED.sub(lambda found: "profile" if found[0] == "texture" else "texture", text)
+
+
+def names_attribute(task: str) -> bool:
+    """Whether the prompt of a task says by which attribute objects are compared."""
+    return _COMPARED.search(task_spec(task).template) is not None
+
+
+def _words(text: str) -> list[re.Match[str]]:
+    return [found for found in _SLOT_OR_WORD.finditer(text) if found.group()[0] != "{"]
+
+
+def _with_words(text: str, words: list[str]) -> str:
+    """Put other words in the places of a text's words."""
+    left: Iterator[str] = iter(words)
+    return _SLOT_OR_WORD.sub(lambda found: found.group() if found.group()[0] == "{" else next(left), text)
+
+
+@cache
+def _benchmark_words() -> tuple[str, ...]:
+    return tuple(sorted(word for word in benchmark_vocabulary().words if word[0].isalpha()))
+
+
+NEUTRAL_PROMPT = RenderedPrompt(".", {})  # not empty, as policies may refuse a prompt without any token
+_MAX_TRIES = 100  # for tasks whose placeholders vary; those of the benchmark's own tasks never do
+_LARGEST_SEED = 2**31  # of the episodes whose images are borrowed
+
+
+def with_images_of_another(env: TabletopEnv, rng: np.random.Generator) -> RenderedPrompt:
+    """Sample seeds until an episode has images of the same names and kinds, and describe the same of them.
+
+    Raises:
+        SamplingError: No other episode has images for the same placeholders.
+    """
+    episode = env.episode
+    own = episode if env.prompts == MULTIMODAL else _multimodal(env, episode.seed)
+    prompt = own.problem.prompt
+    for _ in range(_MAX_TRIES):
+        seed = int(rng.integers(_LARGEST_SEED))
+        if seed == episode.seed:
+            continue
+        try:
+            other = _multimodal(env, seed)
+        except SamplingError:
+            continue
+        images = other.problem.prompt.images
+        if _kinds(images) == _kinds(prompt.images):
+            prompt_rng = make_rng(
+                own.domain, own.task, own.level, own.seed, "prompt", attempt=own.num_redraws
+            )
+            swapped = rewritten(Prompt(prompt.text, images), other.problem.scene, env.prompts, prompt_rng)
+            return Rasteriser(env.assets).prompt(swapped)
+    raise SamplingError(
+        f"{_MAX_TRIES} other episodes of {episode.task} at level {episode.level} have no images for "
+        f"{prompt.text!r}; evaluate this task without the ablation other_prompt_images."
+    )
+
+
+def _multimodal(env: TabletopEnv, seed: int) -> Episode:
+    """Sample an episode of an environment, with the published prompt."""
+    return sample_episode(
+        env.task,
+        level=env.level,
+        seed=seed,
+        domain=env.domain,
+        assets=env.assets,
+        compat=env.compat,
+        **env.task_options,
+    )
+
+
+def _kinds(images: tuple[tuple[str, object], ...]) -> dict[str, type]:
+    return {name: type(fill) for name, fill in images}
+
+
+_MAX_SHOWN = 100  # characters of a prompt in an error
+_TEXTURE = re.compile(
+    re.escape(twist.TEMPLATE.partition("{examples} ")[2]).replace(r"\{twist_obj_texture\}", "(.+)")
+)
+
+
+def in_context_prompt(prompt: RenderedPrompt, task: str) -> RenderedPrompt:
+    """Edit a prompt for in-context evaluation.
+
+    Args:
+        prompt: The task's own prompt.
+        task: Name of the task.
+
+    Raises:
+        ConfigError: The task has no edited prompt.
+        PromptError: The prompt is not one of that task.
+    """
+    if problem := no_edited_prompt(task):
+        raise ConfigError(problem)
+    names = tuple(prompt.images)
+    text, shown = _EDITS[task](prompt.text, names)
+    return RenderedPrompt(text, {name: prompt.images[name] for name in shown})
+
+
+def no_edited_prompt(task: str) -> str:
+    """Return why a task has no in-context evaluation; empty if it has one."""
+    if task in IN_CONTEXT_TASKS:
+        return ""
+    return unknown_name("in-context evaluation of task", task, IN_CONTEXT_TASKS)
+
+
+_Edited = tuple[str, tuple[str, ...]]  # text, and names of the images in it
+
+
+def _twist(text: str, names: tuple[str, ...]) -> _Edited:
+    found = _TEXTURE.search(text)
+    if found is None or len(names) < 2:
+        raise PromptError(f"{echo(repr(text), _MAX_SHOWN)} is no prompt of twist; it has no pair of images.")
+    before, after = names[:2]
+    return f"Follow this motion: {{{before}}} {{{after}}} for all {found[1]} objects.", (before, after)
+
+
+def _follow_motion(text: str, names: tuple[str, ...]) -> _Edited:
+    return text, names
+
+
+def _follow_order(text: str, names: tuple[str, ...]) -> _Edited:
+    return MOTION_TEXT.format(frames=" ".join(f"{{{name}}}" for name in names)), names
+
+
+_EDITS: Mapping[str, Callable[[str, tuple[str, ...]], _Edited]] = MappingProxyType(
+    {"twist": _twist, "follow_motion": _follow_motion, "follow_order": _follow_order}
+)
+IN_CONTEXT_TASKS = tuple(_EDITS)
+
+
+def demonstrated(env: TabletopEnv) -> RenderedPrompt:
+    """Return the motion of the oracle in the episode that an environment has begun, as a prompt.
+
+    If the oracle fails or has no action, the demonstration ends there.
+
+    Args:
+        env: The environment; it is left as it is.
+    """
+    own = TabletopEnv(
+        env.task,
+        level=env.level,
+        domain=env.domain,
+        assets=env.assets,
+        compat=env.compat,
+        hide_arm=env.hide_arm,
+        **env.task_options,
+    )
+    seen = [own.reset(seed=env.episode.seed)[0]]
+    while not own.outcome.is_over and len(seen) <= own.episode.oracle_max_steps:
+        try:
+            action = own.oracle_decision().action
+        except OracleError:
+            break
+        seen.append(own.step(action)[0])
+    objects = [ObjectRecord(p.id, p.object, p.texture) for p in own.scene.placements]
+    return motion_prompt(seen, objects)
+
+
+def held_out_phrasings() -> Phrasings:
+    """Return the phrasings by task."""
+    return read_phrasings("openvima.evaluation", "phrasings.yaml")
+
+
+def has_phrasings(task: str) -> bool:
+    """Whether a task has held-out phrasings."""
+    return task in held_out_phrasings()
+
+
+def in_held_out_phrasing(text: str, task: str, rng: np.random.Generator) -> str:
+    """Return the text of a task's prompt in one of its held-out phrasings.
+
+    Args:
+        text: The text, with images or descriptions. Another form, such as a corrupted one, is unchanged.
+        task: Name of the task.
+        rng: Draws the phrasing.
+    """
+    phrasings = held_out_phrasings()[task]
+    return rephrased(text, task_spec(task).template, phrasings[int(rng.integers(len(phrasings)))]) or text

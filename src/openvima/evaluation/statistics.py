@@ -1,0 +1,549 @@
+"""Confidence intervals and tests of rates and differences, from counts.
+
+Score intervals hold all values of a quantity that a test based on the data would not reject. Each value is
+judged with the variance that it would itself imply, so that intervals keep their promise near 0 and 100 %,
+where the usual "estimate ± 1.96 standard errors" collapses. The fits that a value implies form a family with
+one parameter, a Lagrange multiplier, along which the end of the interval is searched.
+
+Means over training seeds: each seed is a training of its own, evaluated on episodes of its own, so that the
+means of the seeds are independent and their variance holds both sources: var(mean of a seed) = var(training)
++ var(episodes).
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+from openvima.errors import ConfigError
+
+Interval = tuple[float, float]
+Fit = Callable[[float], tuple[float, float]]
+
+_HALVINGS = 36  # of the range of multipliers; ends are then exact to about 1e-10
+
+
+def quantile(confidence: float) -> float:
+    """Standard normal quantile of a two-sided interval.
+
+    Raises:
+        ConfigError: The confidence is not between 0 and 1.
+    """
+    if not 0 < confidence < 1:
+        raise ConfigError(f"the confidence is {confidence}; it must lie between 0 and 1, such as 0.95.")
+    return NormalDist().inv_cdf(0.5 + confidence / 2)
+
+
+def lower_end(estimate: float, fit: Fit, z: float) -> float:
+    """Find the lower end of a score interval.
+
+    Args:
+        estimate: The quantity's estimate without constraint; above the least possible value.
+        fit: Gives for a multiplier above 0 the quantity under the constrained fit, and the variance of its
+            estimate there. The larger the multiplier, the smaller the quantity.
+        z: Standard errors between the end and the estimate.
+
+    Returns:
+        The value that lies `z` of its own standard errors below the estimate.
+    """
+
+    def is_inside(multiplier: float) -> bool:
+        value, variance = fit(multiplier)
+        return (estimate - value) ** 2 <= z * z * variance
+
+    inside, outside = 0.0, 1.0
+    while is_inside(outside):
+        inside, outside = outside, 2 * outside
+    for _ in range(_HALVINGS):
+        middle = (inside + outside) / 2
+        inside, outside = (middle, outside) if is_inside(middle) else (inside, middle)
+    return fit(outside)[0]
+
+
+def mean_and_variance(fitted: Sequence[tuple[float, float]], played: Sequence[int]) -> tuple[float, float]:
+    """Unweighted mean over tasks, and the variance of its estimate.
+
+    With one number fitted to each of k tasks and one constraint over all, k - 1 numbers follow the data and
+    make the fitted variances too small, by (k - 1) / k episodes of each task.
+
+    Args:
+        fitted: Mean and variance of a single episode, for each task.
+        played: Episodes of each task.
+    """
+    num_tasks = len(played)
+    mean = sum(value for value, _ in fitted) / num_tasks
+    spread = sum(v / (n - 1 + 1 / num_tasks) for (_, v), n in zip(fitted, played, strict=True))
+    return mean, spread / num_tasks**2
+
+
+def wilson_interval(successes: int, episodes: int, confidence: float = 0.95) -> Interval:
+    """Confidence interval of a success rate.
+
+    Unlike the normal approximation it stays inside [0, 1] and is valid at 0 and 100 % success.
+
+    Args:
+        successes: Solved episodes.
+        episodes: All episodes, at least one.
+        confidence: Nominal coverage, between 0 and 1.
+
+    Returns:
+        Lower and upper end, as fractions.
+
+    Raises:
+        ConfigError: The counts or the confidence cannot be.
+
+    Example:
+        >>> [round(end, 3) for end in wilson_interval(8, 10)]
+        [0.49, 0.943]
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference", 1927.
+    """
+    _check(successes, episodes)
+    z = quantile(confidence)
+    rate = successes / episodes
+    shrink = 1 + z * z / episodes
+    centre = (rate + z * z / (2 * episodes)) / shrink
+    half = z / shrink * math.sqrt(rate * (1 - rate) / episodes + z * z / (4 * episodes**2))
+    # at 0 and at all successes one end is exactly the rate; rounding must not push it past
+    low = 0.0 if successes == 0 else max(0.0, centre - half)
+    high = 1.0 if successes == episodes else min(1.0, centre + half)
+    return low, high
+
+
+def mean_of_rates(counts: Sequence[tuple[int, int]], confidence: float = 0.95) -> tuple[float, Interval]:
+    """Unweighted mean of several success rates, with an interval.
+
+    The interval is Wilson's, carried over to a mean: it holds every mean that lies within z standard errors
+    of the observed one, these taken from the rates that are most likely if that were the true mean. For one
+    task it is Wilson's interval itself.
+
+    Args:
+        counts: (successes, episodes) of each task.
+        confidence: As for `wilson_interval`.
+
+    Returns:
+        The mean and its interval, as fractions.
+
+    Raises:
+        ConfigError: There are no counts, or impossible ones.
+
+    Source: score method for linear combinations of proportions, Martín Andrés et al. 2011. Adding the tasks'
+        own Wilson intervals in squares is simpler, but covers too rarely near 0 and 100 %: see
+        docs/reports.md.
+    """
+    if not counts:
+        raise ConfigError("the mean of no success rates is undefined; give at least one pair of counts.")
+    for successes, episodes in counts:
+        _check(successes, episodes)
+    z = quantile(confidence)
+    mean = sum(successes / episodes for successes, episodes in counts) / len(counts)
+    failures = [(episodes - successes, episodes) for successes, episodes in counts]
+    return mean, (_lowest_mean(counts, z), 1 - _lowest_mean(failures, z))
+
+
+def _lowest_mean(counts: Sequence[tuple[int, int]], z: float) -> float:
+    """Lower end of the interval of a mean."""
+    estimate = sum(successes / episodes for successes, episodes in counts) / len(counts)
+    if estimate <= 0:
+        return 0.0
+    played = [episodes for _, episodes in counts]
+
+    def fit(multiplier: float) -> tuple[float, float]:
+        rates = [_likely_rate(*count, multiplier) for count in counts]
+        return mean_and_variance([(rate, rate * (1 - rate)) for rate in rates], played)
+
+    return lower_end(estimate, fit, z)
+
+
+def _likely_rate(successes: int, episodes: int, multiplier: float) -> float:
+    """Most likely rate of a task, given the mean of all.
+
+    It is the rate p with `(successes - episodes p) / (p (1 - p)) = multiplier`, the same for all tasks.
+    """
+    total = multiplier + episodes
+    return 2 * successes / (total + math.sqrt(total * total - 4 * multiplier * successes))
+
+
+def _check(successes: int, episodes: int) -> None:
+    if episodes < 1 or not 0 <= successes <= episodes:
+        raise ConfigError(
+            f"no interval for {successes} successes in {episodes} episodes; there must be at least 1 episode "
+            "and 0 to that many successes."
+        )
+
+
+_NEWTON_STEPS = 60  # it needs about 8; more only where an end is nearly -1 or 1
+_CONVERGED = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class PairCounts:
+    """Outcomes of two policies, a and b, on the same episodes.
+
+    Args:
+        both: Episodes that both solved.
+        only_a: Episodes that a solved and b did not.
+        only_b: Episodes that b solved and a did not.
+        neither: Episodes that neither solved.
+
+    Raises:
+        ConfigError: There is no episode, or a count is negative.
+    """
+
+    both: int
+    only_a: int
+    only_b: int
+    neither: int
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1 or min(self.both, self.only_a, self.only_b, self.neither) < 0:
+            raise ConfigError(
+                f"{self} cannot be compared; counts are at least 0, and one episode must have been played."
+            )
+
+    @classmethod
+    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> "PairCounts":
+        """Count the outcomes of a and b, success or not, of each episode."""
+        pairs = list(outcomes)
+        return cls(
+            *(pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False)))
+        )
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return self.both + self.only_a + self.only_b + self.neither
+
+    @property
+    def swapped(self) -> "PairCounts":
+        """The same outcomes with a and b exchanged."""
+        return PairCounts(self.both, self.only_b, self.only_a, self.neither)
+
+    @property
+    def difference(self) -> float:
+        """Success rate of a minus that of b."""
+        return (self.only_a - self.only_b) / self.episodes
+
+
+def mean_difference(counts: Sequence[PairCounts], confidence: float = 0.95) -> tuple[float, Interval]:
+    """Unweighted mean over tasks of the differences of two success rates on the same episodes.
+
+    For one task the interval is Tango's. For several it holds every mean difference that lies within z
+    standard errors of the observed one, these taken from the probabilities that are most likely if that were
+    the true one.
+
+    Args:
+        counts: Outcomes on each task.
+        confidence: Nominal coverage, between 0 and 1.
+
+    Returns:
+        The mean of a minus b, and its interval, as fractions.
+
+    Raises:
+        ConfigError: There are no counts, or the confidence cannot be.
+
+    Example:
+        >>> difference, interval = mean_difference([PairCounts(1, 1, 7, 12)])
+        >>> round(difference, 3), [round(end, 3) for end in interval]
+        (-0.286, [-0.517, -0.026])
+
+    Source: T. Tango, "Equivalence test and confidence interval for the difference in proportions for the
+        paired-sample design", 1998; for several tasks the same principle with one constraint over all.
+    """
+    if not counts:
+        raise ConfigError("the mean of no differences is undefined; give the counts of at least one task.")
+    z = quantile(confidence)
+    difference = sum(count.difference for count in counts) / len(counts)
+    return difference, (_lowest_difference(counts, z), -_lowest_difference([c.swapped for c in counts], z))
+
+
+def mcnemar(only_a: int, only_b: int) -> tuple[float, float]:
+    """Test whether two policies solve equally many of the same episodes.
+
+    If they did, each episode that only one of them solved would be a toss of a fair coin. Counts of several
+    tasks may be added: the test then asks whether the two are alike on every task.
+
+    Args:
+        only_a: Episodes that a solved and b did not.
+        only_b: Episodes that b solved and a did not.
+
+    Returns:
+        The exact p-value, two-sided; and the mid-p-value, which counts the observed outcome half. The exact
+        one errs at most as often as it says, the other about as often as it says.
+
+    Example:
+        >>> [round(p, 4) for p in mcnemar(1, 7)]
+        [0.0703, 0.0391]
+
+    Source: Q. McNemar 1947; mid-p: Fagerland, Lydersen and Laake 2013.
+    """
+    if min(only_a, only_b) < 0:
+        raise ConfigError(f"counts of episodes are at least 0, got {only_a} and {only_b}.")
+    tosses, fewer = only_a + only_b, min(only_a, only_b)
+    ways, tail = 1, 1  # to toss `index` heads, and at most that many; whole numbers, hence exact
+    for index in range(1, fewer + 1):
+        ways = ways * (tosses - index + 1) // index
+        tail += ways
+    everything = 2**tosses
+    if only_a == only_b:
+        return 1.0, 1 - ways / (2 * everything)
+    return 2 * tail / everything, (2 * tail - ways) / everything
+
+
+def _lowest_difference(counts: Sequence[PairCounts], z: float) -> float:
+    """Lower end of the interval of a mean difference."""
+    estimate = sum(count.difference for count in counts) / len(counts)
+    if estimate <= -1:
+        return -1.0
+    played = [count.episodes for count in counts]
+
+    def fit(multiplier: float) -> tuple[float, float]:
+        likely = [_likely_pair(count, multiplier) for count in counts]
+        return mean_and_variance([(a - b, max(0.0, a + b - (a - b) ** 2)) for a, b in likely], played)
+
+    return lower_end(estimate, fit, z)
+
+
+def _likely_pair(counts: PairCounts, multiplier: float) -> tuple[float, float]:
+    """Most likely probabilities that only a, and that only b solves an episode, given the mean difference.
+
+    With A and B for these and C for the rest, the optimum has `only_a / A = s + multiplier`,
+    `only_b / B = s - multiplier` and `same / C = s` for a number s of each task, such that A + B + C = 1.
+    Where only_b is 0, s may be as small as the multiplier, and B takes what A and C leave.
+
+    Args:
+        counts: Outcomes on one task.
+        multiplier: Above 0, the same for all tasks; the larger, the smaller is A - B.
+
+    Returns:
+        A and B.
+    """
+    same = counts.both + counts.neither
+    # The sum falls with s and is convex; each of these bounds makes one term 1, so no step of Newton's
+    # overshoots.
+    s = max(same, counts.only_a - multiplier, counts.only_b + multiplier)
+    for _ in range(_NEWTON_STEPS):
+        a, c = counts.only_a / (s + multiplier), same / s
+        b = counts.only_b / (s - multiplier) if counts.only_b else 0.0
+        slope = a / (s + multiplier) + c / s + (b / (s - multiplier) if b else 0.0)
+        step = (a + b + c - 1) / slope if slope else 0.0
+        if step <= _CONVERGED * s:
+            break
+        s += step
+    a = counts.only_a / (s + multiplier)
+    return a, min(1.0, max(0.0, 1 - a - same / s))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p-values to control the family-wise error rate.
+
+    Args:
+        p_values: Of the single tests, in any order; the tests may depend on each other.
+
+    Returns:
+        Adjusted p-values in the same order.
+
+    Example:
+        >>> holm([0.01, 0.04, 0.03])
+        [0.03, 0.06, 0.06]
+
+    Source: S. Holm, "A simple sequentially rejective multiple test procedure", 1979.
+    """
+    adjusted = [0.0] * len(p_values)
+    largest = 0.0
+    for rank, index in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
+        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[index]))
+        adjusted[index] = largest
+    return adjusted
+
+
+Estimated = tuple[float, Interval]
+
+
+def difference_of_means(a: Estimated, b: Estimated) -> Estimated:
+    """Difference of two independent means.
+
+    Args:
+        a: Mean and its interval.
+        b: Mean and its interval, of other episodes, at the same confidence.
+
+    Returns:
+        a minus b, and its interval.
+
+    Example:
+        >>> value, interval = difference_of_means((0.7, (0.57, 0.81)), (0.4, (0.28, 0.53)))
+        >>> round(value, 2), [round(end, 2) for end in interval]
+        (0.3, [0.12, 0.46])
+
+    Source: method of variance estimates recovery, Zou and Donner 2008; for two rates with Wilson's intervals
+        it is Newcombe's method 10.
+    """
+    (mean_a, (low_a, high_a)), (mean_b, (low_b, high_b)) = a, b
+    value = mean_a - mean_b
+    low = value - math.hypot(mean_a - low_a, high_b - mean_b)
+    high = value + math.hypot(high_a - mean_a, mean_b - low_b)
+    return value, (max(-1.0, low), min(1.0, high))
+
+
+def ratio_of_means(a: Estimated, b: Estimated) -> Estimated | None:
+    """Ratio of two independent means that are not negative.
+
+    Args:
+        a: Mean and its interval.
+        b: Mean and its interval, of other episodes, at the same confidence.
+
+    Returns:
+        a divided by b, and its interval; None where b is too close to 0 for a bounded one.
+
+    Source: MOVER-R, Donner and Zou 2012.
+    """
+    (mean_a, (low_a, high_a)), (mean_b, (low_b, high_b)) = a, b
+    if low_b <= 0 or high_b >= 2 * mean_b:
+        return None
+    product = mean_a * mean_b
+    down, up = high_b * (2 * mean_b - high_b), low_b * (2 * mean_b - low_b)
+    low = (product - math.sqrt(max(0.0, product**2 - low_a * (2 * mean_a - low_a) * down))) / down
+    high = (product + math.sqrt(max(0.0, product**2 - high_a * (2 * mean_a - high_a) * up))) / up
+    return mean_a / mean_b, (max(0.0, low), high)
+
+
+_QUANTILE_HALVINGS = 60
+Counts = Sequence[tuple[int, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class SeedMean:
+    """Mean success rate over training seeds, as fractions.
+
+    Args:
+        mean: Unweighted mean over seeds and tasks.
+        interval: 95 % interval that holds both the variation of seeds and the noise of episodes.
+        seeds: Mean of each seed, and its interval from episodes alone.
+        sd: Standard deviation of the means of the seeds; None with one seed.
+        episode_sd: Standard deviation that the noise of episodes alone gives the mean of a seed.
+        training_sd: What remains: the standard deviation between trainings; None with one seed.
+    """
+
+    mean: float
+    interval: Interval
+    seeds: tuple[tuple[float, Interval], ...]
+    sd: float | None
+    episode_sd: float
+    training_sd: float | None
+
+
+def mean_over_seeds(counts: Sequence[Counts], confidence: float = 0.95) -> SeedMean:
+    """Average the success rates of several trainings.
+
+    The interval spans two: Student's of the means of the seeds, whose variance holds both sources, and the
+    score interval of all episodes, which alone is left where every seed has the same mean, as at 0 and 100 %.
+    With one seed it is the latter, and says nothing on other seeds.
+
+    Args:
+        counts: For each seed (successes, episodes) of each task, tasks in the same order.
+        confidence: Nominal coverage, between 0 and 1.
+
+    Raises:
+        ConfigError: There is no seed, the seeds differ in their tasks, or counts are impossible.
+
+    Source: variance components of a one-way random-effects model, S. R. Searle et al., "Variance Components",
+        1992; Student's interval, "Student", 1908. Seeds apart from test noise: X. Bouthillier et al.,
+        "Accounting for variance in machine learning benchmarks", 2021.
+    """
+    if not counts or len({len(of_seed) for of_seed in counts}) > 1:
+        raise ConfigError("seeds must be evaluated on the same tasks, and there must be one at least.")
+    seeds = tuple(mean_of_rates(of_seed, confidence) for of_seed in counts)
+    pooled = [(sum(s for s, _ in task), sum(n for _, n in task)) for task in zip(*counts, strict=True)]
+    mean, interval = mean_of_rates(pooled, confidence)
+    means = [seed for seed, _ in seeds]
+    episode_variance = sum(map(_episode_variance, counts)) / len(counts)
+    sd = _sd(means)
+    low, high = _spanning(interval, _student_interval(means, confidence))
+    training_sd = None if sd is None else math.sqrt(max(0.0, sd * sd - episode_variance))
+    return SeedMean(
+        mean, (max(0.0, low), min(1.0, high)), seeds, sd, math.sqrt(episode_variance), training_sd
+    )
+
+
+def difference_over_seeds(
+    pairs: Sequence[Sequence[PairCounts]], confidence: float = 0.95
+) -> tuple[float, Interval]:
+    """Average the difference of two success rates over seeds, each pair evaluated on the same episodes.
+
+    Args:
+        pairs: For each seed the outcomes on each task, tasks in the same order.
+        confidence: Nominal coverage, between 0 and 1.
+
+    Returns:
+        The mean of a minus b, and its interval: that of `mean_difference` over all episodes, widened to
+        Student's interval of the differences of the seeds.
+    """
+    pooled = [
+        PairCounts(*(sum(getattr(p, name) for p in task) for name in PairCounts.__slots__))
+        for task in zip(*pairs, strict=True)
+    ]
+    difference, interval = mean_difference(pooled, confidence)
+    each = [sum(p.difference for p in of_seed) / len(of_seed) for of_seed in pairs]
+    low, high = _spanning(interval, _student_interval(each, confidence))
+    return difference, (max(-1.0, low), min(1.0, high))
+
+
+def student_quantile(confidence: float, degrees: int) -> float:
+    """Two-sided quantile of Student's t distribution.
+
+    Args:
+        confidence: Between 0 and 1.
+        degrees: Degrees of freedom, at least 1.
+
+    Example:
+        >>> round(student_quantile(0.95, 2), 3)
+        4.303
+
+    Source: finite series of the distribution, Abramowitz and Stegun, 26.7.3 and 26.7.4.
+    """
+    quantile(confidence)  # checks it
+    low, high = 0.0, math.pi / 2
+    for _ in range(_QUANTILE_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if _within(middle, degrees) < confidence else (low, middle)
+    return math.tan(low) * math.sqrt(degrees)
+
+
+def _within(angle: float, degrees: int) -> float:
+    """Probability of |t| <= tan(angle) sqrt(degrees)."""
+    odd = degrees % 2
+    term = math.cos(angle) if odd else 1.0
+    total = 0.0
+    for power in range(odd, degrees - 1, 2):  # of the cosine
+        total += term
+        term *= math.cos(angle) ** 2 * (power + 1) / (power + 2)
+    total *= math.sin(angle)
+    return 2 / math.pi * (angle + total) if odd else total
+
+
+def _student_interval(values: Sequence[float], confidence: float) -> Interval | None:
+    sd = _sd(values)
+    if sd is None:
+        return None
+    mean = sum(values) / len(values)
+    half = student_quantile(confidence, len(values) - 1) * sd / math.sqrt(len(values))
+    return mean - half, mean + half
+
+
+def _spanning(interval: Interval, other: Interval | None) -> Interval:
+    if other is None:
+        return interval
+    return min(interval[0], other[0]), max(interval[1], other[1])
+
+
+def _sd(values: Sequence[float]) -> float | None:
+    if len(values) < 2:
+        return None
+    mean = sum(values) / len(values)
+    return math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
+
+
+def _episode_variance(counts: Counts) -> float:
+    """Unbiased variance of the mean of one seed over its tasks, from episodes alone."""
+    each = [s / n * (1 - s / n) / max(1, n - 1) for s, n in counts]
+    return sum(each) / len(each) ** 2
