@@ -15,7 +15,7 @@ from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
 from openvima.multiprocess import imap_unordered
-from openvima.policies.naming import BUNDLED
+from openvima.policies.naming import BUNDLED, ORACLE
 from openvima.report.curves import METRICS_FILE
 from openvima.report.page import default_command, write_report
 from openvima.report.text import Confirmation
