@@ -108,7 +108,7 @@ def test_a_file_that_is_no_mapping_is_refused() -> None:
 def test_a_learner_of_ones_own_has_a_name(tmp_path, monkeypatch) -> None:
     from openvima.policies import presets
     from openvima.training import TrainingConfig
-    from openvima.training.building import resolved
+    from openvima.training.building import resolve
 
     file = tmp_path / "named_learner.py"
     lines = ("from openvima.policies import register_policy", "@register_policy('mine')", "def make(): ...")
@@ -119,7 +119,7 @@ def test_a_learner_of_ones_own_has_a_name(tmp_path, monkeypatch) -> None:
     try:
         assert presets.own_policies() == {"mine": f"{file}:make"}
         config = TrainingConfig(data=tmp_path, out=tmp_path / "run", preset="mine")
-        assert resolved(config).preset == f"{file}:make"
+        assert resolve(config).preset == f"{file}:make"
     finally:
         presets._load_own_files.cache_clear()
 
