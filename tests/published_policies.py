@@ -8,7 +8,7 @@ from openvima.policies.architectures import VimaConfig, vima
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
-from openvima.policies.published_names import T5, to_published
+from openvima.policies.published import T5, to_published
 from openvima.policies.sizes import Size
 
 VOCABULARY_SIZE = 160

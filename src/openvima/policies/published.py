@@ -1,8 +1,13 @@
-"""Load published checkpoint files without executing code from them."""
+"""Published checkpoints of VIMA and its baselines, such as 2M.ckpt. No code in a file is executed.
+
+Names of weights there and here are rules, which the architectures combine. `*` stands for a number; a name
+stands for itself and for its `.weight` and `.bias`.
+"""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from reprlib import repr as short
 from typing import Any
@@ -10,24 +15,333 @@ from typing import Any
 import torch
 
 from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.policies.architectures import flamingo, gato, gpt, vima
 from openvima.policies.build import PolicyConfig, outline_network
 from openvima.policies.config_fields import MAX_WIDTH
+from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
-from openvima.policies.published_names import (
-    T5,
-    PublishedAdapter,
-    adapter_of,
-    from_published,
-    is_unused,
-    to_published,
-    without_prefix,
-)
 from openvima.policies.sizes import SIZES, TUNED_T5_LAYERS, Size
 from openvima.policies.tensor_files import check_finite, described, listed, read_archive
 
 _MAX_LISTED = 20  # names that a message lists per kind of problem
+_DEFAULTS = SIZES["2m"]  # sizes to use where a weight is missing
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One line of the table.
+
+    Args:
+        published: Name in a published file.
+        ours: Name in this package.
+        transposed: Whether the file holds the matrix as (in, out).
+    """
+
+    published: str
+    ours: str
+    transposed: bool = False
+
+
+def _table(text: str, published: str = "", ours: str = "") -> tuple[Rule, ...]:
+    """Read rules, one a line: name in files, name here, and "transposed"; both with something before it."""
+    rows = [line.split() for line in text.strip().splitlines()]
+    return tuple(Rule(published + row[0], ours + row[1], row[2:] == ["transposed"]) for row in rows)
+
+
+def _mlp_rules(published: str, ours: str, num_layers: int) -> tuple[Rule, ...]:
+    """An MLP: two layers without weights between linear ones there, one here."""
+    return tuple(Rule(f"{published}.{3 * i}", f"{ours}.{2 * i}") for i in range(num_layers))
+
+
+def _vit_rules(ours: str) -> tuple[Rule, ...]:
+    table = """
+        cls_token                       class_token
+        pos_embed                       positions
+        projection                      projection.weight    transposed
+        conv1                           patches
+        ln_pre                          norm_before
+        ln_post                         norm_after
+        blocks.*.attn.in_proj_weight    blocks.*.query_key_value.weight
+        blocks.*.attn.in_proj_bias      blocks.*.query_key_value.bias
+        blocks.*.attn.out_proj          blocks.*.attention_out
+        blocks.*.ln_1                   blocks.*.norm_attention
+        blocks.*.ln_2                   blocks.*.norm_mlp
+        blocks.*.mlp.c_fc               blocks.*.widen
+        blocks.*.mlp.c_proj             blocks.*.narrow
+    """
+    return _table(table, "obj_encoder.cropped_img_encoder.vit.", f"{ours}.")
+
+
+def _self_block_rules(published: str) -> tuple[Rule, ...]:
+    table = """
+        positions_embed         positions
+        h.*.attn.c_attn         self_blocks.*.query_key_value    transposed
+        h.*.attn.c_proj         self_blocks.*.attention_out      transposed
+        h.*.ln_1                self_blocks.*.norm_attention
+        h.*.mlp.c_fc            self_blocks.*.widen              transposed
+        h.*.mlp.c_proj          self_blocks.*.narrow             transposed
+        h.*.mlp.gated_layer     self_blocks.*.gate
+        h.*.ln_2                self_blocks.*.norm_feed_forward
+    """
+    return _table(table, f"{published}.", "decoder.")
+
+
+T5 = "t5_prompt_encoder.t5.encoder"
+T5_RULES = _table(
+    """
+        block.0.layer.0.SelfAttention.relative_attention_bias    position_bias
+        block.*.layer.0.layer_norm                               blocks.*.norm_attention
+        block.*.layer.0.SelfAttention.q                          blocks.*.query
+        block.*.layer.0.SelfAttention.k                          blocks.*.key
+        block.*.layer.0.SelfAttention.v                          blocks.*.value
+        block.*.layer.0.SelfAttention.o                          blocks.*.attention_out
+        block.*.layer.1.layer_norm                               blocks.*.norm_feed_forward
+        block.*.layer.1.DenseReluDense.wi                        blocks.*.widen
+        block.*.layer.1.DenseReluDense.wo                        blocks.*.narrow
+        final_layer_norm                                         norm_after
+    """,
+    f"{T5}.",
+    "prompt.text.",
+)
+_SHARED_RULES = (
+    *T5_RULES,
+    *_table(
+        """
+        prompt_embedding._embed_layer    prompt.words
+        t5_prompt_encoder_post_layer     prompt.out
+        action_encoder._post_layer       head.actions.out
+        end_effector_encoder             end_effectors
+        obs_fusion_layer                 observation_out
+    """
+    ),
+    *_mlp_rules("prompt_obj_post_layer", "prompt.images", 3),
+    *(
+        rule
+        for part, (name, components) in enumerate(ACTION_PARTS.items())
+        for rule in (
+            *_mlp_rules(f"action_encoder._embed_dict.{name}._layer", f"head.actions.parts.{part}", 2),
+            *(
+                rule
+                for i, component in enumerate(range(components.start, components.stop))
+                for rule in _mlp_rules(
+                    f"action_decoder._decoders.{name}.mlps.{i}", f"head.classifiers.{component}", 3
+                )
+            ),
+        )
+    ),
+)
+_CROSS_ATTENTION_RULES = (
+    *_self_block_rules("xattn_gpt"),
+    Rule("xattn_gpt.xattn_positions_embed", "decoder.prompt_positions"),
+    *_table(
+        """
+        layernorm        norm_attention
+        query            query
+        key_value        key_value
+        attention_out    attention_out
+        ln               norm_feed_forward
+        linear1          widen
+        linear2          narrow
+        gated_layer      gate
+    """,
+        "xattn_gpt.xattns.*.",
+        "decoder.cross_blocks.*.",
+    ),
+)
+_PREFIX_RULES = (*_self_block_rules("transformer.lm"), Rule("prompt_sep_token", "decoder.separator"))
+_OBJECT_RULES = (
+    *_mlp_rules("obj_encoder.bbox_mlp.front", "images.box_encoders.0", 3),
+    *_mlp_rules("obj_encoder.bbox_mlp.top", "images.box_encoders.1", 3),
+    Rule("obj_encoder.pre_transformer_layer.front", "images.fusion.0"),
+    Rule("obj_encoder.pre_transformer_layer.top", "images.fusion.1"),
+)
+PERCEIVER = "obj_encoder.peceiver.model"  # spelled like this in the files
+_RESAMPLER_LAYER = """
+        attention.self.layernorm1    norm_attention
+        attention.self.layernorm2    norm_source
+        attention.self.query         query
+        attention.self.key           key
+        attention.self.value         value
+        attention.output.dense       attention_out
+        layernorm                    norm_feed_forward
+        mlp.dense1                   hidden
+        mlp.dense2                   out
+"""
+_RESAMPLER_RULES = (
+    Rule(f"{PERCEIVER}.embeddings.latents", "resampler.latents"),
+    *_table(_RESAMPLER_LAYER, f"{PERCEIVER}.encoder.cross_attention.", "resampler.cross_layer."),
+    *_table(_RESAMPLER_LAYER, f"{PERCEIVER}.encoder.self_attends.*.", "resampler.self_layers.*."),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedAdapter:
+    """How to load published files of one architecture.
+
+    Args:
+        architecture: Its name.
+        rules: Names of all weights.
+        cfg_names: What `cfg` calls the width, the number of layers and the numbers of heads.
+        decoder: Prefix of the decoder's weights.
+        build: Its config in a size.
+    """
+
+    architecture: str
+    rules: tuple[Rule, ...]
+    cfg_names: tuple[str, ...]
+    decoder: str
+    build: Callable[[Size], Any]  # Any: the config of the architecture
+
+
+def to_ours(rules: Iterable[Rule], name: str) -> tuple[str, bool] | None:
+    """Return our name of a published weight and whether to transpose it; None if there is no such weight."""
+    return _renamed(name, [(rule.published, rule.ours, rule.transposed) for rule in rules])
+
+
+def to_theirs(rules: Iterable[Rule], name: str) -> tuple[str, bool] | None:
+    """Return the published name of one of our weights and whether to transpose it; None if it has none."""
+    return _renamed(name, [(rule.ours, rule.published, rule.transposed) for rule in rules])
+
+
+def _renamed(name: str, rows: list[tuple[str, str, bool]]) -> tuple[str, bool] | None:
+    for before, after, transposed in rows:
+        match = _pattern(before).fullmatch(name)
+        if match:
+            *numbers, ending = match.groups(default="")
+            for number in numbers:
+                after = after.replace("*", number, 1)
+            return after + ending, transposed
+    return None
+
+
+@cache
+def _pattern(template: str) -> re.Pattern[str]:
+    return re.compile(re.escape(template).replace(r"\*", r"(\d+)") + r"(\.weight|\.bias)?")
+
+
+VIMA = PublishedAdapter(
+    "vima",
+    (*_SHARED_RULES, *_vit_rules("images.crop_encoder"), *_OBJECT_RULES, *_CROSS_ATTENTION_RULES),
+    cfg_names=("embed_dim", "xf_n_layers", "sattn_n_heads", "xattn_n_heads"),
+    decoder="xattn_gpt",
+    build=vima,
+)
+GATO = PublishedAdapter(
+    "gato",
+    (*_SHARED_RULES, *_vit_rules("images"), *_PREFIX_RULES),
+    cfg_names=("embed_dim", "n_layer", "n_head"),
+    decoder="transformer.lm",
+    build=gato,
+)
+FLAMINGO = PublishedAdapter(
+    "flamingo",
+    (*_SHARED_RULES, *_vit_rules("images"), *_RESAMPLER_RULES, *_CROSS_ATTENTION_RULES),
+    cfg_names=("embed_dim", "dt_n_layers", "dt_n_heads", "xattn_n_heads"),
+    decoder="xattn_gpt",
+    build=flamingo,
+)
+GPT = replace(GATO, architecture="gpt", build=gpt)  # with a class token
+
+
+PREFIX = "policy."  # before every name in a file
+ADAPTERS = {adapter.architecture: adapter for adapter in (VIMA, GATO, FLAMINGO, GPT)}
+# Unused position counters, masks and embeddings of the files.
+_UNUSED = re.compile(
+    r"(xattn_gpt|transformer\.lm)\.(position_ids|xattn_position_ids|h\.\d+\.attn\.bias)"
+    r"|xattn_gpt\.xattns\.\d+\.kv_position_ids"
+    r"|transformer\.lm\.tokens_embed\.weight"
+    r"|t5_prompt_encoder\.t5\.(shared|encoder\.embed_tokens)\.weight"
+)
+
+
+def is_unused(name: str) -> bool:
+    """Whether a published name, without prefix, is an unused entry."""
+    return _UNUSED.fullmatch(name) is not None
+
+
+def without_prefix(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Remove the prefix `policy.` from the names of published weights."""
+    return {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
+
+
+def adapter_of(weights: Iterable[str]) -> PublishedAdapter:
+    """Recognise the architecture of weights by their published names.
+
+    Raises:
+        CheckpointError: It is none of the four.
+    """
+    names = {name.removeprefix(PREFIX) for name in weights}
+    if any(name.startswith("obj_encoder.bbox_mlp.") for name in names):
+        return VIMA
+    if any(name.startswith(f"{PERCEIVER}.") for name in names):
+        return FLAMINGO
+    if any(name.startswith("transformer.lm.") for name in names):
+        return GPT if "obj_encoder.cropped_img_encoder.vit.cls_token" in names else GATO
+    raise CheckpointError(
+        "these are no weights of VIMA, VIMA-Gato, VIMA-Flamingo or VIMA-GPT: no name begins with "
+        f"obj_encoder.bbox_mlp, {PERCEIVER} or transformer.lm."
+    )
+
+
+def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Rename published weights to their names in this package.
+
+    Args:
+        weights: Weights by published name, with or without the prefix `policy.`.
+
+    Returns:
+        Weights in float32, matrices as (out, in). Unused entries are dropped; unknown names are unchanged.
+
+    Raises:
+        CheckpointError: The names are not those of VIMA or one of its baselines.
+    """
+    adapter = adapter_of(weights)
+    result = {}
+    for name, tensor in without_prefix(weights).items():
+        if not is_unused(name):
+            ours, transposed = to_ours(adapter.rules, name) or (name, False)
+            result[ours] = _converted(tensor, transposed)
+    return result
+
+
+def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
+    """Give the weights of a network their published names, without `policy.` before them.
+
+    Numbers of heads are not in the weights; a file gives those of the decoder in its `cfg`, and all image
+    encoders have 24.
+
+    Args:
+        network: Of the published architecture, in any size, with or without weights.
+
+    Returns:
+        Weights in float32, matrices as they are published. They may share memory with the network.
+
+    Raises:
+        CheckpointError: The network has parts that no published policy has.
+    """
+    adapter = ADAPTERS.get(network.config.architecture, VIMA)
+    result, without_name = {}, []
+    for ours, tensor in network.state_dict().items():
+        renamed = to_theirs(adapter.rules, ours)
+        if renamed is None:
+            without_name.append(ours)
+        else:
+            name, transposed = renamed
+            result[name] = _converted(tensor, transposed)
+    if without_name:
+        raise CheckpointError(
+            f"this network has parts that no published policy has: {', '.join(without_name)}. "
+            "Only presets of the form vima-…, gato-…, flamingo-… and gpt-… have published names."
+        )
+    return result
+
+
+def _converted(tensor: torch.Tensor, transposed: bool) -> torch.Tensor:
+    tensor = tensor.detach()
+    tensor = tensor.float() if tensor.is_floating_point() else tensor
+    return (tensor.T if transposed and tensor.ndim == 2 else tensor).contiguous()
 
 
 def load_published(file: str | Path) -> PolicyNetwork:
@@ -106,9 +420,6 @@ def _check_fit(network: PolicyNetwork, weights: Mapping[str, torch.Tensor]) -> N
     ]
     if problems:
         raise CheckpointError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
-
-
-_DEFAULTS = SIZES["2m"]  # sizes to use where a weight is missing
 
 
 @dataclass(frozen=True, slots=True)

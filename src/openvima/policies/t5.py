@@ -25,7 +25,7 @@ from openvima.imports import import_extra
 from openvima.input_files import as_path, open_regular
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.published_names import PROMPT_RULES, T5, to_theirs
+from openvima.policies.published import T5, T5_RULES, to_theirs
 from openvima.policies.sizes import T5_SIZES, t5_name
 from openvima.policies.tensor_files import check_finite, read_archive, read_safetensors
 from openvima.policies.tokenizer import END_ID, PADDING_ID, UNKNOWN, Tokenizer, Vocabulary, WordTokenizer
@@ -224,8 +224,7 @@ def _expected(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     """The network's weights by their names in T5 files, which the published policies share."""
     expected = {"shared.weight": network.prompt.words.weight.detach()}
     for ours, tensor in network.state_dict().items():
-        named = to_theirs(PROMPT_RULES, ours) if ours.startswith("prompt.text.") else None
-        if named:
+        if named := to_theirs(T5_RULES, ours):
             expected["encoder" + named[0].removeprefix(T5)] = tensor
     return expected
 
