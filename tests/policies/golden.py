@@ -35,8 +35,7 @@ from openvima.policies.build import outline_network
 from openvima.policies.nn.action_head import BinsHead, decode_bins, shift_actions
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
 from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork
-from openvima.policies.published import config_from_published
-from openvima.policies.published import from_published
+from openvima.policies.published import config_from_published, from_published
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import VIEWS
 

@@ -1,8 +1,12 @@
-"""The token sequence of a history: observations and actions in turn.
+"""The token sequence of a history, and the published action head on it.
 
     [obs, obs, query, action, obs, obs, query, action, …]
 
-Shape suffixes: B batch, T steps, Q tokens of a step, D width, C components of an action.
+Every action component is a classification over bins. Encoding and decoding are not inverse to each other:
+values are compared with n boundaries 1/(n - 1) apart, but bin k decodes to k/n. All published weights were
+trained with that.
+
+Shape suffixes: B batch, T steps, Q tokens of a step, D width, C components of an action, K bins of one.
 """
 
 import math

@@ -1,4 +1,7 @@
-"""Encoder of past actions."""
+"""Actions as vectors, their encoder and targets, and how a class is decoded from logits.
+
+Shape suffixes: B batch, T steps, N objects in view, C components of an action.
+"""
 
 import math
 from collections.abc import Callable, Sequence

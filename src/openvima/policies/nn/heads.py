@@ -1,10 +1,14 @@
-"""Autoregressive action decoding: each action component is conditioned on those before it.
+"""The other action heads: autoregressive bins, a mixture density, and plain regression; all heads by config.
 
-Where two actions would be right, independent components may mix them; here the first component decides.
+Autoregressive: each component is conditioned on those before it. Where two actions would be right,
+independent components may mix them; here the first component decides. Source: MIDAS (Li et al. 2023).
 
-Shape suffixes: B batch, T steps, Q tokens of a step, D width, C components of an action, K bins of one.
+The continuous heads express an action by six numbers: the planar positions of pick and place in unit range,
+and the rotation between them as cosine and sine. Only the difference of the two yaws turns an object, so the
+rotation at the pick is none.
 
-Source: MIDAS (Li et al. 2023).
+Shape suffixes: B batch, T steps, Q tokens of a step, D width, C components of an action, K bins of one, or
+components of the mixture.
 """
 
 import math

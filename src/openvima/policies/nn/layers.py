@@ -1,8 +1,10 @@
-"""A linear layer that is fast on CPUs: for few rows in inference, and in training.
+"""Layers: linear ones that are fast on CPUs, MLPs, batches without their padding, records of tensors.
 
 Training uses oneDNN, which takes half the time of torch's default library on AMD CPUs (results/
 2026-11-28_training_step.md); both compute in float32. Its kernels are compiled for each number of rows, so
 `rounded_rows` keeps these few.
+
+Shape suffixes: B batch, L positions, N positions of all rows that are computed, D width.
 """
 
 import os

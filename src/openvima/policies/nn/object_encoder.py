@@ -1,15 +1,13 @@
-"""Relative rotation of an object between two images, from the features of its crops.
+"""Objects to tokens: crop features and boxes of both views, as one token per view or as one for both.
 
-Each crop is described by complex harmonics around the circle: a rotation of the object shifts their phases
-and keeps their magnitudes. Comparing phases needs no knowledge of the shape, so it generalises to unknown
-ones.
+The rotation of an object between two images is told by complex harmonics around the circle of each crop: a
+rotation shifts their phases and keeps their magnitudes. Comparing phases needs no knowledge of the shape, so
+it generalises to unknown ones. Measured on 1,605 objects, 120 steps of 64 with a crop encoder of width 16:
+harmonics that are linear in the features classify 72 % of held-out rotations within 15 degrees; 62 % with 12
+harmonics instead of 8, and 35 % with those 12 behind a hidden layer.
 
-Measured on 1,605 objects, 120 steps of 64 with a crop encoder of width 16: harmonics that are linear in the
-features classify 72 % of held-out rotations within 15 degrees; 62 % with 12 harmonics instead of 8, and 35 %
-with those 12 behind a hidden layer.
-
-Shape suffixes: V views (front, top), N objects, F width of crop features, C channels, M harmonics, R bins of
-rotations; `...` any axes.
+Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token, C channels, M
+harmonics, R bins of rotations; `...` any axes.
 """
 
 import math

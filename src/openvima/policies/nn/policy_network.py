@@ -1,6 +1,7 @@
-"""What a network computed for one step, to explain its action.
+"""What every policy network of the package can do, for training and for acting, and what it explains.
 
-Shape suffixes: B batch, L positions of the prompt, C place candidates.
+Shape suffixes: B batch, T steps, L prompt positions, Q tokens of a step, K images, F width of image
+features, D width of the decoder, E width of an image token, C components of an action, or place candidates.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,10 @@
-"""T5-style encoder over words and image tokens: relative positions, RMSNorm, unscaled attention scores.
+"""The prompt encoder: words and image tokens, interleaved, through a T5 encoder to the decoder's width.
 
-Shape suffixes: B batch, L prompt positions, N those of all prompts up to their ends, H heads, W width, K
-width of one head.
+The text encoder is that of T5: relative positions, RMSNorm, unscaled attention scores.
+
+Shape suffixes: B batch, L prompt positions, N those of all prompts up to their ends, I image tokens of all
+prompts, H heads, W width of the text encoder, K width of one head, D width of the decoder, E width of an
+image token.
 """
 
 import math

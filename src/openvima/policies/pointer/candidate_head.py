@@ -98,11 +98,13 @@ class CandidatePointerHead(nn.Module):
         the place. If none is named, the nearest grid point is right; metrics leave out such a step.
         """
         candidates, config = self.candidates(inputs), self.config
+        # The pick is teacher-forced: the place is that of the object that the demonstration picked. Slots of
+        # -1 are clamped, so that they can be gathered, and masked in the losses.
         has_pick, pick = targets.steps_BT & (targets.pick_BT >= 0), targets.pick_BT.clamp(min=0)
         pick_logits, place_logits = self.pick(inputs), self.place(inputs, candidates, pick)
         goal = self._goal(inputs, targets, pick)
         right_BTC, has_place_BT = candidates.right(targets, goal)
-        right_BTC = right_BTC | ~has_pick[..., None]
+        right_BTC = right_BTC | ~has_pick[..., None]  # else no logit would be left, and the loss infinite
         right_logits = mask_scores(place_logits, right_BTC)
         place = right_logits.argmax(-1)  # of the right ones that with the highest logit
         points = at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, pick), candidates.positions_at(place)
@@ -254,6 +256,8 @@ class PickPointer(ObjectPointer):
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
         """Return the keys of the objects, geometry included, (B, T, N, D)."""
         keys_BTND, positions_BTN2 = super().keys(inputs), inputs.positions_BTN2
+        # G: vector and distance to the last pick and to the last place, and that there was one; then how near
+        # an object of the prompt's scenes is, another one in view, and one in or on this one.
         has_previous_BT11 = (inputs.previous_BTC != 0).any(dim=-1)[..., None, None]
         relative = []
         for start in (0, 6):
@@ -338,6 +342,8 @@ class PlacePointer(nn.Module):
 
     def forward(self, inputs: HeadInputs, candidates: PlaceCandidates, pick_BT: torch.Tensor) -> torch.Tensor:
         """Return logits, (B, T, C); candidates that do not exist get the most negative number."""
+        # Candidates are (C): those in view (N), which differ from step to step, then those kept for all steps
+        # (K). Only the products are built for both at once, (B, T, C); kept keys have no axis of steps.
         last = self.step_embedding.num_embeddings - 1
         context_BTD = self._context(inputs, pick_BT)
         query_BTD = self.query(context_BTD) * inputs.query_BTD.shape[-1] ** -0.5
@@ -356,6 +362,7 @@ class PlacePointer(nn.Module):
         logits_BTC = logits_BTC + self.kind_bias(context_BTD).index_select(-1, kinds_C)
         geometry_BTCG = candidates.geometry(pick_BT).to(logits_BTC.dtype)
         logits_BTC = logits_BTC + torch.einsum("btg,btcg->btc", self.geometry(context_BTD), geometry_BTCG)
+        # Objects in view come first, so the slot of the picked one is also the number of its candidate.
         picked_BTC = F.one_hot(pick_BT, logits_BTC.shape[-1]).to(logits_BTC.dtype)
         logits_BTC = logits_BTC + self.same(context_BTD) * picked_BTC
         return mask_scores(logits_BTC, candidates.masks_BTC)

@@ -1,4 +1,4 @@
-"""What the heads of the pointer models read.
+"""What the heads of the pointer models read, and the planar geometry of their actions, losses and metrics.
 
 Shape suffixes: B batch, T steps, N objects in view, L positions of the prompt, K objects of a set, D width, A
 width of appearance, P attributes, X width of all their projections, C components of an action, R bins of
