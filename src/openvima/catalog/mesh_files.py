@@ -288,7 +288,11 @@ def _from_arrays(mesh: object, what: str) -> ObjMesh:
 
 
 def _pieces(triangles: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Number the groups of triangles that share vertices, shape (F,), int32."""
+    """Number the groups of triangles that share vertices, shape (F,), int32.
+
+    Each round gives all vertices of a triangle its lowest label, then follows labels to labels
+    (`lower[lower]`), which halves the way to the lowest one: few rounds even for a long chain of triangles.
+    """
     label = np.arange(num_vertices)
     while True:
         lowest = label[triangles].min(axis=1, initial=num_vertices)
@@ -307,6 +311,9 @@ def _parts(mesh: ObjMesh) -> list[np.ndarray]:
 
 def _oriented(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarray:
     """Return the triangles facing outwards; the array itself where they do already.
+
+    In a closed mesh each edge, from start to end, has its reverse in a neighbour. Six times its volume is a
+    sum over the triangles, negative where they face inwards.
 
     Raises:
         AssetError: The mesh is open, or its triangles are wound inconsistently.

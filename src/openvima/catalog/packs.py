@@ -1,6 +1,7 @@
-"""Assets that a function of a user registers or returns, by the function's name.
+"""Loading of asset packs by name, folder or function.
 
-Records name the function without its folder. They never run it: whoever reads one loads the assets first.
+Records name a user's function without its folder. They never run it: whoever reads one loads the assets
+first.
 """
 
 import os

@@ -256,7 +256,11 @@ def _touches_by_a_corner(cells: set[Cell]) -> bool:
 
 
 def _borders(cells: set[Cell]) -> list[np.ndarray]:
-    """Closed loops around cells, with the cells on their left, corners only."""
+    """Closed loops around cells, with the cells on their left, corners only.
+
+    `following` leads from corner to corner along the sides without a neighbour. It is a function, as no two
+    cells touch by a corner alone. Corners between two collinear sides are dropped.
+    """
     following: dict[Cell, Cell] = {}
     for x, y in cells:
         corners = ((x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1))

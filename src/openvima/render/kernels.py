@@ -130,6 +130,9 @@ def draw_triangles(
 
     A pixel belongs to a triangle if its sampling point lies inside or on the border; among triangles of equal
     depth the later one shows. Back faces and triangles of next to no area are left out.
+
+    Every pixel of a triangle's bounding box is tested by its three barycentric weights, computed anew:
+    stepped from pixel to pixel they would round differently, and pixels on a border would change sides.
     """
     image_height, image_width = segm.shape
     texture_height, texture_width = texture.shape[0], texture.shape[1]

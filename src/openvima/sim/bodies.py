@@ -1,5 +1,8 @@
 """Bodies in MuJoCo, suction probe and spatula included: poses, velocities, and distances to contact."""
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's names come from a compiled module without type stubs.)
+
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -11,10 +14,6 @@ from openvima.catalog.geometry import Assets, Vector3
 from openvima.scene import Pose, Scene
 from openvima.scene.scene import Quaternion, normalised
 from openvima.sim.model import PARKED_M, PROBE_HALF_LENGTH_M, TICK_S, body_shape, build_model
-
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's names come from a compiled module without type stubs.)
-
 
 _FASTEST = np.array([1.0, 1.0, 1.0, 1 / 0.015, 1 / 0.015, 1 / 0.015])  # rad/s per m/s: half a small block
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that later ticks depend on
@@ -243,10 +242,6 @@ def _numbers(pose: Pose) -> tuple[float, ...]:
     return (*pose.position, w, x, y, z)
 
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo's names come from a compiled module without type stubs.)
-
-
 CONTACT_M = 1e-5  # gaps below this count as contact
 _FARTHEST_M = 10.0  # beyond this, distances are not computed
 _MOST_STEPS = 50
@@ -294,6 +289,12 @@ def distance_to_contact(
 def _pair_distance_to_contact(
     bodies: Bodies, geom: int, other: int, direction: np.ndarray, length_m: float
 ) -> float | None:
+    """How far one part can move before it touches another; None without contact.
+
+    The distance of two convex shapes is a convex function of the translation of one of them. Newton's method,
+    started without contact, therefore never overshoots, and converges in a few evaluations. The slope is that
+    of the segment between the nearest points. The part is moved meanwhile, and put back.
+    """
     model, positions = bodies.model, bodies.data.geom_xpos
     margin = float(model.geom_margin[geom] + model.geom_margin[other])
     start = positions[geom].copy()

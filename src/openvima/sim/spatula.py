@@ -159,7 +159,12 @@ class Spatula:
                 return
 
     def _push_to(self, target: Vector3) -> None:
-        """Move the tip in a straight line to a point and push what is in the way."""
+        """Move the tip in a straight line to a point and push what is in the way.
+
+        Three gaits, by what the bodies do: none moves, so the spatula goes on to the first contact without
+        physics; all that move ride along with it, so they are shifted rigidly to the next contact; else
+        physics. Short of the target, a stride of physics follows in any case: contacts have changed.
+        """
         while (left := math.dist(target, self._tip)) > 1e-9:
             direction = _direction(self._tip, target, left)
             if self._is_calm():
@@ -187,7 +192,11 @@ class Spatula:
         return length - way
 
     def _carried_bodies(self) -> tuple[int, ...] | None:
-        """The carried bodies; None while any body neither moves with the spatula nor rests."""
+        """The carried bodies; None while any body neither moves with the spatula nor rests.
+
+        Positions are compared over the last strides, not velocities: pushed bodies jitter without going
+        anywhere. Rows of `change`, shape (free bodies, 7), are position and quaternion.
+        """
         if len(self._recent) < _CARRIED_STRIDES:
             return None
         before, tip = self._recent[-_CARRIED_STRIDES]

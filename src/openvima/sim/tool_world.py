@@ -203,7 +203,10 @@ class ToolWorld:
         self._go(self._above_contact(target) if is_cup else target)
 
     def _reachable(self, motion: tuple[float, float, float, float]) -> ToolPose | None:
-        """The pose after as much of a motion as the joints allow; None: nothing of it."""
+        """The pose after as much of a motion as the joints allow; None: nothing of it.
+
+        By bisection of the fraction: the whole motion is tried first, which nearly always can be reached.
+        """
         found, low, high = None, 0.0, 1.0
         fraction = 1.0
         for _ in range(_BISECTIONS):

@@ -120,6 +120,8 @@ def inverse(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
             f"{SHORTEST_REACH_M:.4f} … {LONGEST_REACH_M:.4f} m with the tool vertical. Lower it or move it "
             f"nearer (`highest_tip_z` gives the limit of the height)."
         )
+    # The arm's plane passes the shoulder's axis at a constant side offset, hence the arcsine; `reach` and
+    # `height` are the wrist in that plane. The elbow stays up, so one of the two triangles is left out.
     pan = math.atan2(y, x) - math.asin(SIDE_OFFSET_M / distance) - math.pi
     pan = _wrapped(pan, -1.5 * math.pi)
     lift = -math.atan2(height, reach) - _corner(UPPER_ARM_M, length, FOREARM_M)
@@ -172,6 +174,7 @@ def _wrapped(angle: float, low: float) -> float:
     return (angle - low) % (2 * math.pi) + low
 
 
+# Dimensions of the two tools, which point down from the flange. Heights are those of the tip (`forward`).
 HOVER_TIP_Z_M = 0.32  # above pick and place points
 REACH_RESERVE_M = 0.005  # kept below the highest point that the arm can reach
 

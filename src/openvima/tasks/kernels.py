@@ -17,6 +17,10 @@ def mark_free_centres(
 
     A window that reaches an occupied cell, the outermost ring of cells or past the raster is not free. For an
     even side the window has one cell more on the low side, as in the benchmark's erosion.
+
+    One pass, whatever the side: `run` counts the free cells upwards in each column, `width` the neighbouring
+    columns with a run of at least `side`. The last cell of a free window is reached last, so its centre lies
+    behind the present cell.
     """
     num_rows, num_columns = labels.shape
     below = side // 2  # cells of the window before its centre

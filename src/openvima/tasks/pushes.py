@@ -256,6 +256,9 @@ class View:
     def cleared(self, goal: InZone, push: Push) -> Push | None:
         """Find a variant of a push of the goal's block without collisions, except for `overlap_m`.
 
+        The block's way is the same in all variants and tested once, that of the spatula for each. The place
+        where the spatula comes down must be free of all blocks, even of swept ones.
+
         Returns:
             The push, possibly with the spatula off-centre; None if every variant collides.
         """
