@@ -107,7 +107,7 @@ def in_prompt(episode: Episode, rasteriser: Rasteriser) -> tuple[list[Placement]
         elif isinstance(fill, SceneImage):
             placements += [fill.scene[object_id] for object_id in seen.ids.tolist()]
         views.append(seen)
-    return placements, ObjectViews.concatenated(views)
+    return placements, ObjectViews.concatenate(views)
 
 
 def nearest(

@@ -122,7 +122,7 @@ class NaiveProcessor:
         slots = _widest(images)
         if self.layout == "views":
             # What comes after the fullest view's objects is hidden in both.
-            images = [image.select(np.arange(len(image)) < max(slots)).padded(max(slots)) for image in images]
+            images = [image.select(np.arange(len(image)) < max(slots)).pad(max(slots)) for image in images]
         count, unread = 0, iter(images)
         for piece in sequence:
             if isinstance(piece, str):
@@ -140,7 +140,7 @@ class NaiveProcessor:
         in_scene = np.array(kinds, np.bool_)[numbers]
         named = np.isin(words, self.tokenizer.texture_ids)
         return PromptInput(
-            words, entries, parts, mask, ObjectViews.concatenated(images), numbers, in_scene, named
+            words, entries, parts, mask, ObjectViews.concatenate(images), numbers, in_scene, named
         )
 
     def start_episode(self) -> "NaiveEpisode":
@@ -166,7 +166,7 @@ class NaiveProcessor:
         if self.layout == "frames":
             return self.see_frames(image.rgb)
         objects = self.extractor.in_prompt_image(image)
-        return objects if self.layout == "objects" else objects.compacted()
+        return objects if self.layout == "objects" else objects.compact()
 
     def _places(self, objects: ObjectViews, slots: Sequence[int]) -> list[tuple[int, int, bool]]:
         """Entry, part and validity of the tokens of one image, in the order of the prompt.
@@ -218,7 +218,7 @@ class NaiveEpisode:
         self._check_count(len(objects))
         if layout == "views":
             self._num_slots = max(self._num_slots, len(objects))
-            objects = objects.compacted().padded(self._num_slots)
+            objects = objects.compact().pad(self._num_slots)
         return StepInput(objects, objects.positions(), objects.grasp_points(), end_effector)
 
     def _check_count(self, count: int) -> None:

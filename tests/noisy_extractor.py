@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.perception.objects import ObjectViews, observe, observe_prompt_image, see_nothing
+from openvima.perception.objects import ObjectViews, make_hidden_objects, observe, observe_prompt_image
 from openvima.scene import PromptImage
 
 HOOK = f"{Path(__file__)}:make"
@@ -32,7 +32,7 @@ class NoisyExtractor:
 
     def _seen(self, true: ObjectViews, rgb: np.ndarray) -> ObjectViews:
         if int(rgb.sum()) % 5 == 0:
-            return see_nothing()
+            return make_hidden_objects()
         found = true.select(np.array([slot for slot in range(len(true)) if slot % 3 != 1][::-1], np.int64))
         found.boxes[..., :2] += self.pixels * found.masks[..., None]
         found.ids[:] = -1

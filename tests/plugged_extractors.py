@@ -1,6 +1,6 @@
 """Extractors of objects as a user would write them, named by `plugged_extractors.py:truth` and the like."""
 
-from openvima.perception.objects import GROUND_TRUTH, see_nothing
+from openvima.perception.objects import GROUND_TRUTH, make_hidden_objects
 
 
 def truth():
@@ -12,7 +12,7 @@ class Blind:
     """Finds nothing on the table, and in a prompt two objects that no view shows."""
 
     def in_observation(self, observation):
-        return see_nothing()
+        return make_hidden_objects()
 
     def in_prompt_image(self, image):
-        return see_nothing(2)
+        return make_hidden_objects(2)

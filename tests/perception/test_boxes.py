@@ -6,14 +6,14 @@ import pytest
 from openvima.env import TabletopEnv
 from openvima.perception.boxes import BoxJitter, match_ids_to_slots, object_iou
 from openvima.perception.kernels import CROP_SIZE
-from openvima.perception.objects import ObjectViews, crop_box, observe, see_nothing
+from openvima.perception.objects import ObjectViews, crop_box, make_hidden_objects, observe
 from openvima.perception.preprocessing import FOUND, ImageStack, extract_observation, preprocess_prompt
 from openvima.render.camera import VIEWS
 
 
 def objects(*boxes: tuple, view: int = 1, first_id: int = 5) -> ObjectViews:
     """Objects with these boxes (first column, first row, last column, last row) in one view."""
-    found = see_nothing(len(boxes))
+    found = make_hidden_objects(len(boxes))
     found.ids[:] = np.arange(first_id, first_id + len(boxes))
     for slot, (left, upper, right, lower) in enumerate(boxes):
         found.masks[view, slot] = True
@@ -56,8 +56,10 @@ def test_each_object_takes_the_slot_that_overlaps_it_most_and_none_twice() -> No
 
 def test_where_nothing_is_found_or_there_nothing_is_named() -> None:
     box = objects((0, 0, 9, 9))
-    assert match_ids_to_slots(see_nothing(), box) == match_ids_to_slots(box, see_nothing()) == {}
-    assert match_ids_to_slots(see_nothing(1), box) == {}
+    assert (
+        match_ids_to_slots(make_hidden_objects(), box) == match_ids_to_slots(box, make_hidden_objects()) == {}
+    )
+    assert match_ids_to_slots(make_hidden_objects(1), box) == {}
 
 
 def edges(objects: ObjectViews) -> np.ndarray:

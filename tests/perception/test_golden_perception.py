@@ -26,7 +26,7 @@ def seen(golden: dict[str, np.ndarray], prefix: str, ids: np.ndarray) -> ObjectV
 
 @pytest.mark.parametrize(("view", "name"), [(0, "front"), (1, "top")])
 def test_objects_of_an_observation_equal_the_golden_ones(golden, view, name):
-    objects = seen(golden, "in.obs", golden["in.obs.object_ids"]).compacted()
+    objects = seen(golden, "in.obs", golden["in.obs.object_ids"]).compact()
     np.testing.assert_array_equal(objects.masks[view], golden[f"out.obs.mask.{name}"][0, 0])
     np.testing.assert_array_equal(objects.boxes[view], golden[f"out.obs.bbox.{name}"][0, 0])
     np.testing.assert_array_equal(objects.crops[view], golden[f"out.obs.cropped_img.{name}"][0, 0])
@@ -39,7 +39,7 @@ def test_objects_of_prompt_images_equal_the_golden_ones(golden, view, name):
         ("in.prompt.scene", golden["in.prompt.scene.object_ids"]),
     ]
     for entry, (prefix, ids) in enumerate(assets):
-        objects = seen(golden, prefix, ids).compacted()
+        objects = seen(golden, prefix, ids).compact()
         count = int(objects.masks[view].sum())
         expected = golden[f"out.prompt.mask.{name}"][entry]
         assert count == expected.sum()

@@ -154,7 +154,7 @@ def test_slots_are_the_same_object_in_both_views_until_compacted() -> None:
     segm["top"][10:20, 10:20] = 8
     objects = extract_objects(noise(), segm, [7, 8])
     assert objects.masks.tolist() == [[True, False], [False, True]]
-    compacted = objects.compacted()
+    compacted = objects.compact()
     assert compacted.masks.tolist() == [[True, False], [True, False]]
     np.testing.assert_array_equal(compacted.boxes[TOP, 0], objects.boxes[TOP, 1])
     np.testing.assert_array_equal(compacted.crops[TOP, 0], objects.crops[TOP, 1])

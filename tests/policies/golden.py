@@ -29,7 +29,7 @@ from naive_inputs import (
     batch_histories,
     batch_prompts,
 )
-from openvima.perception.objects import ObjectViews, see_nothing
+from openvima.perception.objects import ObjectViews, make_hidden_objects
 from openvima.perception.preprocessing import ImageStack
 from openvima.policies.build import outline_network
 from openvima.policies.nn.action_head import BinsHead, decode_bins, shift_actions
@@ -304,7 +304,7 @@ def _prompts(network: PolicyNetwork, recorded: Arrays) -> list[PromptInput]:
             ]
         words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
         numbers = np.repeat(np.arange(len(images)), [len(image) for image in images])
-        objects, in_scene = ObjectViews.concatenated(images), np.zeros(len(numbers), dtype=bool)
+        objects, in_scene = ObjectViews.concatenate(images), np.zeros(len(numbers), dtype=bool)
         prompts.append(PromptInput(words, entries, parts, mask, objects, numbers, in_scene))
     return prompts
 
@@ -328,10 +328,10 @@ def _images(recorded: Arrays, kind: str, index: tuple[int, ...]) -> tuple[Object
     """
     if f"in.{kind}.rgb.{VIEWS[0]}" in recorded:
         frames = np.stack([recorded[f"in.{kind}.rgb.{view}"][index] for view in VIEWS])[:, None]
-        whole = see_nothing(1)
+        whole = make_hidden_objects(1)
         return ObjectViews(whole.ids, frames, whole.boxes, ~whole.masks, whole.grasps), [1, 1]
     masks = [recorded[f"in.{kind}.mask.{view}"][index] for view in VIEWS]
-    objects = see_nothing(max(len(mask) for mask in masks))
+    objects = make_hidden_objects(max(len(mask) for mask in masks))
     for view, name in enumerate(VIEWS):
         count = len(masks[view])
         objects.crops[view, :count] = recorded[f"in.{kind}.cropped_img.{name}"][index]

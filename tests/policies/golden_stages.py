@@ -229,7 +229,7 @@ def _filled(steps: Sequence[StepInput]) -> tuple[list[StepInput], list[int]]:
     counts = [len(step.objects) for step in steps]
     nowhere = np.zeros((max(counts), 2))
     filled = [
-        replace(step, objects=step.objects.padded(max(counts)), positions=nowhere, grasps=nowhere)
+        replace(step, objects=step.objects.pad(max(counts)), positions=nowhere, grasps=nowhere)
         for step in steps
     ]
     return filled, counts

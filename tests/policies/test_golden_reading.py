@@ -67,7 +67,7 @@ def longer_companion(inputs: Inputs) -> Inputs:
         ),
         np.concatenate([first.parts, second.parts]),
         np.concatenate([first.mask, second.mask]),
-        ObjectViews.concatenated([first.objects, second.objects]),
+        ObjectViews.concatenate([first.objects, second.objects]),
         np.concatenate([first.numbers, second.numbers]),
         np.concatenate([first.in_scene, second.in_scene]),
     )
@@ -83,7 +83,7 @@ def longer_companion(inputs: Inputs) -> Inputs:
 
 
 def with_objects_twice(step: StepInput) -> StepInput:
-    objects = ObjectViews.concatenated([step.objects, step.objects])
+    objects = ObjectViews.concatenate([step.objects, step.objects])
     nowhere = np.zeros((len(objects), 2))
     return replace(step, objects=objects, positions=nowhere, grasps=nowhere)
 

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from openvima.perception.objects import ObjectViews, see_nothing
+from openvima.perception.objects import ObjectViews, make_hidden_objects
 from openvima.policies.batch import WORD, PromptBatch
 from openvima.policies.processor import Processor
 from openvima.scene import PromptImage, RenderedPrompt
@@ -19,7 +19,7 @@ class Scripted:
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         shown = image.name.split("_")
         masks = np.array([[view in views for views in shown] for view in "ft"])
-        return replace(see_nothing(len(shown)), masks=masks)
+        return replace(make_hidden_objects(len(shown)), masks=masks)
 
     def in_observation(self, observation):
         raise NotImplementedError

@@ -8,7 +8,7 @@ import numpy as np
 from openvima.data.records import Demonstration
 from openvima.data.schema import VIEWS
 from openvima.perception.boxes import match_ids_to_slots
-from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, observe, see_nothing
+from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, make_hidden_objects, observe
 from openvima.perception.preprocessing import (
     IMAGE_SIZES,
     ImageStack,
@@ -117,7 +117,7 @@ def preprocess(
     extract_ahead(kind, extractor, observations=observations, prompts=[demo.prompt])
     prompt = preprocess_prompt(demo.prompt, kind, extractor, stack)
     views = [extract_observation(observation, kind, extractor) for observation in observations]
-    objects = ObjectTable.from_views(ObjectViews.concatenated(views), stack)
+    objects = ObjectTable.from_views(ObjectViews.concatenate(views), stack)
     pick_ids, place_ids = np.array(demo.pick_ids, np.int16), np.array(demo.place_ids, np.int16)
     if extractor is not None:
         for t, (observation, found) in enumerate(zip(observations, views, strict=True)):
@@ -165,7 +165,7 @@ def number_images(
 def empty_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:
     """Return an episode without steps and images, in place of one that a cache leaves out."""
     stack, none = ImageStack(IMAGE_SIZES[kind]), np.zeros(0, np.int16)
-    nothing = ObjectTable.from_views(see_nothing(), stack)
+    nothing = ObjectTable.from_views(make_hidden_objects(), stack)
     return PreprocessedEpisode(
         task=task,
         seed=seed,

@@ -17,8 +17,8 @@ from openvima.perception.objects import (
     camera_frames,
     crop_box,
     interior_pixel,
+    make_hidden_objects,
     part_of,
-    see_nothing,
 )
 from openvima.render.camera import CAMERAS, VIEWS, View, unproject
 from openvima.scene import PromptImage
@@ -257,15 +257,15 @@ class DetectedObjects:
             detected = [self.detector.detect(rgb, view) for rgb, view in zip(frames, views, strict=True)]
         singles = [pair.single for pair in pairs for _ in VIEWS]
         crops = [
-            _crop_objects(rgb, self._chosen(found, rgb, view, single=single), view)
+            _crop_objects(rgb, self._choose(found, rgb, view, single=single), view)
             for rgb, view, found, single in zip(frames, views, detected, singles, strict=True)
         ]
         return [
-            _joined(front, top, single=pair.single)
+            _join(front, top, single=pair.single)
             for pair, front, top in zip(pairs, crops[::2], crops[1::2], strict=True)
         ]
 
-    def _chosen(self, found: Detections, rgb: np.ndarray, view: View, *, single: bool) -> Detections:
+    def _choose(self, found: Detections, rgb: np.ndarray, view: View, *, single: bool) -> Detections:
         _check_within(found, rgb.shape[1:], view)
         if single and len(found):
             return found.select(np.array([0 if found.scores is None else found.scores.argmax()]))
@@ -318,7 +318,7 @@ class _ViewDetections:
 
 
 def _crop_objects(rgb: np.ndarray, found: Detections, view: View) -> _ViewDetections:
-    blank = see_nothing(len(found))
+    blank = make_hidden_objects(len(found))
     crops, boxes, grasps = blank.crops[0], blank.boxes[0], blank.grasps[0]
     colours = np.zeros((len(found), NUM_BINS**3))
     for k, (left, upper, right, lower) in enumerate(found.boxes.tolist()):
@@ -342,7 +342,7 @@ def _histogram(pixels: np.ndarray) -> np.ndarray:
     return np.bincount(bins, minlength=NUM_BINS**3) / pixels.shape[1]
 
 
-def _joined(front: _ViewDetections, top: _ViewDetections, *, single: bool) -> ObjectViews:
+def _join(front: _ViewDetections, top: _ViewDetections, *, single: bool) -> ObjectViews:
     """Match the detections of both views, all of them or those of a single object."""
     both = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
     return _merge_views(front, top, both if single else _match_views(front, top)).left_to_right()
@@ -369,7 +369,7 @@ def _merge_views(front: _ViewDetections, top: _ViewDetections, pairs: list[tuple
     hidden = -1
     slots = [*pairs, *((row, hidden) for row in only_front), *((hidden, row) for row in only_top)]
     rows = np.array(slots, np.int64).reshape(-1, 2)
-    objects = see_nothing(len(rows))
+    objects = make_hidden_objects(len(rows))
     for view, detections in ((FRONT, front), (TOP, top)):
         visible = rows[:, view] != hidden
         chosen = rows[visible, view]

@@ -145,9 +145,9 @@ class MaskRCNN(nn.Module):
         scale = self.pixel_mean.new_tensor([width / before[1], height / before[0]]).repeat(2)
         divisor = self.backbone.size_divisor
         padded = height + -height % divisor, width + -width % divisor
-        return self._normalised(pixels, *padded), scale, (height, width)
+        return self._normalise(pixels, *padded), scale, (height, width)
 
-    def _normalised(self, pixels: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    def _normalise(self, pixels: torch.Tensor, height: int, width: int) -> torch.Tensor:
         """Normalise pixels, and pad them with zeros."""
         if pixels.dtype == torch.uint8 and is_cpu_inference(pixels):
             return normalise(pixels, self.pixel_mean, self.pixel_std, height=height, width=width)

@@ -21,7 +21,7 @@ from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.detector.detection import MATCHING_VERSION, DetectedObjects
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
-from openvima.perception.objects import AheadExtractor, ObjectExtractor, ObjectViews, see_nothing
+from openvima.perception.objects import AheadExtractor, ObjectExtractor, ObjectViews, make_hidden_objects
 from openvima.policies.naming import WEIGHTS_FILE, checkpoint_folder
 from openvima.scene import PromptImage
 from openvima.user_code import call_function, is_code, load_function, source_hash
@@ -148,7 +148,7 @@ class PluggedExtractor:
     def in_observation(self, observation: Mapping) -> ObjectViews:
         """Extract the objects of an observation, at least one masked object."""
         found = _visible(self.extractor.in_observation(observation))
-        return found if len(found) else see_nothing(1)
+        return found if len(found) else make_hidden_objects(1)
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Extract the objects of a prompt image; there may be none."""

@@ -91,15 +91,15 @@ class BoxJitter:
         if "segm" not in observation or "rgb" not in observation:
             return observation  # of a policy on whole frames
         frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
-        return {**observation, FOUND: self._moved(frames, observe(observation)).left_to_right()}
+        return {**observation, FOUND: self._move(frames, observe(observation)).left_to_right()}
 
     def prompt_image(self, image: PromptImage) -> PromptImage:
         """Return a prompt image with its objects, found beforehand."""
         frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
-        found = self._moved(frames, observe_prompt_image(image))
+        found = self._move(frames, observe_prompt_image(image))
         return FoundImage(**{f.name: getattr(image, f.name) for f in fields(image)}, found=found)
 
-    def _moved(self, frames: Mapping[str, np.ndarray], objects: ObjectViews) -> ObjectViews:
+    def _move(self, frames: Mapping[str, np.ndarray], objects: ObjectViews) -> ObjectViews:
         crops, boxes, grasps = objects.crops.copy(), objects.boxes.copy(), objects.grasps.copy()
         for v, view in enumerate(VIEWS):
             height, width = frames[view].shape[1:]

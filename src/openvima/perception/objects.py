@@ -60,7 +60,7 @@ class ObjectViews:
             self.grasps[:, slots],
         )
 
-    def compacted(self) -> "ObjectViews":
+    def compact(self) -> "ObjectViews":
         """Return visible objects first in each view, padding at its end, as published policies expect.
 
         Slots of the two views then need not show the same object, and `ids` name nothing any more.
@@ -75,7 +75,7 @@ class ObjectViews:
             self.grasps[rows, order],
         )
 
-    def padded(self, count: int) -> "ObjectViews":
+    def pad(self, count: int) -> "ObjectViews":
         """Return at least so many slots; the new ones are black, hidden and at the end."""
         extra = max(0, count - len(self))
 
@@ -91,10 +91,10 @@ class ObjectViews:
         )
 
     @staticmethod
-    def concatenated(images: Sequence["ObjectViews"]) -> "ObjectViews":
+    def concatenate(images: Sequence["ObjectViews"]) -> "ObjectViews":
         """Put the objects of several images into one record, image after image."""
         if not images:
-            return see_nothing()
+            return make_hidden_objects()
         return ObjectViews(
             np.concatenate([image.ids for image in images]),
             np.concatenate([image.crops for image in images], axis=1),
@@ -178,7 +178,7 @@ GROUND_TRUTH = GroundTruth()
 PUBLISHED_ORDER = GroundTruth(left_to_right=False)
 
 
-def see_nothing(count: int = 0) -> ObjectViews:
+def make_hidden_objects(count: int = 0) -> ObjectViews:
     """Return so many hidden objects."""
     views = len(VIEWS)
     return ObjectViews(
@@ -205,7 +205,7 @@ def whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
         PolicyError: A view is missing.
         ShapeError: An image has another shape or dtype.
     """
-    front, top = (_checked_rgb(view, frame) for view, frame in by_view(rgb, "rgb").items())
+    front, top = (_check_rgb(view, frame) for view, frame in by_view(rgb, "rgb").items())
     height, width = front.shape[1:]
     if top.shape != front.shape or height % 2 or width % 2 or not front.size:
         raise ShapeError(
@@ -325,7 +325,7 @@ def camera_frames(rgb: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndar
     """
     frames = by_view(rgb, what)
     for view in VIEWS:
-        shape = _checked_rgb(view, frames[view]).shape
+        shape = _check_rgb(view, frames[view]).shape
         expected = (3, CAMERAS[view].height, CAMERAS[view].width)
         if shape != expected:
             raise ShapeError(f"rgb {view!r} has shape {shape}; it must be {expected}, to measure boxes in.")
@@ -380,8 +380,8 @@ def _measure(rgb: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray]) -> l
     views = []
     frames, segmentations = by_view(rgb, "rgb"), by_view(segm, "segm")
     for view in VIEWS:
-        frame = _checked_rgb(view, frames[view])
-        ids = _checked_segm(view, segmentations[view], frame.shape[1:])
+        frame = _check_rgb(view, frames[view])
+        ids = _check_segm(view, segmentations[view], frame.shape[1:])
         extents, num_pixels = np.empty((_NUM_IDS, 4), np.int64), np.empty(_NUM_IDS, np.int64)
         object_extents(ids, extents, num_pixels)
         views.append(_Measured(frame, ids, extents, num_pixels))
@@ -391,7 +391,7 @@ def _measure(rgb: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray]) -> l
 def _cut_out(views: Sequence[_Measured], ids: np.ndarray) -> ObjectViews:
     if len(ids) > MAX_OBJECTS:
         raise PolicyError(f"an image has {len(ids)} objects; at most {MAX_OBJECTS} are allowed.")
-    objects = replace(see_nothing(len(ids)), ids=ids)
+    objects = replace(make_hidden_objects(len(ids)), ids=ids)
     for v, view in enumerate(views):
         objects.masks[v] = view.num_pixels[ids] >= MIN_PIXELS
         for slot in np.flatnonzero(objects.masks[v]):
@@ -419,13 +419,13 @@ def interior_pixel(segm: np.ndarray, extent: np.ndarray, *, value: int) -> np.nd
     return pixel
 
 
-def _checked_rgb(view: str, rgb: np.ndarray) -> np.ndarray:
+def _check_rgb(view: str, rgb: np.ndarray) -> np.ndarray:
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3:
         raise ShapeError(f"rgb {view!r} is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W).")
     return rgb
 
 
-def _checked_segm(view: str, segm: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _check_segm(view: str, segm: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if segm.dtype != np.uint8 or segm.shape != shape:
         raise ShapeError(f"segm {view!r} is {segm.dtype} {segm.shape}; it must be uint8 {shape}.")
     return segm

@@ -118,7 +118,7 @@ class ObjectTable:
     def concatenate(tables: Sequence["ObjectTable"]) -> "ObjectTable":
         """Put the rows of several tables into one."""
         if not tables:
-            return ObjectTable.from_views(ObjectViews.concatenated([]), ImageStack((CROP_SIZE, CROP_SIZE)))
+            return ObjectTable.from_views(ObjectViews.concatenate([]), ImageStack((CROP_SIZE, CROP_SIZE)))
         return ObjectTable(
             np.concatenate([table.ids for table in tables]),
             np.concatenate([table.crop_index for table in tables]),
@@ -183,7 +183,7 @@ def preprocess_prompt(
     found = [_extract_prompt_image(image, kind, extractor, stack.image_size) for image in images]
     return PreprocessedPrompt(
         prompt.text,
-        ObjectTable.from_views(ObjectViews.concatenated(found), stack),
+        ObjectTable.from_views(ObjectViews.concatenate(found), stack),
         np.array([len(objects) for objects in found], np.int16),
         np.array([image.kind == "scene" for image in images], np.bool_),
     )
@@ -214,7 +214,7 @@ def extract_observation(
         return observation[FOUND]
     if extractor is None:
         return GROUND_TRUTH.in_observation(observation)
-    return _numbered(extractor.in_observation(observation))
+    return _number(extractor.in_observation(observation))
 
 
 def extract_ahead(
@@ -272,7 +272,7 @@ def _extract_prompt_image(
         return image.found
     if extractor is None:
         return GROUND_TRUTH.in_prompt_image(image)
-    return _numbered(extractor.in_prompt_image(image))
+    return _number(extractor.in_prompt_image(image))
 
 
 def _whole_frames(rgb: Mapping[str, np.ndarray], image_size: tuple[int, int]) -> ObjectViews:
@@ -285,6 +285,6 @@ def _whole_frames(rgb: Mapping[str, np.ndarray], image_size: tuple[int, int]) ->
     return frames
 
 
-def _numbered(found: ObjectViews) -> ObjectViews:
+def _number(found: ObjectViews) -> ObjectViews:
     """Number what an extractor found in its own order."""
     return replace(found, ids=np.arange(len(found)))

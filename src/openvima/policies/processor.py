@@ -151,7 +151,7 @@ class Processor:
                 found.append(objects)
         steps = _Steps.of([len(history) for history in histories])
         counts = np.array([len(objects) for objects in found], np.int64)
-        objects = ObjectTable.from_views(ObjectViews.concatenated(found), stack)
+        objects = ObjectTable.from_views(ObjectViews.concatenate(found), stack)
         slots_BT = self._num_slots(steps, counts, np.array(num_slots))
         return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors)), stack
 

@@ -215,7 +215,7 @@ def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(d
         kinds = [image.kind == "scene" for image in demo.prompt.images.values()]
         assert batch.in_scene_S.tolist() == np.repeat(kinds, counts).tolist(), task
         objects = [GROUND_TRUTH.in_prompt_image(image) for image in demo.prompt.images.values()]
-        np.testing.assert_array_equal(batch.positions_S2, ObjectViews.concatenated(objects).positions())
+        np.testing.assert_array_equal(batch.positions_S2, ObjectViews.concatenate(objects).positions())
 
 
 def test_images_of_single_objects_do_not_change_the_correspondence_of_scenes(network, demos):
