@@ -14,7 +14,6 @@ from openvima.data import (
     GenerationProgress,
     generate,
     generation,
-    oracle_rollouts,
 )
 from openvima.data import manifest as manifests
 from openvima.data.encoding import Skipped
@@ -138,7 +137,7 @@ def test_seeds_that_fail_are_skipped_and_counted(tmp_path: Path, monkeypatch: py
 def test_a_task_that_the_oracle_cannot_solve_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(oracle_rollouts, "attempt", lambda env, seed: Skipped(seed, "no_action", "it fell"))
+    monkeypatch.setattr(generation, "attempt", lambda env, seed: Skipped(seed, "no_action", "it fell"))
     with pytest.raises(OracleError, match=r"solved 0 of 20 episodes of 'rotate'.*it fell"):
         generate(config(tmp_path))
     assert contents(tmp_path) == {}
@@ -147,7 +146,7 @@ def test_a_task_that_the_oracle_cannot_solve_is_given_up(
 @pytest.fixture
 def clumsy(monkeypatch: pytest.MonkeyPatch) -> None:
     """An oracle that spoils seed 0, does not end seeds 1 and 20, and is at a loss at seed 2."""
-    rollout = oracle_rollouts.rollout_oracle
+    rollout = generation.rollout_oracle
 
     def sometimes(env: TabletopEnv, seed: int) -> Demonstration:
         if seed == 2:
@@ -156,7 +155,7 @@ def clumsy(monkeypatch: pytest.MonkeyPatch) -> None:
         outcomes = {0: Outcome(False, True, "it fell"), 1: Outcome(), 20: Outcome()}
         return replace(demo, outcome=outcomes.get(seed, demo.outcome))
 
-    monkeypatch.setattr(oracle_rollouts, "rollout_oracle", sometimes)
+    monkeypatch.setattr(generation, "rollout_oracle", sometimes)
 
 
 @pytest.mark.usefixtures("clumsy")
@@ -301,7 +300,7 @@ def test_extending_copies_what_is_there_and_gives_the_same_bytes(
     settings = {"tasks": ("rotate",), "shard_size": 4, "images": images}
     whole = contents(generate(config(tmp_path / "whole", episodes=6, **settings)))
     played, read = [], []
-    attempt, summarise = oracle_rollouts.attempt, manifests.summarise
+    attempt, summarise = generation.attempt, manifests.summarise_shard
 
     def counting_attempt(env, seed):
         played.append(seed)
@@ -312,8 +311,8 @@ def test_extending_copies_what_is_there_and_gives_the_same_bytes(
         return summarise(path, known)
 
     generate(config(tmp_path / "out", episodes=5, **settings))
-    monkeypatch.setattr(oracle_rollouts, "attempt", counting_attempt)
-    monkeypatch.setattr(manifests, "summarise", counting_summarise)
+    monkeypatch.setattr(generation, "attempt", counting_attempt)
+    monkeypatch.setattr(manifests, "summarise_shard", counting_summarise)
     generate(config(tmp_path / "out", episodes=6, **settings))
     assert contents(tmp_path / "out") == whole
     assert len(played) == 1
@@ -344,8 +343,8 @@ def test_an_extension_that_was_interrupted_reads_no_more_than_needed(tmp_path: P
     with pytest.raises(DatasetError, match="not finished"):
         Dataset(tmp_path / "out")
     read = []
-    summarise = manifests.summarise
-    monkeypatch.setattr(manifests, "summarise", lambda *a: read.append(a[0].name) or summarise(*a))
+    summarise = manifests.summarise_shard
+    monkeypatch.setattr(manifests, "summarise_shard", lambda *a: read.append(a[0].name) or summarise(*a))
     generate(config(tmp_path / "out", episodes=5, **settings))
     assert read == ["rotate-train-00002.arrow"]
     assert contents(tmp_path / "out") == contents(

@@ -13,7 +13,7 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter, generate
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
-from openvima.data.page import bar_chart, episode_card, write_page
+from openvima.data.page import lay_out_histogram, make_episode_card, write_page
 from openvima.data.summary import Histogram, Summary, Unfinished, summarise_folder
 from openvima.errors import ConfigError, DatasetError
 from openvima.html import render_page
@@ -183,11 +183,11 @@ def test_equal_data_give_equal_pages(demos: Path, tmp_path: Path) -> None:
 
 
 def drawn_episode(demo: Demonstration) -> str:
-    return render_page("episode", card=episode_card(demo))
+    return render_page("episode", card=make_episode_card(demo))
 
 
 def drawn_chart(histogram: Histogram) -> str:
-    return render_page("histogram", chart=bar_chart(histogram))
+    return render_page("histogram", chart=lay_out_histogram(histogram))
 
 
 def test_names_from_files_cannot_change_the_page(made_up: MadeUp) -> None:

@@ -79,12 +79,15 @@ def appearance_record(dataset: Dataset, report: Report | None = None) -> dict[st
     for done, name in enumerate(names, start=1):
         for row in dataset.shard(name).table(_COLUMNS).to_pylist():
             roles = counts[row["task"]]
-            for role, appearance in _roles(row):
+            for role, appearance in _list_roles(row):
                 roles[role][appearance] += 1
         if report is not None:
             report(done, len(names), "")
     manifest = {name: dataset.manifest[name] for name in _FROM_MANIFEST}
-    tasks = {task: {**_episodes(dataset, task), "roles": _tables(counts[task])} for task in sorted(counts)}
+    tasks = {
+        task: {**_summarise_episodes(dataset, task), "roles": _make_tables(counts[task])}
+        for task in sorted(counts)
+    }
     sha256 = hashlib.sha256((dataset.path / MANIFEST_NAME).read_bytes()).hexdigest()
     return {"manifest": {**manifest, "sha256": sha256}, "tasks": tasks}
 
@@ -105,13 +108,13 @@ def appearances_of(role: Mapping[str, Any]) -> frozenset[Appearance]:
     )
 
 
-def _roles(row: Row) -> Iterator[tuple[str, Appearance]]:
+def _list_roles(row: Row) -> Iterator[tuple[str, Appearance]]:
     """Yield role and appearance of all objects of an episode."""
     scene_images = [image for image in row["prompt_images"] if image["name"] == _SCENE_IMAGE]
     in_scene_image = {_appearance(part) for image in scene_images for part in image["objects"]}
     for part in row["objects"]:
         yield (
-            _role(part, row, is_in_scene_image=not scene_images or _appearance(part) in in_scene_image),
+            _classify(part, row, is_in_scene_image=not scene_images or _appearance(part) in in_scene_image),
             _appearance(part),
         )
     for image in row["prompt_images"]:
@@ -119,7 +122,7 @@ def _roles(row: Row) -> Iterator[tuple[str, Appearance]]:
             yield "prompted", _appearance(part)
 
 
-def _role(part: Row, row: Row, *, is_in_scene_image: bool) -> str:
+def _classify(part: Row, row: Row, *, is_in_scene_image: bool) -> str:
     if part["fixed"]:
         return "base" if part["id"] in row["place_ids"] else "other_fixed"
     if not is_in_scene_image:
@@ -131,7 +134,7 @@ def _appearance(part: Row) -> Appearance:
     return part["object"], part["texture"]
 
 
-def _episodes(dataset: Dataset, task: str) -> dict[str, Any]:
+def _summarise_episodes(dataset: Dataset, task: str) -> dict[str, Any]:
     """Summarise the episodes of a task in the index."""
     index = dataset.index
     rows = index.filter(np.array(index.column("task").to_pylist()) == task)
@@ -147,15 +150,15 @@ def _episodes(dataset: Dataset, task: str) -> dict[str, Any]:
     }
 
 
-def _tables(roles: Mapping[str, Counter[Appearance]]) -> dict[str, Any]:
+def _make_tables(roles: Mapping[str, Counter[Appearance]]) -> dict[str, Any]:
     return {
-        role: {"count": roles[role].total(), "appearances": _grouped(roles[role])}
+        role: {"count": roles[role].total(), "appearances": _group(roles[role])}
         for role in ROLES
         if roles[role]
     }
 
 
-def _grouped(appearances: Counter[Appearance]) -> list[dict[str, Any]]:
+def _group(appearances: Counter[Appearance]) -> list[dict[str, Any]]:
     """Group objects that have most of their textures in common."""
     textures: dict[str, set[str]] = defaultdict(set)
     for name, texture in appearances:
@@ -169,10 +172,10 @@ def _grouped(appearances: Counter[Appearance]) -> list[dict[str, Any]]:
                 break
         else:
             groups.append(([name], set(textures[name])))
-    return [_group(names, union, textures) for names, union in groups]
+    return [_describe_group(names, union, textures) for names, union in groups]
 
 
-def _group(names: list[str], union: set[str], found: Mapping[str, set[str]]) -> dict[str, Any]:
+def _describe_group(names: list[str], union: set[str], found: Mapping[str, set[str]]) -> dict[str, Any]:
     lacking = {name: sorted(union - found[name]) for name in names if union != found[name]}
     return {"objects": names, "textures": sorted(union), **({"lacking": lacking} if lacking else {})}
 
@@ -193,7 +196,7 @@ def find_leaks(record: Mapping[str, Any]) -> list[str]:
     Returns:
         One sentence for each task, level or appearance outside the training partition.
     """
-    return [problem for task, entry in record["tasks"].items() for problem in _problems(task, entry)]
+    return [problem for task, entry in record["tasks"].items() for problem in _find_problems(task, entry)]
 
 
 def training_appearances(task: str) -> dict[str, frozenset[Appearance]]:
@@ -223,7 +226,7 @@ def training_appearances(task: str) -> dict[str, frozenset[Appearance]]:
     return appearances
 
 
-def _problems(task: str, entry: Mapping[str, Any]) -> list[str]:
+def _find_problems(task: str, entry: Mapping[str, Any]) -> list[str]:
     if task not in tasks_at(_LEVEL):
         return [f"{task} is none of the training tasks."]
     problems = [f"{task} has episodes of level {level}." for level in entry["levels"] if level != _LEVEL]

@@ -64,7 +64,7 @@ def _holds_data_sets_only(folder: Path) -> bool:
     return all((entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in entries)
 
 
-def provenance(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def identify_source(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return what identifies a source, wherever it lies: its content, and the settings that made it."""
     return {key: manifest[key] for key in ("content_hash", "command", "config", "versions")}
 

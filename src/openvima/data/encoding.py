@@ -188,12 +188,12 @@ class Encoder:
             "content_hash": columns.content_hash,
             "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
         }
-        cells: dict[str, pa.Array] = {name: _value_cell(name, others[name]) for name in _REPEATED}
+        cells: dict[str, pa.Array] = {name: _make_value_cell(name, others[name]) for name in _REPEATED}
         made = pa.array([others], type=_OTHERS)
         cells |= {name: made.field(number) for number, name in enumerate(_OTHER_NAMES)}
         for name, rows in columns.numbers.items():
             if name == "joint_paths":
-                cells[name] = _paths_cell(rows, columns.path_lengths)
+                cells[name] = _make_paths_cell(rows, columns.path_lengths)
             else:
                 cells[name] = self._number_cell(name, rows)
         for name, images in columns.images.items():
@@ -205,7 +205,7 @@ class Encoder:
         key = name, len(rows)
         if key not in self._kept:
             memory = np.empty_like(rows)
-            self._kept[key] = memory, _cell(_rows(memory, _TYPES[name].value_type), _TYPES[name])
+            self._kept[key] = memory, _make_cell(_make_rows(memory, _TYPES[name].value_type), _TYPES[name])
         memory, cell = self._kept[key]
         np.copyto(memory, rows)
         return cell
@@ -214,39 +214,41 @@ class Encoder:
         """A column of one row that lists images; those of `ImageBuffers` lie where others lay before."""
         key, memory = (name, len(images)), images.base
         if memory is None or not self._images.owns(name, memory):
-            return _cell(_rows(images, _TYPES[name].value_type), _TYPES[name])
+            return _make_cell(_make_rows(images, _TYPES[name].value_type), _TYPES[name])
         if key not in self._kept or self._kept[key][0] is not memory:
-            self._kept[key] = memory, _cell(_rows(images, _TYPES[name].value_type), _TYPES[name])
+            self._kept[key] = memory, _make_cell(_make_rows(images, _TYPES[name].value_type), _TYPES[name])
         return self._kept[key][1]
 
 
 @lru_cache(maxsize=4096)
-def _value_cell(name: str, value: str | int | bool) -> pa.Array:
+def _make_value_cell(name: str, value: str | int | bool) -> pa.Array:
     """A column of one row that holds a value which many rows share."""
     return pa.array([value], type=COLUMNS.field(name).type)
 
 
-def _rows(rows: np.ndarray, dtype: pa.FixedSizeListType) -> pa.Array:
+def _make_rows(rows: np.ndarray, dtype: pa.FixedSizeListType) -> pa.Array:
     """An array as rows of equal size, without a copy."""
     flat = pa.Array.from_buffers(dtype.value_type, rows.size, [None, pa.py_buffer(rows)], null_count=0)
     return pa.Array.from_buffers(dtype, len(rows), [None], null_count=0, children=[flat])
 
 
-def _cell(items: pa.Array, dtype: pa.ListType) -> pa.ListArray:
+def _make_cell(items: pa.Array, dtype: pa.ListType) -> pa.ListArray:
     """A column of one row that lists items."""
-    return _lists(items, [0, len(items)], dtype)
+    return _make_lists(items, [0, len(items)], dtype)
 
 
-def _paths_cell(waypoints: np.ndarray, lengths: Sequence[int]) -> pa.ListArray:
+def _make_paths_cell(waypoints: np.ndarray, lengths: Sequence[int]) -> pa.ListArray:
     """A column of one row that lists, for each step, the waypoints of the arm."""
     dtype = _TYPES["joint_paths"]
-    steps = _lists(
-        _rows(waypoints, dtype.value_type.value_type), [0, *itertools.accumulate(lengths)], dtype.value_type
+    steps = _make_lists(
+        _make_rows(waypoints, dtype.value_type.value_type),
+        [0, *itertools.accumulate(lengths)],
+        dtype.value_type,
     )
-    return _cell(steps, dtype)
+    return _make_cell(steps, dtype)
 
 
-def _lists(items: pa.Array, ends: Sequence[int], dtype: pa.ListType) -> pa.ListArray:
+def _make_lists(items: pa.Array, ends: Sequence[int], dtype: pa.ListType) -> pa.ListArray:
     offsets = pa.py_buffer(np.array(ends, np.int32))
     return pa.Array.from_buffers(dtype, len(ends) - 1, [None, offsets], null_count=0, children=[items])
 
@@ -275,7 +277,7 @@ def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:
         rgb={view: planes(row[f"rgb_{view}"]) for view in views},
         segm={view: row[f"segm_{view}"] for view in views},
         end_effector=row["end_effector"],
-        actions=actions_in(row),
+        actions=decode_actions(row),
         pick_ids=tuple(row["pick_ids"]),
         place_ids=tuple(row["place_ids"]),
         joint_paths=tuple(row["joint_paths"]),
@@ -306,9 +308,9 @@ def decode_columns(batch: pa.RecordBatch) -> dict[str, Any]:
     for number, name in enumerate(batch.schema.names):
         column = batch.column(number)
         if name in ARRAYS:
-            values[name] = _array_in(column, *ARRAYS[name])
+            values[name] = _view_array(column, *ARRAYS[name])
         elif name == "joint_paths":
-            values[name] = _paths_in(column)
+            values[name] = _view_paths(column)
         else:
             values[name] = column[0].as_py()
     if len(values.get("poses", ())):
@@ -316,7 +318,7 @@ def decode_columns(batch: pa.RecordBatch) -> dict[str, Any]:
     return values
 
 
-def actions_in(row: Mapping[str, Any]) -> tuple[Action, ...]:
+def decode_actions(row: Mapping[str, Any]) -> tuple[Action, ...]:
     """Return the actions of a row, one for each step."""
     columns = [row[name].tolist() for name in ACTION_SHAPES]
     return tuple(
@@ -325,14 +327,14 @@ def actions_in(row: Mapping[str, Any]) -> tuple[Action, ...]:
     )
 
 
-def _array_in(column: pa.ListArray, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+def _view_array(column: pa.ListArray, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
     """The arrays that a row lists, without a copy: nobody else sees what Arrow has decompressed."""
     buffers = column.buffers()  # Arrow's own ways to the numbers take ten times as long
     start, end = _ends(buffers[1], column.offset, 1)
     return _slice(buffers[-1], dtype, shape, start, end)
 
 
-def _paths_in(column: pa.ListArray) -> list[np.ndarray]:
+def _view_paths(column: pa.ListArray) -> list[np.ndarray]:
     _, outer, _, inner, *_, numbers = column.buffers()
     start, end = _ends(outer, column.offset, 1)
     ends = _ends(inner, start, end - start)

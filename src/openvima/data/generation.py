@@ -16,15 +16,24 @@ from openvima.data.manifest import (
     clear,
     finish_folder,
     is_finished,
-    previous_summaries,
+    read_previous_summaries,
     remove_leftovers,
     set_aside,
     storage_error,
 )
-from openvima.data.planning import COMMAND, DOMAIN, NUM_COUNTS, Block, GenerateConfig, Report, plan, reporter
+from openvima.data.planning import (
+    COMMAND,
+    DOMAIN,
+    NUM_COUNTS,
+    Block,
+    GenerateConfig,
+    Report,
+    make_watcher,
+    plan,
+)
 from openvima.data.reader import read_manifest
 from openvima.data.records import Demonstration, rollout_oracle
-from openvima.data.shard import Shard, ShardWriter, spans_of
+from openvima.data.shard import Shard, ShardWriter, list_spans
 from openvima.env import TabletopEnv
 from openvima.env.config import ENV_SETTINGS, EnvConfig
 from openvima.errors import DatasetError, OracleError, SamplingError
@@ -59,10 +68,10 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
     wanted = {block.path.name: block for block in blocks}
     for path in sorted(config.out.glob("*.arrow")):
         shard = Shard(path)
-        problems = _differences(shard.info, blocks[0].info)
+        problems = _compare(shard.info, blocks[0].info)
         block = wanted.get(path.name)
         if block is None and not problems:
-            problems = [_surplus(shard.info, config)]
+            problems = [_explain_surplus(shard.info, config)]
         if block is not None and len(shard) > block.episodes:
             problems.append(f"it has {len(shard)} episodes, asked for are {block.episodes}")
         if problems:
@@ -95,13 +104,13 @@ def _has_failed(shard: Shard) -> bool:
     return any(skipped["kind"] in FAILED_KINDS for row in rows for skipped in row)
 
 
-def _surplus(found: ShardInfo, config: GenerateConfig) -> str:
+def _explain_surplus(found: ShardInfo, config: GenerateConfig) -> str:
     if found.task in config.resolved_tasks():
         return f"it has episodes beyond the {config.episodes} a task that are asked for"
     return f"its task {found.task} is not asked for"
 
 
-def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
+def _compare(found: ShardInfo, asked: ShardInfo) -> list[str]:
     names = ("level", "domain", "shard_size", "first_seed", *ENV_SETTINGS, "compression", "images")
     pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
     pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
@@ -138,7 +147,7 @@ def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:
                 kept.write(rollout, skipped)
                 num_kept, skipped = num_kept + 1, []
             else:
-                skipped.append(why_skipped(rollout))
+                skipped.append(explain_skip(rollout))
                 if block.failed_path is not None:
                     if failed is None:
                         block.failed_path.parent.mkdir(exist_ok=True)
@@ -179,7 +188,7 @@ def rollouts(block: Block) -> Iterator[Demonstration | Skipped]:
         rollout = attempt(env, seed)
         yield rollout
         if isinstance(rollout, Skipped) or not rollout.outcome.success:
-            reason = (rollout if isinstance(rollout, Skipped) else why_skipped(rollout)).reason
+            reason = (rollout if isinstance(rollout, Skipped) else explain_skip(rollout)).reason
             continue
         num_solved += 1
         if num_solved == block.episodes:
@@ -200,7 +209,7 @@ def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
         return Skipped(seed, "no_action", str(error))
 
 
-def why_skipped(demo: Demonstration) -> Skipped:
+def explain_skip(demo: Demonstration) -> Skipped:
     """Return the reason why an unsolved episode is skipped."""
     kind: SkipKind = "failed" if demo.outcome.failure else "unsolved"
     return Skipped(demo.seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
@@ -263,16 +272,16 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
     """
     _remove_leftovers(config, own)
     missing = [block for block in own if not is_done(block)]
-    previous = previous_summaries(config.out) if missing and not config.keep_failed else {}
-    missing = [_with_kept(block, previous.get(block.path.name)) for block in missing]
+    previous = read_previous_summaries(config.out) if missing and not config.keep_failed else {}
+    missing = [_keep_records(block, previous.get(block.path.name)) for block in missing]
     missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
-    watch = reporter(report, own, missing)
+    watch = make_watcher(report, own, missing)
     if not missing:
         return
     for folder in (config.out, config.out / FAILED_FOLDER):
         set_aside(folder)  # a manifest speaks of whole data sets
     try:
-        for _ in _engine(config, missing, watch):
+        for _ in _run(config, missing, watch):
             pass  # a block's result is its file
     finally:
         _remove_leftovers(config, own)
@@ -288,7 +297,7 @@ def _remove_leftovers(config: GenerateConfig, own: Sequence[Block]) -> None:
     remove_leftovers(config.out, None if config.shard_range is None else [block.path for block in own])
 
 
-def _engine(
+def _run(
     config: GenerateConfig, missing: Sequence[Block], watch: Callable[[Counts], None]
 ) -> Iterator[tuple[Block, None]]:
     if config.engine == "processes":
@@ -311,9 +320,9 @@ def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None
             finish(config, blocks)
 
 
-def _with_kept(block: Block, summary: ShardSummary | None) -> Block:
+def _keep_records(block: Block, summary: ShardSummary | None) -> Block:
     """Add the records that a smaller shard has already."""
-    return block if summary is None else replace(block, kept=tuple(spans_of(summary.index)))
+    return block if summary is None else replace(block, kept=tuple(list_spans(summary.index)))
 
 
 def finish(config: GenerateConfig, blocks: Sequence[Block], *, reuse: bool = True) -> None:
@@ -333,5 +342,5 @@ def finish(config: GenerateConfig, blocks: Sequence[Block], *, reuse: bool = Tru
         settings = {**record, "kept": FAILED_FOLDER}
         finish_folder(config.out / FAILED_FOLDER, failed, command=COMMAND, config=settings, versions=versions)
     paths = [block.path for block in blocks]
-    known = previous_summaries(config.out) if reuse else {}
+    known = read_previous_summaries(config.out) if reuse else {}
     finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions, known=known)

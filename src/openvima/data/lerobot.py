@@ -109,7 +109,7 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     with folder_lock(config.out), atomic_folder(config.out) as folder:
         with LerobotWriter(
             folder,
-            survey(dataset, END_EFFECTOR if settings else PRIMITIVES),
+            find_layout(dataset, END_EFFECTOR if settings else PRIMITIVES),
             fps=fps,
             pixels=config.pixels,
             data_file_mb=config.data_file_mb,
@@ -123,7 +123,7 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     return config.out
 
 
-def survey(dataset: Dataset, control: str) -> FrameLayout:
+def find_layout(dataset: Dataset, control: str) -> FrameLayout:
     """Find what the frames of all episodes have in common, without reading images.
 
     Args:

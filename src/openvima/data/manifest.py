@@ -138,9 +138,9 @@ def finish_folder(
     Raises:
         ShardError: A shard is damaged.
     """
-    summaries = [known.get(path.name) or summarise(path) for path in shards]
+    summaries = [known.get(path.name) or summarise_shard(path) for path in shards]
     origin = {"command": command, "config": dict(config), "versions": dict(versions), "licence": licence}
-    index, manifest = compose(summaries, origin)
+    index, manifest = compose_manifest(summaries, origin)
     sink = BytesIO()
     pq.write_table(index, sink, compression="zstd")
     manifest["index"] = {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()}
@@ -152,12 +152,12 @@ def finish_folder(
 
 
 def set_aside(folder: Path) -> None:
-    """Take away the manifest of a folder that is about to change; `previous_summaries` still finds it."""
+    """Rename the manifest of a folder that is about to change; `read_previous_summaries` still finds it."""
     with contextlib.suppress(FileNotFoundError):
         os.replace(folder / MANIFEST_NAME, folder / PREVIOUS_NAME)
 
 
-def previous_summaries(folder: Path) -> dict[str, ShardSummary]:
+def read_previous_summaries(folder: Path) -> dict[str, ShardSummary]:
     """Return summaries of the shards that are as the folder's manifest says, without reading their records.
 
     The manifest may have been set aside. Size, schema and footer of each shard are compared.
@@ -169,7 +169,7 @@ def previous_summaries(folder: Path) -> dict[str, ShardSummary]:
     except (OSError, DatasetError):
         return {}
     found = {}
-    for name, part in index_parts(index).items():
+    for name, part in split_index(index).items():
         entry = manifest["shards"][name]
         with contextlib.suppress(ShardError):
             if "skipped" in entry and is_inside(folder / name):
@@ -178,7 +178,7 @@ def previous_summaries(folder: Path) -> dict[str, ShardSummary]:
     return found
 
 
-def index_parts(index: pa.Table) -> dict[str, pa.Table]:
+def split_index(index: pa.Table) -> dict[str, pa.Table]:
     """Return the rows of an index by shard."""
     if index.num_rows == 0:
         return {}
@@ -190,7 +190,7 @@ def index_parts(index: pa.Table) -> dict[str, pa.Table]:
     return {name: index.take(rows) for name, rows in zip(names, np.split(order, starts), strict=True)}
 
 
-def summarise(
+def summarise_shard(
     path: Path,
     known: Mapping[str, Any] | None = None,
 ) -> ShardSummary:
@@ -213,10 +213,12 @@ def summarise(
         "skipped": dict(sorted(skipped.items())),
     }
     entry = {**counts, **(known or fingerprint(path)), **envelope.to_entry()}
-    return ShardSummary(path.name, entry, _index_part(table, path.name, spans))
+    return ShardSummary(path.name, entry, _make_index_part(table, path.name, spans))
 
 
-def compose(summaries: Sequence[ShardSummary], origin: Mapping[str, Any]) -> tuple[pa.Table, dict[str, Any]]:
+def compose_manifest(
+    summaries: Sequence[ShardSummary], origin: Mapping[str, Any]
+) -> tuple[pa.Table, dict[str, Any]]:
     """Put index and manifest together.
 
     Args:
@@ -271,7 +273,7 @@ def parse_manifest(content: bytes) -> dict[str, Any]:
         raise DatasetError(f"it has schema {written_as}; this package reads {SCHEMA_VERSION}")
     if checksum != manifest_checksum(manifest):
         raise DatasetError("it is damaged or was edited (its checksum is wrong)")
-    if lacking := _lacking(manifest):
+    if lacking := _find_lacking(manifest):
         raise DatasetError(f"it lacks {', '.join(lacking)}, or has other things there")
     _check_names(manifest["shards"])
     return manifest
@@ -296,7 +298,7 @@ def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:
     return index
 
 
-def _lacking(manifest: Mapping[str, Any]) -> list[str]:
+def _find_lacking(manifest: Mapping[str, Any]) -> list[str]:
     """Name what a manifest lacks that something else than this package wrote."""
     lacking = [key for key, kind in _TYPES.items() if not isinstance(manifest.get(key), kind)]
     if lacking:
@@ -378,7 +380,7 @@ def joint_hash(content_hashes: pa.ChunkedArray) -> str:
     return digest.hexdigest()[:32]
 
 
-def _index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
+def _make_index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
     columns = {
         **{column: table.column(column) for column in table.column_names},
         "shard": pa.array([name] * table.num_rows, pa.string()),

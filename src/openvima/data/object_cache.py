@@ -24,7 +24,7 @@ from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empty_episode, preprocess
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
-from openvima.data.shard import DAMAGE_ERRORS, Envelope, Shard, map_file, spans_of
+from openvima.data.shard import DAMAGE_ERRORS, Envelope, Shard, list_spans, map_file
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, imap_unordered
@@ -556,7 +556,7 @@ def _write(work: _Work, count: Callable[[int], None]) -> None:
     kept = split_hashes(index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
     tasks, seeds = (index.column(name).to_pylist() for name in ("task", "seed"))
     episodes = []
-    for row, span in enumerate(spans_of(index)):
+    for row, span in enumerate(list_spans(index)):
         is_unknown = variant.appearance is not None and tasks[row] == COMPOSED  # its prompt is not sampled
         if is_unknown or not kept[row]:
             episodes.append(empty_episode(tasks[row], seeds[row], work.kind))

@@ -60,15 +60,17 @@ def write_page(summary: Summary, out: Path, *, num_samples: int = 3, report: Rep
         manifest=manifest,
         tiles=tiles,
         tasks=summary.tasks,
-        histograms=[bar_chart(histogram) for histogram in summary.histograms if len(histogram.counts) > 1],
-        episodes=_episodes(summary, num_samples, report or (lambda done, total, note: None)),
+        histograms=[
+            lay_out_histogram(histogram) for histogram in summary.histograms if len(histogram.counts) > 1
+        ],
+        episodes=_make_cards(summary, num_samples, report or (lambda done, total, note: None)),
         settings=json.dumps(manifest["config"], indent=2, ensure_ascii=False),
         caches={name: _size(size) for name, size in summary.object_caches.items()},
     )
     return atomic_write_file(out, page)
 
 
-def _episodes(summary: Summary, num_samples: int, report: Report) -> dict[str, list[object]]:
+def _make_cards(summary: Summary, num_samples: int, report: Report) -> dict[str, list[object]]:
     """Values of the template `episode` for some episodes of each task, or why one cannot be shown."""
     if not num_samples:
         return {}
@@ -79,7 +81,7 @@ def _episodes(summary: Summary, num_samples: int, report: Report) -> dict[str, l
     cards: dict[str, list[object]] = {}
     for task, episodes in chosen.items():
         for episode_index in episodes:
-            cards.setdefault(task, []).append(_card(dataset, episode_index))
+            cards.setdefault(task, []).append(_make_card(dataset, episode_index))
             done += 1
             report(done, total, task)
     return cards
@@ -90,9 +92,9 @@ def _spread(numbers: np.ndarray, count: int) -> list[int]:
     return numbers[places].tolist()
 
 
-def _card(dataset: Dataset, episode_index: int) -> dict[str, object] | str:
+def _make_card(dataset: Dataset, episode_index: int) -> dict[str, object] | str:
     try:
-        return episode_card(dataset[episode_index])
+        return make_episode_card(dataset[episode_index])
     except (AssetError, ShardError) as error:  # stored without images, which cannot be rerendered here
         if dataset.shard(dataset.locate(episode_index)[0]).info.images:
             raise
@@ -117,7 +119,7 @@ _COUNT = 92  # room for a count and its fraction
 _LABEL_GAP = 7
 
 
-def bar_chart(histogram: Histogram) -> dict[str, object]:
+def lay_out_histogram(histogram: Histogram) -> dict[str, object]:
     """Lay out a histogram: a bar per value, with its count and fraction.
 
     Of many values the first and the last are shown.
@@ -156,7 +158,7 @@ _HEAD = 7.0  # length of the arrow's head in pixels
 _LEAST_TURN_DEG = 1
 
 
-def episode_card(demo: Demonstration) -> dict[str, object]:
+def make_episode_card(demo: Demonstration) -> dict[str, object]:
     """Values of the template `episode`: prompt, frames, and facts.
 
     Args:
@@ -171,7 +173,7 @@ def episode_card(demo: Demonstration) -> dict[str, object]:
     )
     return {
         "prompt": [part if isinstance(part, str) else _prompt_image(part) for part in demo.prompt.sequence()],
-        "frames": [_frame(demo, step) for step in range(demo.num_steps + 1)],
+        "frames": [_make_frame(demo, step) for step in range(demo.num_steps + 1)],
         "size": (IMAGE_SHAPE[1], 2 * IMAGE_SHAPE[0] + _GAP),
         "facts": facts,
         "content_hash": demo.content_hash(),
@@ -198,18 +200,18 @@ def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
     return pixels[top : rows[-1] + 1 + _MARGIN, left : columns[-1] + 1 + _MARGIN]
 
 
-def _frame(demo: Demonstration, step: int) -> dict[str, object]:
+def _make_frame(demo: Demonstration, step: int) -> dict[str, object]:
     """Observation of both cameras before a step, or at the end, with the action that follows."""
     height, width = IMAGE_SHAPE
     image = np.full((2 * height + _GAP, width, 3), 255, np.uint8)
     for index, view in enumerate(VIEWS):
         top = index * (height + _GAP)
         image[top : top + height] = channels_last(demo.rgb[view][step])
-    arrows = [_arrow(action, view) for action in demo.actions[step : step + 1] for view in VIEWS]
+    arrows = [_draw_arrow(action, view) for action in demo.actions[step : step + 1] for view in VIEWS]
     return {"caption": _caption(demo, step), "png": _png(image), "arrows": arrows}
 
 
-def _arrow(action: Action, view: View) -> dict[str, object]:
+def _draw_arrow(action: Action, view: View) -> dict[str, object]:
     """A ring where the tool goes down, and an arrow to where it goes up again."""
     points = np.array([(*action.pose0_position, 0.0), (*action.pose1_position, 0.0)])
     start, end = project(points, CAMERAS[view]) + 0.5  # the middle of a pixel, as SVG counts
@@ -223,11 +225,11 @@ def _arrow(action: Action, view: View) -> dict[str, object]:
     forward = way / length
     side = np.array([-forward[1], forward[0]])
     wings = [end - _HEAD * forward + sign * _HEAD / 2 * side for sign in (1, -1)]
-    path = _path([start + _RING * forward, end]) + _path([wings[0], end, wings[1]])
+    path = _draw_path([start + _RING * forward, end]) + _draw_path([wings[0], end, wings[1]])
     return {**ring, "path": path}
 
 
-def _path(points: list[np.ndarray]) -> str:
+def _draw_path(points: list[np.ndarray]) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
 
 

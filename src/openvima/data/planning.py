@@ -212,7 +212,7 @@ def plan(config: GenerateConfig) -> list[Block]:
     versions, assets = package_versions(), load_assets(config.env_config.assets).name
     blocks = []
     for task in config.resolved_tasks():
-        for number, episodes, seeds in _division(config):
+        for number, episodes, seeds in _divide(config):
             info = ShardInfo(
                 task=task,
                 level=config.level,
@@ -247,7 +247,7 @@ def shard_episodes(number: int, shard_size: int | None = None) -> int:
     return shard_size or min(LARGEST_SHARD, SMALLEST_SHARD << doublings)
 
 
-def _division(config: GenerateConfig) -> Iterator[tuple[int, int, range]]:
+def _divide(config: GenerateConfig) -> Iterator[tuple[int, int, range]]:
     """Yield number, episodes and seeds of each shard of a task; the last may be smaller than a full one."""
     first, num_left = config.start_seed, config.episodes
     for number in itertools.count():
@@ -323,7 +323,7 @@ class GenerationProgress:
 Report = Callable[[GenerationProgress], None]
 
 
-def reporter(
+def make_watcher(
     report: Report | None, blocks: Sequence[Block], missing: Sequence[Block]
 ) -> Callable[[Counts], None]:
     """Make of a caller's `report` what an engine calls; it first receives what was there before.

@@ -19,7 +19,7 @@ from openvima.data.manifest import (
     remove_leftovers,
     storage_error,
 )
-from openvima.data.published_episode import ASSETS, DOMAIN, LEVEL, demonstration_of, package_versions
+from openvima.data.published_episode import ASSETS, DOMAIN, LEVEL, package_versions, read_demonstration
 from openvima.data.published_sources import EpisodeFolders, ZipArchive
 from openvima.data.records import Demonstration
 from openvima.data.shard import Shard, ShardWriter
@@ -43,13 +43,13 @@ OLD_TASK_NAMES = {
 _NUM_FOLDS = 13
 
 
-def todays_task(folder_name: str) -> str | None:
+def current_task(folder_name: str) -> str | None:
     """Return the name of the task whose episodes a folder holds; None if there is no such task."""
     name = OLD_TASK_NAMES.get(folder_name, folder_name)
     return name if name in list_tasks() else None
 
 
-def split_of(task: str, episode_id: str) -> Split:
+def assign_split(task: str, episode_id: str) -> Split:
     """Tell whether an episode is for training or for validation, 12 to 1 and always the same.
 
     Args:
@@ -155,10 +155,10 @@ class PublishedData(Sequence[Demonstration]):
         self.tasks = None if tasks is None else names_of(tasks)
         self.split = split
         self._source = open_source(self.path)
-        places, self.broken_folders = _sorted_places(self._source)
+        places, self.broken_folders = _sort_places(self._source)
         if self.tasks is not None:
-            places = _of_tasks(places, self.tasks, self.path)
-        self.places = tuple(place for place in places if split in ("all", split_of(*place.key)))
+            places = _select_tasks(places, self.tasks, self.path)
+        self.places = tuple(place for place in places if split in ("all", assign_split(*place.key)))
         if not self.places:
             raise DatasetError(
                 f"{self.path} holds no episodes; give vima.zip, or the folder it was unpacked to."
@@ -193,7 +193,7 @@ class PublishedData(Sequence[Demonstration]):
         """
         if not self._index_of:
             self._index_of = {place.key: index for index, place in enumerate(self.places)}
-        key = EpisodeKey(todays_task(task) or task, episode_id)
+        key = EpisodeKey(current_task(task) or task, episode_id)
         if key not in self._index_of:
             raise DatasetError(
                 f"{self.path} has no episode {task}/{episode_id}; its ids have gaps, see `keys`."
@@ -209,7 +209,7 @@ class PublishedData(Sequence[Demonstration]):
             task: Those of this task only; old or new name.
             on_broken: Called with each one that is not.
         """
-        wanted = None if task is None else todays_task(task) or task
+        wanted = None if task is None else current_task(task) or task
         for place in self.places:
             if wanted not in (None, place.key.task):
                 continue
@@ -220,7 +220,7 @@ class PublishedData(Sequence[Demonstration]):
                 on_broken(found)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopened, (self.path, self.tasks, self.split)
+        return _reopen, (self.path, self.tasks, self.split)
 
     def _read(self, place: EpisodePlace) -> Demonstration:
         found = read_place(self._source, place)
@@ -247,23 +247,23 @@ def open_source(path: Path) -> Source:
 def read_place(source: Source, place: EpisodePlace) -> Demonstration | Broken:
     """Read one episode, or say what is wrong with it."""
     try:
-        return demonstration_of(source.files(place.place), task=place.key.task, folder=place.folder)
+        return read_demonstration(source.files(place.place), task=place.key.task, folder=place.folder)
     except MemberError as error:
         return Broken(place.folder, str(error))
 
 
-def _reopened(path: Path, tasks: tuple[str, ...] | None, split: str) -> PublishedData:
+def _reopen(path: Path, tasks: tuple[str, ...] | None, split: str) -> PublishedData:
     return PublishedData(path, tasks=tasks, split=split)
 
 
-def _sorted_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]]:
+def _sort_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]]:
     """All episodes of known tasks by task and id, and the folders of others."""
     places: dict[EpisodeKey, tuple[str, EpisodePlace]] = {}
     todays: dict[str, str | None] = {}
     for path, place in source.episodes().items():
         parent, _, episode_id = path.rpartition("/")
         if parent not in todays:
-            todays[parent] = todays_task(parent.rpartition("/")[2])
+            todays[parent] = current_task(parent.rpartition("/")[2])
         task = todays[parent]
         if task is None:
             continue
@@ -277,11 +277,11 @@ def _sorted_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ..
     return [places[key][1] for key in sorted(places)], tuple(Broken(parent, unknown) for parent in strange)
 
 
-def _of_tasks(places: Sequence[EpisodePlace], tasks: Sequence[str], path: Path) -> list[EpisodePlace]:
+def _select_tasks(places: Sequence[EpisodePlace], tasks: Sequence[str], path: Path) -> list[EpisodePlace]:
     present = {place.key.task for place in places}
     wanted = set()
     for task in tasks:
-        name = todays_task(task) or task_spec(task).name
+        name = current_task(task) or task_spec(task).name
         if name not in present:
             raise DatasetError(
                 f"{path} has no episodes of {name}; it has {', '.join(sorted(present)) or 'none'}."
@@ -390,7 +390,7 @@ def _import(
     if config.force:
         clear(config.out)
     _check_folder(config.out, blocks)
-    broken = {block.path: _broken_in(block) for block in blocks}
+    broken = {block.path: _find_broken(block) for block in blocks}
     missing = [block for block in blocks if broken[block.path] is None]
     try:
         if missing:
@@ -479,7 +479,7 @@ def _probe(blocks: Sequence[Block]) -> None:
     )
 
 
-def _broken_in(block: Block) -> list[Broken] | None:
+def _find_broken(block: Block) -> list[Broken] | None:
     """The episodes that a finished shard lacks because they are broken; None if it is not finished.
 
     Raises:

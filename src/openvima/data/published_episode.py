@@ -182,7 +182,7 @@ def as_array(value: object) -> np.ndarray:
         raise
     except (TypeError, ValueError, OverflowError):
         raise MemberError("it has an array whose size, shape and type do not fit each other.") from None
-    raise MemberError(f"it has {kind_of(value)} where an array should be.")
+    raise MemberError(f"it has {describe_kind(value)} where an array should be.")
 
 
 def as_plain(value: object) -> object:
@@ -202,7 +202,7 @@ def as_plain(value: object) -> object:
         raise MemberError("it has a number whose size and type do not fit.") from None
 
 
-def kind_of(value: object) -> str:
+def describe_kind(value: object) -> str:
     """Describe a value in a word or two, without visiting nested values, which may be endless."""
     if value is None or isinstance(value, bool | int | float):
         return repr(value)
@@ -219,7 +219,7 @@ def _frombuffer(content: object, dtype: object) -> np.ndarray:
         raise TypeError
     spec = dtype.args[0] if dtype.args else None
     if not isinstance(spec, str) or not _DTYPE.fullmatch(spec):
-        raise MemberError(f"it has an array of type {kind_of(spec)}; only numbers are read.")
+        raise MemberError(f"it has an array of type {describe_kind(spec)}; only numbers are read.")
     order = dtype.state[1] if isinstance(dtype.state, tuple) and len(dtype.state) > 1 else "|"
     numbers = np.dtype(spec)
     numbers = numbers.newbyteorder(">") if order == ">" else numbers
@@ -238,7 +238,7 @@ _AROUND = sorted(
 )
 
 
-def picked_ids(segm: np.ndarray, actions: Sequence[Action], object_ids: Collection[int]) -> tuple[int, ...]:
+def infer_picks(segm: np.ndarray, actions: Sequence[Action], object_ids: Collection[int]) -> tuple[int, ...]:
     """Tell which object is where each action begins.
 
     Args:
@@ -252,11 +252,12 @@ def picked_ids(segm: np.ndarray, actions: Sequence[Action], object_ids: Collecti
     points = np.array([(*action.pose0_position, 0.0) for action in actions])
     pixels = np.rint(project(points, TOP)).astype(int)
     return tuple(
-        _nearest(image, pixel, object_ids) for image, pixel in zip(segm[: len(actions)], pixels, strict=True)
+        _find_nearest(image, pixel, object_ids)
+        for image, pixel in zip(segm[: len(actions)], pixels, strict=True)
     )
 
 
-def _nearest(image: np.ndarray, pixel: np.ndarray, object_ids: Collection[int]) -> int:
+def _find_nearest(image: np.ndarray, pixel: np.ndarray, object_ids: Collection[int]) -> int:
     height, width = image.shape
     for row_offset, column_offset in _AROUND:
         row, column = int(pixel[1]) + row_offset, int(pixel[0]) + column_offset
@@ -271,7 +272,7 @@ _KINDS = ("object", "scene")
 Fields = dict[str, Any]
 
 
-def demonstration_of(files: Mapping[str, bytes], *, task: str, folder: str) -> Demonstration:
+def read_demonstration(files: Mapping[str, bytes], *, task: str, folder: str) -> Demonstration:
     """Make a demonstration of the files of an episode.
 
     Args:
@@ -286,7 +287,7 @@ def demonstration_of(files: Mapping[str, bytes], *, task: str, folder: str) -> D
     Raises:
         MemberError: A file is missing, damaged or of another form; the message begins with its name.
     """
-    observations, actions, trajectory = (_unpickled(files, name) for name in PICKLES)
+    observations, actions, trajectory = (_unpickle(files, name) for name in PICKLES)
     with _naming("action.pkl"):
         steps = _actions(actions)
     num_images = len(steps) + 1
@@ -310,7 +311,7 @@ def demonstration_of(files: Mapping[str, bytes], *, task: str, folder: str) -> D
         segm=segm,
         end_effector=end_effector,
         actions=steps,
-        pick_ids=picked_ids(segm["top"], steps, [record.object_id for record in objects]),
+        pick_ids=infer_picks(segm["top"], steps, [record.object_id for record in objects]),
         place_ids=(UNKNOWN_ID,) * len(steps),
         joint_paths=(),
         objects=objects,
@@ -335,13 +336,13 @@ def _naming(name: str) -> Iterator[None]:
         raise MemberError(f"{name}: {error}") from None
 
 
-def _unpickled(files: Mapping[str, bytes], name: str) -> Fields:
+def _unpickle(files: Mapping[str, bytes], name: str) -> Fields:
     if name not in files:
         raise MemberError(f"{name} is missing.")
     with _naming(name):
         fields = read_pickle(files[name])
         if not isinstance(fields, dict):
-            raise MemberError(f"it holds {kind_of(fields)}; a dictionary is needed.")
+            raise MemberError(f"it holds {describe_kind(fields)}; a dictionary is needed.")
         return fields
 
 
@@ -358,7 +359,7 @@ def _field(fields: Fields, *keys: str) -> Any:
 def _text(fields: Fields, key: str) -> str:
     value = _field(fields, key)
     if not isinstance(value, str):
-        raise MemberError(f"{key} is {kind_of(value)}; a text is needed.")
+        raise MemberError(f"{key} is {describe_kind(value)}; a text is needed.")
     try:
         value.encode()
     except UnicodeEncodeError:
@@ -369,7 +370,9 @@ def _text(fields: Fields, key: str) -> str:
 def _whole_number(fields: Fields, key: str, largest: int) -> int:
     value = as_plain(_field(fields, key))
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= largest:
-        raise MemberError(f"{key} is {kind_of(value)}; a whole number within 0 … {largest:,} is needed.")
+        raise MemberError(
+            f"{key} is {describe_kind(value)}; a whole number within 0 … {largest:,} is needed."
+        )
     return value
 
 
@@ -391,7 +394,7 @@ def _actions(fields: Fields) -> tuple[Action, ...]:
             raise MemberError(
                 f"{key} has shape {array.shape} and type {array.dtype}; it must be (T, {length})."
             )
-        columns[key] = _checked_rows(key, array[:, :length].astype(np.float32))
+        columns[key] = _check_rows(key, array[:, :length].astype(np.float32))
     lengths = {key: len(rows) for key, rows in columns.items()}
     if len(set(lengths.values())) > 1 or not columns["pose0_position"]:
         raise MemberError(f"its arrays have {lengths} rows; they must be equally many, and at least one.")
@@ -401,7 +404,7 @@ def _actions(fields: Fields) -> tuple[Action, ...]:
     )
 
 
-def _checked_rows(key: str, rows: np.ndarray) -> list[list[float]]:
+def _check_rows(key: str, rows: np.ndarray) -> list[list[float]]:
     low, high = (WORKSPACE_LOW, WORKSPACE_HIGH) if rows.shape[1] == 2 else (-1.0, 1.0)
     least, most = np.array(low, np.float32), np.array(high, np.float32)
     outside = ~((rows >= least) & (rows <= most)).all(axis=1)  # also what is no number
@@ -418,7 +421,9 @@ def _segmentation(fields: Fields, num_images: int) -> dict[str, np.ndarray]:
 def _end_effector(trajectory: Fields, observations: Fields, num_images: int) -> EndEffector:
     name = _field(trajectory, "end_effector_type")
     if name not in END_EFFECTORS:
-        raise MemberError(f"end_effector_type is {kind_of(name)}; allowed are {', '.join(END_EFFECTORS)}.")
+        raise MemberError(
+            f"end_effector_type is {describe_kind(name)}; allowed are {', '.join(END_EFFECTORS)}."
+        )
     shown = as_array(_field(observations, "ee"))
     if shown.shape != (num_images,) or (shown != END_EFFECTORS.index(name)).any():
         raise MemberError(f"the tool is {name!r}, but obs.pkl shows another or in another number of steps.")
@@ -435,7 +440,7 @@ def _objects(trajectory: Fields) -> tuple[ObjectRecord, ...]:
 def _object(object_id: object, entry: Fields, texture_key: str) -> ObjectRecord:
     """A record; textures that the catalogue does not know stay, since nothing but their name is ever used."""
     number = _whole_number({"obj_id": object_id}, "obj_id", 255)
-    return ObjectRecord(number, checked_object(_field(entry, "obj_name")), _text(entry, texture_key))
+    return ObjectRecord(number, check_object(_field(entry, "obj_name")), _text(entry, texture_key))
 
 
 def _prompt(trajectory: Fields) -> RenderedPrompt:
@@ -456,15 +461,17 @@ def _prompt(trajectory: Fields) -> RenderedPrompt:
 def _prompt_image(name: str, asset: Fields) -> PromptImage:
     kind = _field(asset, "placeholder_type")
     if kind not in _KINDS:
-        raise MemberError(f"placeholder_type of {name} is {kind_of(kind)}; allowed are {', '.join(_KINDS)}.")
+        raise MemberError(
+            f"placeholder_type of {name} is {describe_kind(kind)}; allowed are {', '.join(_KINDS)}."
+        )
     entries = _field(asset, "segm", "obj_info")
-    shown: Sequence[Any] = entries if isinstance(entries, list) else [entries]
+    objects: Sequence[Any] = entries if isinstance(entries, list) else [entries]
     return PromptImage(
         name=name,
         kind=kind,
         rgb={view: _images(_field(asset, "rgb", view), channels=3) for view in VIEWS},
         segm={view: _images(_field(asset, "segm", view)) for view in VIEWS},
-        objects=tuple(_object(_field(entry, "obj_id"), entry, "obj_color") for entry in shown),
+        objects=tuple(_object(_field(entry, "obj_id"), entry, "obj_color") for entry in objects),
     )
 
 
@@ -472,12 +479,12 @@ def _check_summary(trajectory: Fields, num_steps: int) -> None:
     """Compare what the episode says of itself with what it holds."""
     steps, success = as_plain(_field(trajectory, "steps")), as_plain(_field(trajectory, "success"))
     if steps != num_steps:
-        raise MemberError(f"steps is {kind_of(steps)}, but action.pkl has {num_steps} actions.")
+        raise MemberError(f"steps is {describe_kind(steps)}, but action.pkl has {num_steps} actions.")
     if success is not True:
-        raise MemberError(f"success is {kind_of(success)}; only solved episodes are demonstrations.")
+        raise MemberError(f"success is {describe_kind(success)}; only solved episodes are demonstrations.")
     difficulty = trajectory.get("difficulty", "easy")
     if difficulty != "easy":
-        raise MemberError(f"difficulty is {kind_of(difficulty)}; the published episodes are easy.")
+        raise MemberError(f"difficulty is {describe_kind(difficulty)}; the published episodes are easy.")
 
 
 def _frames(files: Mapping[str, bytes], folder: str, num_images: int) -> np.ndarray:
@@ -491,11 +498,11 @@ def _frames(files: Mapping[str, bytes], folder: str, num_images: int) -> np.ndar
         raise MemberError(f"{folder} has {len(numbered)} images for {num_images - 1} actions; {detail}.")
     stacked = np.empty((num_images, *IMAGE_SHAPE, 3), np.uint8)
     for number in range(num_images):
-        stacked[number] = _decoded(numbered[number], f"{folder}/{number}.jpg")
+        stacked[number] = _decode(numbered[number], f"{folder}/{number}.jpg")
     return channels_first(stacked)
 
 
-def _decoded(content: bytes, name: str) -> np.ndarray:
+def _decode(content: bytes, name: str) -> np.ndarray:
     height, width = IMAGE_SHAPE
     try:
         with Image.open(io.BytesIO(content), formats=("JPEG",)) as image:
@@ -517,7 +524,7 @@ def _decoded(content: bytes, name: str) -> np.ndarray:
         raise MemberError(f"{name} is no whole JPEG image.") from None
 
 
-def checked_object(name: object) -> str:
+def check_object(name: object) -> str:
     """Return an object's display name, which is the same here and there.
 
     Raises:

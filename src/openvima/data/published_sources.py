@@ -56,10 +56,10 @@ class EpisodeFolders:
         The disk is searched once; what comes later is not seen.
         """
         if self._episodes is None:
-            self._episodes = self._found()
+            self._episodes = self._search()
         return self._episodes
 
-    def _found(self) -> dict[str, str]:
+    def _search(self) -> dict[str, str]:
         found = {}
         for folder, names in _task_folders(self.path, MAX_DEPTH):
             # For a task's own folder the name of the task is not part of the relative path.
@@ -111,7 +111,7 @@ def _files(episode: Path) -> list[str]:
 
 def _task_folders(folder: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
     """Folders that hold numbered ones, in the order of their names, and the names of those."""
-    if names := _numbered(folder):
+    if names := _list_numbered(folder):
         yield folder, names
     elif depth > 0:
         for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
@@ -119,7 +119,7 @@ def _task_folders(folder: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
                 yield from _task_folders(folder / entry.name, depth - 1)
 
 
-def _numbered(folder: Path) -> list[str]:
+def _list_numbered(folder: Path) -> list[str]:
     with os.scandir(folder) as entries:
         return [e.name for e in entries if e.name.isascii() and e.name.isdigit() and e.is_dir()]
 
@@ -171,7 +171,7 @@ class ZipArchive:
     def __init__(self, path: Path) -> None:
         self.path = path
         with open(path, "rb") as file:
-            self._start, self._end, self._shift = _directory(file, path)
+            self._start, self._end, self._shift = _find_directory(file, path)
 
     def episodes(self) -> dict[str, Place]:
         """Return the folders of all episodes, such as "vima_v6/rotate/000123", and where their entries are.
@@ -212,7 +212,7 @@ class ZipArchive:
             members = {}
             for start, end in place:
                 file.seek(start)
-                found = _members(file.read(end - start))
+                found = _list_members(file.read(end - start))
                 members |= {member.name: member for member in found if is_episode_file(member.name)}
             for member in members.values():
                 if member.offset + self._shift >= self._end:
@@ -257,13 +257,13 @@ class ZipArchive:
             raise MemberError(f"{member.name} is not where the archive's directory says.")
         file.seek(sum(_HEAD.unpack(head)[-2:]), 1)  # name and extra fields again
         packed = file.read(member.packed_bytes)
-        content = packed if member.method == _STORED else _inflated(packed, member)
+        content = packed if member.method == _STORED else _inflate(packed, member)
         if len(content) != member.num_bytes or zlib.crc32(content) != member.checksum:
             raise MemberError(f"{member.name} is damaged: its checksum differs.")
         return content
 
 
-def _inflated(packed: bytes, member: _Member) -> bytes:
+def _inflate(packed: bytes, member: _Member) -> bytes:
     """Unpack as many bytes as were promised, and no more."""
     try:
         return zlib.decompressobj(-zlib.MAX_WBITS).decompress(packed, member.num_bytes + 1)
@@ -271,7 +271,7 @@ def _inflated(packed: bytes, member: _Member) -> bytes:
         raise MemberError(f"{member.name} is damaged: it cannot be unpacked.") from None
 
 
-def _directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
+def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
     """Start and end of the directory, and how far everything lies behind where the archive says."""
     size = file.seek(0, 2)
     tail_start = max(0, size - _END.size - _LONGEST_COMMENT)
@@ -282,7 +282,7 @@ def _directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
         raise DatasetError(f"{path} is no zip archive, or its end is missing (an interrupted download?).")
     _, disk, first_disk, _, _, num_bytes, offset, _ = _END.unpack_from(tail, at)
     end = tail_start + at
-    large = _end_64(file, end, path)
+    large = _find_end_64(file, end, path)
     if large is not None:
         end, num_bytes, offset = large
     elif disk or first_disk:
@@ -293,7 +293,7 @@ def _directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
     return start, end, start - offset
 
 
-def _end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] | None:
+def _find_end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] | None:
     """End, size and offset of the directory from the 64-bit end record; None if there is none."""
     file.seek(max(0, end - _POINTER_64.size))
     pointer = file.read(_POINTER_64.size)
@@ -309,7 +309,7 @@ def _end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] | None
     return at, num_bytes, offset
 
 
-def _members(directory: bytes) -> Iterator[_Member]:
+def _list_members(directory: bytes) -> Iterator[_Member]:
     """The files among some entries of the directory, named relative to their episode's folder."""
     position = 0
     while position < len(directory):
@@ -324,7 +324,7 @@ def _members(directory: bytes) -> Iterator[_Member]:
         position += name_bytes + extra_bytes + comment_bytes
         if name.endswith(b"/"):
             continue
-        unpacked, packed, offset = _large_numbers(extra, (unpacked, packed, offset))
+        unpacked, packed, offset = _read_large_numbers(extra, (unpacked, packed, offset))
         folder = _EPISODE.match(name)
         yield _Member(
             name=name[folder.end() if folder else 0 :].decode("utf-8", "replace"),
@@ -337,7 +337,7 @@ def _members(directory: bytes) -> Iterator[_Member]:
         )
 
 
-def _large_numbers(extra: bytes, numbers: tuple[int, int, int]) -> tuple[int, int, int]:
+def _read_large_numbers(extra: bytes, numbers: tuple[int, int, int]) -> tuple[int, int, int]:
     """Replace numbers that did not fit into four bytes by those of the 64-bit extra field."""
     if _IN_EXTRA not in numbers:
         return numbers

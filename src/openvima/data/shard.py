@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import pyarrow as pa
 
 from openvima.atomic_io import NO_SPACE, atomic_write
-from openvima.data.encoding import Encoder, ShardInfo, Skipped, actions_in, decode, decode_columns
+from openvima.data.encoding import Encoder, ShardInfo, Skipped, decode, decode_actions, decode_columns
 from openvima.data.records import Demonstration, Step, make_columns, planes
 from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION, VIEWS
 from openvima.errors import DatasetError, ShardError, unknown_name
@@ -115,7 +115,7 @@ def measure(path: Path) -> tuple[Envelope, list[Span]]:
     return Envelope(len(content), head, tail, _envelope_crc32(content, head, tail)), spans
 
 
-def spans_of(index: pa.Table) -> list[Span]:
+def list_spans(index: pa.Table) -> list[Span]:
     """Return where the records of a shard lie, from its part of the index."""
     columns = (index.column(name).to_pylist() for name in ("offset", "num_bytes", "crc32"))
     return [Span(*numbers) for numbers in zip(*columns, strict=True)]
@@ -226,7 +226,7 @@ class Shard:
         kinds = ("rgb", "segm") if segm else ("rgb",)
         images = [f"{kind}_{view}" for kind in kinds for view in views]
         values = self.read(row, [*images, *ACTION_SHAPES, "end_effector"])
-        actions = actions_in(values)
+        actions = decode_actions(values)
         if not 0 <= step < len(actions):
             raise IndexError(f"step {step} of {len(actions)}; count from 0 to {len(actions) - 1}.")
         observation: dict[str, Any] = {

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_folder, folder_lock
-from openvima.data.derived import ShardPart, check_out, number_shards, provenance, write_shards
+from openvima.data.derived import ShardPart, check_out, identify_source, number_shards, write_shards
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.planning import LARGEST_SHARD
@@ -115,7 +115,7 @@ class SubsetConfig:
     def settings(self, dataset: Dataset) -> dict[str, Any]:
         """Return what decides the content, without paths."""
         return {
-            "source": provenance(dataset.manifest),
+            "source": identify_source(dataset.manifest),
             "tasks": None if self.tasks is None else sorted(self.tasks),
             "seed": self.seed,
             "compression": self.compression,
@@ -371,7 +371,7 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
         raise DatasetError("the sources hold no episodes, so there is nothing to merge.")
     parts = _skip_duplicates(parts, refuse=config.duplicates == "refuse")
     settings = {
-        "sources": [provenance(dataset.manifest) for dataset in datasets],
+        "sources": [identify_source(dataset.manifest) for dataset in datasets],
         "tasks": None if config.tasks is None else sorted(config.tasks),
         "duplicates": config.duplicates,
         "compression": config.compression,

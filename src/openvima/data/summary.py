@@ -143,7 +143,7 @@ def summarise_folder(
     index_only = dataset_name(folder) is not None and not details
     folder = data_folder(folder, shards=not index_only)
     if not (folder / MANIFEST_NAME).is_file() and any(folder.glob("*.arrow")):
-        return _unfinished(folder)
+        return _summarise_unfinished(folder)
     dataset = Dataset(folder, index_only=index_only)  # which also finds missing files
     task_of = np.array(dataset.index.column("task").to_pylist(), dtype=str)
     histograms = [*_index_histograms(dataset.index)]
@@ -157,12 +157,12 @@ def summarise_folder(
             for task in dataset.manifest["tasks"]
         ),
         tuple(histograms),
-        _num_failed(folder),
-        _object_caches(folder),
+        _count_failed(folder),
+        _measure_caches(folder),
     )
 
 
-def _unfinished(folder: Path) -> Unfinished:
+def _summarise_unfinished(folder: Path) -> Unfinished:
     episodes: Counter[str] = Counter()
     damaged = []
     paths = sorted(folder.glob("*.arrow"))
@@ -197,12 +197,12 @@ def _image_fraction(dataset: Dataset, episodes: Iterable[int]) -> float:
         if not info.images:
             continue
         batch = dataset.batch(episode_index)
-        total += _stored_bytes(batch, info.compression)
-        rest += _stored_bytes(batch.select(without), info.compression)
+        total += _measure(batch, info.compression)
+        rest += _measure(batch.select(without), info.compression)
     return round(1 - rest / total, 4) if total else 0.0
 
 
-def _stored_bytes(batch: pa.RecordBatch, compression: str) -> int:
+def _measure(batch: pa.RecordBatch, compression: str) -> int:
     """Size of a record as a shard would hold it."""
     sink = pa.MockOutputStream()
     options = pa.ipc.IpcWriteOptions(compression=compression, use_threads=False)
@@ -252,14 +252,14 @@ def _value_counts(values: pa.Array | pa.ChunkedArray) -> dict[Any, int]:
     return {entry["values"]: entry["counts"] for entry in values.value_counts().to_pylist()}
 
 
-def _num_failed(folder: Path) -> int | None:
+def _count_failed(folder: Path) -> int | None:
     failed = folder / FAILED_FOLDER
     if not failed.is_dir():
         return None
     return sum(len(Shard(path)) for path in failed.glob("*.arrow"))
 
 
-def _object_caches(folder: Path) -> dict[str, int]:
+def _measure_caches(folder: Path) -> dict[str, int]:
     return {
         cache.name: sum(file.stat().st_size for file in cache.rglob("*") if file.is_file())
         for cache in sorted((folder / CACHE_FOLDER).glob("*"))

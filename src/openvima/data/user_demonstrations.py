@@ -15,7 +15,7 @@ from openvima.data.manifest import (
     MANIFEST_NAME,
     ShardSummary,
     finish_folder,
-    previous_summaries,
+    read_previous_summaries,
     remove_leftovers,
     set_aside,
     storage_error,
@@ -101,12 +101,12 @@ def demonstrate(
             grasped = rollout.step(action)["grasped"]
         except EpisodeError as error:
             raise DatasetError(f"action {number} of {len(actions)} is one too many: {error}") from None
-        pick_id = grasped or _moved_most(before, env.scene)
+        pick_id = grasped or _find_moved(before, env.scene)
         if pick_id is None:
             raise DatasetError(f"action {number} moves nothing; go back and repeat it before recording.")
         met = [g for g in open_goals if g not in env.progress.open_goals]
         pick_ids.append(pick_id)
-        place_ids.append(_place_id(env, before, pick_id, met))
+        place_ids.append(_infer_place(env, before, pick_id, met))
     if not env.outcome.success:
         reason = env.outcome.reason or f"not solved after {len(actions)} actions"
         raise DatasetError(f"only successes are recorded, and this episode is not one: {reason}.")
@@ -157,7 +157,7 @@ def record_demonstration(
 
 
 def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
-    shards = _own_shards(folder)
+    shards = _open_own_shards(folder)
     settings = {**env_config.record(), "assets": load_assets(env_config.assets).name}
     info = ShardInfo(demo.task, LEVEL, DOMAIN, 0, SHARD_SIZE, 0, versions=package_versions(), **settings)
     same = [shard for shard in shards if shard.info.task == demo.task]
@@ -166,7 +166,9 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
         seeds = _seeds(shard) if shard.info.env_config == info.env_config else []
         if demo.seed in seeds:
             if not is_complete and shard[seeds.index(demo.seed)].content_hash() == demo.content_hash():
-                return _finish(folder, shards, previous_summaries(folder))  # recording it was interrupted
+                return _finish(
+                    folder, shards, read_previous_summaries(folder)
+                )  # recording it was interrupted
             raise DatasetError(
                 f"{folder} holds a demonstration of this episode already ({demo.task}, seed {demo.seed}); "
                 "go on with another seed or scene."
@@ -176,7 +178,7 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
         last, info = None, replace(info, number=len(same))
     else:
         info = last.info
-    known = previous_summaries(folder)
+    known = read_previous_summaries(folder)
     known.pop(info.file_name, None)
     set_aside(folder)
     with ShardWriter(folder / info.file_name, info) as writer:
@@ -196,7 +198,7 @@ def _finish(folder: Path, shards: Sequence[Shard], known: dict[str, ShardSummary
     return sum(map(len, shards))
 
 
-def _own_shards(folder: Path) -> list[Shard]:
+def _open_own_shards(folder: Path) -> list[Shard]:
     """Open the shards of a folder, by task and number.
 
     Raises:
@@ -216,7 +218,7 @@ def _seeds(shard: Shard) -> list[int]:
     return shard.table(["seed"]).column("seed").to_pylist()
 
 
-def _moved_most(before: Scene, after: Scene) -> int | None:
+def _find_moved(before: Scene, after: Scene) -> int | None:
     """The object that moved farthest; None if all are where they were."""
     pairs = zip(before.placements, after.placements, strict=True)
     moved = {old.id: old.pose.planar_distance(new.pose) for old, new in pairs}
@@ -224,7 +226,7 @@ def _moved_most(before: Scene, after: Scene) -> int | None:
     return farthest if moved[farthest] > _MOVED_M else None
 
 
-def _place_id(env: TabletopEnv, before: Scene, pick_id: int, met: Sequence[int]) -> int:
+def _infer_place(env: TabletopEnv, before: Scene, pick_id: int, met: Sequence[int]) -> int:
     """The object relative to which another was placed: of a goal that was met, else what lies below it."""
     goals = env.episode.problem.goals
     is_sweep = before.end_effector == "spatula"

@@ -23,15 +23,15 @@ from openvima.data.manifest import (
     MANIFEST_NAME,
     ShardSummary,
     check_failed,
-    compose,
+    compose_manifest,
     fingerprint,
-    index_parts,
     is_inside,
     joint_hash,
     parse_index,
     parse_manifest,
     read_inside,
-    summarise,
+    split_index,
+    summarise_shard,
 )
 from openvima.data.object_cache import CacheFile
 from openvima.data.planning import COMMAND, generate_command
@@ -40,7 +40,7 @@ from openvima.data.reader import explain_missing
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.replay import ReplayTask, replay_shard
 from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
-from openvima.data.shard import Envelope, Shard, map_file, remedy, spans_of
+from openvima.data.shard import Envelope, Shard, list_spans, map_file, remedy
 from openvima.env.config import ENV_SETTINGS
 from openvima.errors import AssetError, ConfigError, DatasetError, OpenVimaError, ShardError, echo
 from openvima.input_files import as_path
@@ -322,7 +322,7 @@ class _Verifier:
         """Return the manifest's shards in the order of the data set; without a manifest, all files."""
         manifest, index = self.manifest, self.index
         generated = manifest if manifest is not None and self._is_generated else {}
-        parts = {} if index is None else index_parts(index)
+        parts = {} if index is None else split_index(index)
         listed = found if manifest is None else [*parts, *sorted(manifest["shards"].keys() - parts.keys())]
         return [
             _ShardTask(
@@ -354,7 +354,7 @@ class _Verifier:
                 self._add(summary.name, cause, remedy)
         if self.manifest is None or len(summaries) < len(found):
             return
-        index, expected = compose(summaries, {})
+        index, expected = compose_manifest(summaries, {})
         for key, value in expected.items():
             if key != "shards" and self.manifest[key] != value:  # those were compared one by one
                 self._add(MANIFEST_NAME, f"{key!r} is not what the shards say", self._remedy)
@@ -429,7 +429,7 @@ def check_shard(task: _ShardTask, count: Callable[[int], None]) -> _Checked:
     known = None if task.entry is None else {key: task.entry[key] for key in ("bytes", "sha256")}
     try:
         shard = Shard(task.path)
-        summary = summarise(task.path, known)
+        summary = summarise_shard(task.path, known)
     except ShardError as error:
         return _Checked([_bare_cause(error, task.path)])
     found = list(_find_record_faults(task, shard, count))
@@ -458,7 +458,7 @@ def _find_byte_faults(task: _ShardTask) -> Iterator[str]:
         content = memoryview(b"") if found["bytes"] == 0 else map_file(task.path)
         places = [Envelope.from_entry(task.entry).fault_in(content)]
         if task.index is not None:
-            broken = [row for row, span in enumerate(spans_of(task.index)) if span.fault_in(content)]
+            broken = [row for row, span in enumerate(list_spans(task.index)) if span.fault_in(content)]
             places += _by_cause(((row, "damaged") for row in broken), task.index.num_rows)
         where = "; ".join(filter(None, places))
         yield f"its bytes are not those that were written{f': {where}' if where else ''}"

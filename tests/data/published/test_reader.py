@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from openvima.data import Demonstration
-from openvima.data.published import Broken, EpisodeKey, PublishedData, split_of
-from openvima.data.published_episode import picked_ids
+from openvima.data.published import Broken, EpisodeKey, PublishedData, assign_split
+from openvima.data.published_episode import infer_picks
 from openvima.data.records import rollout_oracle
 from openvima.data.schema import UNKNOWN_ID
 from openvima.env import EnvConfig
@@ -156,7 +156,7 @@ def test_objects_can_be_sent_to_other_processes(path: Path) -> None:
 
 def test_parts_are_disjoint_complete_and_always_the_same() -> None:
     keys = [("rotate", f"{number:06d}") for number in range(13_000)]
-    validation = [key for key in keys if split_of(*key) == "validation"]
+    validation = [key for key in keys if assign_split(*key) == "validation"]
     assert 900 < len(validation) < 1100
     assert [int(key[1]) for key in validation[:4]] == [4, 27, 40, 47]
 
@@ -165,7 +165,7 @@ def test_a_part_can_be_read_alone(path: Path) -> None:
     whole = PublishedData(path).keys
     splits = {}
     for split in ("train", "validation"):
-        keys = {key for key in whole if split_of(*key) == split}
+        keys = {key for key in whole if assign_split(*key) == split}
         splits[split] = keys
         if keys:
             assert set(PublishedData(path, split=split).keys) == keys
@@ -323,6 +323,6 @@ def test_unknown_textures_are_kept(tmp_path: Path) -> None:
 def test_picks_are_found_again_in_the_images(task: str) -> None:
     demo: Demonstration = rollout_oracle(EnvConfig(compat=True).make(task, "train", domain="user"), 0)
     ids = [record.object_id for record in demo.objects]
-    assert picked_ids(demo.segm["top"], demo.actions, ids) == demo.pick_ids
+    assert infer_picks(demo.segm["top"], demo.actions, ids) == demo.pick_ids
     nothing = np.zeros_like(demo.segm["top"])
-    assert picked_ids(nothing, demo.actions, ids) == (UNKNOWN_ID,) * demo.num_steps
+    assert infer_picks(nothing, demo.actions, ids) == (UNKNOWN_ID,) * demo.num_steps
