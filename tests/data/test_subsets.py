@@ -92,6 +92,16 @@ def test_smaller_samples_are_part_of_larger_ones() -> None:
         assert not (smaller & ~larger).any()
 
 
+def test_a_number_of_episodes_is_taken_of_each_task_or_all_that_it_has() -> None:
+    index = pa.concat_tables([index_of(40, ("rotate",)), index_of(3, ("twist",))])
+    chosen = select_sample(index, 0, episodes=10)
+    assert not (chosen & ~select_sample(index, 0, fraction=0.99)).any()
+    tasks = index.filter(pa.array(chosen)).column("task").to_pylist()
+    assert {task: tasks.count(task) for task in set(tasks)} == {"rotate": 10, "twist": 3}
+    with pytest.raises(ConfigError, match="episodes is 0"):
+        select_sample(index, 0, episodes=0)
+
+
 def test_each_task_keeps_its_proportion_and_at_least_one_episode() -> None:
     index = pa.concat_tables([index_of(1000, ("rotate",)), index_of(30, ("stack",)), index_of(3, ("twist",))])
     chosen = index.filter(pa.array(select_sample(index, 0, fraction=0.1))).column("task").to_pylist()
@@ -152,6 +162,14 @@ def test_small_samples_lie_in_all_parts() -> None:
 def test_parts_that_make_no_sense_are_refused(text: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
         parse_splits(text)
+
+
+def test_a_sample_has_a_fraction_or_a_number(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos")
+    assert main(["data", "sample", str(source), str(tmp_path / "two"), "--episodes", "2"]) == 0
+    assert Dataset(tmp_path / "two").index.column("task").to_pylist() == ["rotate"] * 2 + ["stack"] * 2
+    for size in ([], ["--episodes", "2", "--fraction", "0.5"]):
+        assert main(["data", "sample", str(source), str(tmp_path / "none"), *size]) == 2
 
 
 def test_a_sample_holds_the_records_unchanged(tmp_path: Path, write_folder: WriteFolder) -> None:

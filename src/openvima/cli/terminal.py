@@ -286,7 +286,7 @@ def table_of(progress: "GenerationProgress", pace: Pace) -> "Table":
         pad_edge=False,
     )
     table.add_column("task", no_wrap=True)
-    for name in ("done", "of", "solved", "redraws"):
+    for name in ("done", "of", "solved", "resamples"):
         table.add_column(name, justify="right", no_wrap=True)
     for task in progress.tasks:
         counts = (

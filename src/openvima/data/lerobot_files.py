@@ -93,57 +93,44 @@ def value_statistics(values: np.ndarray) -> Statistics:
     }
 
 
-class PixelCounts:
-    """How often each brightness occurs in the pictures of one feature, by channel."""
+def count_pixels(pictures: np.ndarray, num_frames: int) -> np.ndarray:
+    """Count how often each brightness occurs in the pictures of an episode, by channel.
 
-    def __init__(self) -> None:
-        self.counts = np.zeros((3, 256), np.int64)
-        self.num_frames = 0
+    Args:
+        pictures: Shape (num_frames or 1, 3, height, width), uint8; one picture stands for all frames.
+        num_frames: Frames of the episode.
 
-    def add(self, pictures: np.ndarray, *, num_frames: int) -> None:
-        """Count the pictures of an episode.
-
-        Args:
-            pictures: Shape (num_frames or 1, 3, height, width), uint8; one picture stands for all frames.
-            num_frames: Frames of the episode.
-        """
-        self.num_frames += num_frames
-        if not pictures.any():  # most prompts have fewer images than the longest
-            self.counts[:, 0] += num_frames * pictures[0, 0].size
-            return
-        times = num_frames // len(pictures)
-        for channel in range(3):
-            self.counts[channel] += times * np.bincount(pictures[:, channel].reshape(-1), minlength=256)
-
-    def merge(self, other: "PixelCounts") -> None:
-        """Add what another has counted."""
-        self.counts += other.counts
-        self.num_frames += other.num_frames
-
-    def statistics(self) -> Statistics:
-        """Return the statistics of brightness from 0 to 1: shape (3, 1, 1), "count" is that of frames."""
-        levels = np.arange(256) / 255
-        num_pixels = self.counts[0].sum()
-        mean = self.counts @ levels / num_pixels
-        squares = self.counts @ levels**2 / num_pixels
-        below = self.counts.cumsum(axis=1)
-        ranks = {name: _rank(share, num_pixels) for name, share in QUANTILES.items()}
-        moments = {
-            "min": levels[(self.counts > 0).argmax(axis=1)],
-            "max": levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)],
-            "mean": mean,
-            "std": np.sqrt(np.maximum(squares - mean**2, 0)),
-        }
-        quantiles = {name: levels[(below > rank).argmax(axis=1)] for name, rank in ranks.items()}
-        return {
-            **_by_channel(moments),
-            "count": np.array([self.num_frames]),
-            **_by_channel(quantiles),
-        }
+    Returns:
+        Shape (3, 256), int64.
+    """
+    counts = np.zeros((3, 256), np.int64)
+    if not pictures.any():  # most prompts have fewer images than the longest
+        counts[:, 0] = num_frames * pictures[0, 0].size
+        return counts
+    for channel in range(3):
+        counts[channel] = np.bincount(pictures[:, channel].reshape(-1), minlength=256)
+    return counts * (num_frames // len(pictures))
 
 
-def _by_channel(statistics: Statistics) -> Statistics:
-    return {name: row.reshape(3, 1, 1) for name, row in statistics.items()}
+def pixel_statistics(counts: np.ndarray, num_frames: int) -> Statistics:
+    """Return the statistics of brightness from 0 to 1: shape (3, 1, 1), "count" is that of frames."""
+    levels = np.arange(256) / 255
+    num_pixels = counts[0].sum()
+    mean = counts @ levels / num_pixels
+    squares = counts @ levels**2 / num_pixels
+    below = counts.cumsum(axis=1)
+    found = {
+        "min": levels[(counts > 0).argmax(axis=1)],
+        "max": levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(squares - mean**2, 0)),
+        "count": np.array([num_frames]),
+        **{
+            name: levels[(below > _rank(share, num_pixels)).argmax(axis=1)]
+            for name, share in QUANTILES.items()
+        },
+    }
+    return {name: row if name == "count" else row.reshape(3, 1, 1) for name, row in found.items()}
 
 
 def _rank(share: float, count: int) -> int:
@@ -274,19 +261,6 @@ _BYTES_PER_FRAME = 64  # generous share of the file's tables
 MAX_FRAMES = 100_000  # in a file: of each one about 70 bytes stay in memory until it is closed
 
 
-@dataclass(frozen=True, slots=True)
-class VideoPlace:
-    """Where the frames of an episode are.
-
-    Args:
-        number: The file.
-        first_frame: Place of the first one in it, from 0.
-    """
-
-    number: FileNumber
-    first_frame: int
-
-
 class NumberedVideo:
     """The videos of one feature; a context manager.
 
@@ -313,7 +287,7 @@ class NumberedVideo:
         self._stream: Any = None
         self._num_frames = self._num_bytes = self._largest_frame = 0
 
-    def write(self, pictures: np.ndarray, *, num_frames: int) -> VideoPlace:
+    def write(self, pictures: np.ndarray, *, num_frames: int) -> tuple[FileNumber, int]:
         """Append an episode.
 
         Args:
@@ -321,14 +295,14 @@ class NumberedVideo:
             num_frames: Frames of the episode.
 
         Returns:
-            Where they are.
+            The number of the file, and the place of the first frame in it.
         """
         expected = num_frames * max(self._largest_frame, _BYTES_PER_FRAME)
         is_full = self._num_bytes + expected >= self._limit_bytes or self._num_frames >= MAX_FRAMES
         if self._number is None or is_full:
             self._begin()
         assert self._number is not None  # `_begin` has set it
-        place = VideoPlace(self._number, self._num_frames)
+        place = self._number, self._num_frames
         kinds = self._av.video.frame.PictureType
         frame: Any = None
         for index in range(num_frames):
@@ -418,7 +392,7 @@ class LerobotWriter:
         self._num_episodes = self._num_frames = 0
         self._row_schema: pa.Schema | None = None  # of the list of episodes; its first row gives it
         self._row_bytes = 0
-        self._pixel_counts = {key: PixelCounts() for key in frames.video_keys}
+        self._pixel_counts = {key: np.zeros((3, 256), np.int64) for key in frames.video_keys}
         self._closing = contextlib.ExitStack()
         data_bytes, video_bytes = (limit * BYTES_PER_MB for limit in self._limits.values())
         self._data, self._episodes = (
@@ -488,16 +462,15 @@ class LerobotWriter:
         places: dict[str, Any] = {}
         statistics = {}
         for key, pictures in self._frames.pictures(demo).items():  # type: ignore[arg-type]  # as above
-            place = self._videos[key].write(pictures, num_frames=demo.num_steps)
-            counts = PixelCounts()
-            counts.add(pictures, num_frames=demo.num_steps)
-            self._pixel_counts[key].merge(counts)
-            statistics[key] = counts.statistics()
+            number, first_frame = self._videos[key].write(pictures, num_frames=demo.num_steps)
+            counts = count_pixels(pictures, demo.num_steps)
+            self._pixel_counts[key] += counts
+            statistics[key] = pixel_statistics(counts, demo.num_steps)
             places |= {
-                f"videos/{key}/chunk_index": place.number.chunk,
-                f"videos/{key}/file_index": place.number.file,
-                f"videos/{key}/from_timestamp": place.first_frame / self._fps,
-                f"videos/{key}/to_timestamp": (place.first_frame + demo.num_steps) / self._fps,
+                f"videos/{key}/chunk_index": number.chunk,
+                f"videos/{key}/file_index": number.file,
+                f"videos/{key}/from_timestamp": first_frame / self._fps,
+                f"videos/{key}/to_timestamp": (first_frame + demo.num_steps) / self._fps,
             }
         return places, statistics
 
@@ -524,7 +497,8 @@ class LerobotWriter:
             "video_path": VIDEO_PATH,
             "features": self._frames.features(fps=self._fps, pixels=self._pixels),
         }
-        statistics = {key: counts.statistics() for key, counts in self._pixel_counts.items()}
+        counted = self._pixel_counts.items()
+        statistics = {key: pixel_statistics(counts, self._num_frames) for key, counts in counted}
         statistics |= {name: self._overall(name) for name in self._schema.names}
         plain = {
             name: {kind: value.tolist() for kind, value in entry.items()}

@@ -7,7 +7,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
@@ -68,35 +68,6 @@ _SHARD_NAME = re.compile(r"\w[\w.+-]{0,200}\.arrow")
 _NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
 # What the index and the counts need of each shard.
 _COLUMNS = [name for name in INDEX_SCHEMA.names if name not in _NOT_IN_SHARDS] + ["redraws", "skipped"]
-
-
-@dataclass(slots=True)
-class TaskCounts:
-    """Episodes kept of a task, seeds tried for them, and what became of the others."""
-
-    episodes: int = 0
-    steps: int = 0
-    redraws: int = 0
-    skipped: Counter[str] = field(default_factory=Counter)
-
-    def add(self, other: "TaskCounts") -> None:
-        """Add those of another shard."""
-        self.episodes += other.episodes
-        self.steps += other.steps
-        self.redraws += other.redraws
-        self.skipped.update(other.skipped)
-
-    def record(self) -> dict[str, object]:
-        """Return what the manifest holds of a task."""
-        num_tried = self.episodes + self.skipped.total()
-        return {
-            "episodes": self.episodes,
-            "steps": self.steps,
-            "seeds_tried": num_tried,
-            "success_rate": round(self.episodes / num_tried, 6),
-            "redraws": self.redraws,
-            "skipped": dict(sorted(self.skipped.items())),
-        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,13 +200,10 @@ def compose_manifest(
         The index, and the manifest without the checksums of the index and of itself.
     """
     index = pa.concat_tables([INDEX_SCHEMA.empty_table(), *(summary.index for summary in summaries)])
-    tasks: dict[str, TaskCounts] = {}
+    entries: dict[str, list[Mapping[str, Any]]] = {}  # of the shards of each task
     for summary in summaries:
-        entry = summary.entry
-        skipped = Counter(entry["skipped"])
-        counts = TaskCounts(entry["episodes"], entry["steps"], entry["redraws"], skipped)
         for task in summary.index.column("task").unique().to_pylist():  # a shard has one
-            tasks.setdefault(task, TaskCounts()).add(counts)
+            entries.setdefault(task, []).append(summary.entry)
     manifest = {
         "schema": SCHEMA_VERSION,
         **origin,
@@ -246,10 +214,25 @@ def compose_manifest(
             "shards": len(summaries),
             "bytes": sum(summary.entry["bytes"] for summary in summaries),
         },
-        "tasks": {task: tasks[task].record() for task in sorted(tasks)},
+        "tasks": {task: _add_up(entries[task]) for task in sorted(entries)},
         "shards": {summary.name: summary.entry for summary in summaries},
     }
     return index.combine_chunks(), manifest
+
+
+def _add_up(entries: Sequence[Mapping[str, Any]]) -> dict[str, object]:
+    """Return what the manifest holds of a task: episodes kept, seeds tried, and what became of the others."""
+    episodes, steps, redraws = (sum(e[name] for e in entries) for name in ("episodes", "steps", "redraws"))
+    skipped = sum((Counter(entry["skipped"]) for entry in entries), Counter[str]())
+    num_tried = episodes + skipped.total()
+    return {
+        "episodes": episodes,
+        "steps": steps,
+        "seeds_tried": num_tried,
+        "success_rate": round(episodes / num_tried, 6),
+        "redraws": redraws,
+        "skipped": dict(sorted(skipped.items())),
+    }
 
 
 def manifest_checksum(manifest: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from openvima.data.lerobot_files import QUANTILES, PixelCounts, value_statistics
+from openvima.data.lerobot_files import QUANTILES, count_pixels, pixel_statistics, value_statistics
 
 
 def smallest_not_exceeded_by(values: np.ndarray, share: float) -> float:
@@ -31,9 +31,7 @@ def test_the_extremes_of_truth_values_are_truth_values() -> None:
 
 def test_pictures_get_the_statistics_of_their_pixels_by_channel() -> None:
     pictures = np.random.default_rng(0).integers(20, 200, (3, 3, 4, 8), dtype=np.uint8)
-    counts = PixelCounts()
-    counts.add(pictures, num_frames=3)
-    found = counts.statistics()
+    found = pixel_statistics(count_pixels(pictures, 3), 3)
     for channel in range(3):
         pixels = pictures[:, channel].reshape(-1) / 255
         for name in ("min", "max", "mean", "std"):
@@ -46,8 +44,5 @@ def test_pictures_get_the_statistics_of_their_pixels_by_channel() -> None:
 
 def test_one_picture_counts_for_each_frame_that_shows_it() -> None:
     picture = np.random.default_rng(0).integers(0, 256, (1, 3, 4, 8), dtype=np.uint8)
-    once, often = PixelCounts(), PixelCounts()
-    once.add(picture, num_frames=5)
-    often.add(np.repeat(picture, 5, axis=0), num_frames=5)
-    np.testing.assert_array_equal(once.counts, often.counts)
-    assert once.num_frames == often.num_frames == 5
+    often = np.repeat(picture, 5, axis=0)
+    np.testing.assert_array_equal(count_pixels(picture, 5), count_pixels(often, 5))

@@ -76,11 +76,10 @@ def test_files_stay_below_their_limit(tmp_path: Path) -> None:
     files = sorted(tmp_path.rglob("*.mp4"))
     assert len(files) > 2
     assert all(file.stat().st_size < limit for file in files)
-    assert [place.number for place in places] == sorted(
-        (place.number for place in places), key=lambda n: n.file
-    )
+    numbers = [number for number, _ in places]
+    assert numbers == sorted(numbers, key=lambda n: n.file)
     for file_index, file in enumerate(files):
-        firsts = [place.first_frame for place in places if place.number == FileNumber(0, file_index)]
+        firsts = [first for number, first in places if number == FileNumber(0, file_index)]
         with av.open(str(file)) as container:
             assert container.streams.video[0].frames == 2 * len(firsts)
         assert firsts == list(range(0, 2 * len(firsts), 2))
@@ -90,7 +89,7 @@ def test_a_file_is_closed_after_so_many_frames(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(lerobot_files, "MAX_FRAMES", 4)
     with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video:
         places = [video.write(pictures(1), num_frames=3) for _ in range(3)]
-    assert [(place.number.file, place.first_frame) for place in places] == [(0, 0), (0, 3), (1, 0)]
+    assert [(number.file, first) for number, first in places] == [(0, 0), (0, 3), (1, 0)]
 
 
 def test_nothing_is_in_the_way_of_the_first_error(tmp_path: Path) -> None:

@@ -149,7 +149,7 @@ def _task_table(summary: "Summary") -> "Table":
     from rich.table import Table
 
     table = Table("task", box=None, pad_edge=False, header_style="")
-    for name in ("episodes", "steps", "kB/episode", "images", "seeds tried", "oracle success", "redraws"):
+    for name in ("episodes", "steps", "kB/episode", "images", "seeds tried", "oracle success", "resamples"):
         table.add_column(name, justify="right", no_wrap=True)
     table.columns[0].no_wrap = True
     for task in summary.tasks:
