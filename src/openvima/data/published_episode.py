@@ -42,7 +42,7 @@ _OPCODES = OPCODES | {"BYTEARRAY8"}  # in which protocol 5 writes the content of
 MAX_OPERATIONS = 100_000  # opcodes; the largest known file has about 3,000
 _MAX_TEXT = 200  # characters of a name or reason that a message quotes
 # What `pickle` raises when it is given damaged bytes.
-_ODD_ERRORS = (
+_DAMAGE_ERRORS = (
     *(pickle.UnpicklingError, LookupError, TypeError, ValueError, AttributeError, EOFError),
     *(ArithmeticError, MemoryError),
 )
@@ -146,7 +146,7 @@ def read_pickle(content: bytes) -> Any:
         raise
     except InputFileError as error:
         raise MemberError(str(error)) from None
-    except _ODD_ERRORS as error:
+    except _DAMAGE_ERRORS as error:
         reason = str(error)[:_MAX_TEXT] or type(error).__name__
         raise MemberError(f"it is truncated or no pickle of data ({reason}).") from None
 
