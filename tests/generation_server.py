@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from openvima.data import generate
-from small_generations import config
+from small_data_sets import config
 
 EPISODES = 12
 

@@ -1,18 +1,25 @@
-"""Small data sets that no simulation made, and ways to damage their files, for tests of verification."""
+"""Small data sets and results, sampled or made up, and random damage to bytes."""
 
 import dataclasses
 import json
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
+from PIL import Image
 
-from damage import damaged
-from openvima.data import Dataset, Demonstration, Shard, ShardWriter
+from openvima.data import Dataset, Demonstration, GenerateConfig, Shard, ShardWriter
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import MANIFEST_NAME, finish_folder, manifest_checksum
 from openvima.errors import DatasetError, ShardError
+from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.perception.preprocessing import ObjectTable
+from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
+from openvima.video.encoder import Clip, png
 
 MERGE = "openvima data merge"  # a command whose work nothing repeats
 
@@ -101,3 +108,121 @@ def read_damaged_shards(whole: Path, copy: Path, seeds: range, result: Path) -> 
         except Exception as error:  # what the test looks for
             odd.append(f"seed {seed}: {type(error).__name__}: {error}")
     result.write_text(json.dumps(odd))
+
+
+TASKS = ("rotate", "sweep_without_exceeding")
+
+
+def config(out: Path, **changes: object) -> GenerateConfig:
+    """Three episodes of two tasks, in shards of two."""
+    return replace(GenerateConfig(out=out, tasks=TASKS, episodes=3, shard_size=2), **changes)
+
+
+def rows_of(table: ObjectTable) -> np.ndarray:
+    """All fields of each object in one row: id, two indices of images, two boxes, two grasp points."""
+    columns = (table.ids, table.crop_index, table.boxes, table.grasps)
+    return np.concatenate(
+        [column.reshape(len(table), int(np.prod(column.shape[1:]))) for column in columns], axis=1
+    )
+
+
+def seeds_of(entry: Mapping[str, Any]) -> list[int]:  # Any: JSON
+    """All seeds of a task in the record."""
+    return [seed for first, last in entry["seeds"] for seed in range(first, last + 1)]
+
+
+BLOCKS = (1, 8, 64, 512)  # bytes
+
+
+def damaged(
+    content: bytes, rng: random.Random, *, blocks: Sequence[int] = BLOCKS, cut_prob: float = 0.3
+) -> bytes:
+    """Return the content after one to five accidents: to bits, bytes, blocks, order or length.
+
+    Args:
+        content: What the file holds.
+        rng: Source of the accidents.
+        blocks: Sizes of damaged blocks, in bytes.
+        cut_prob: How probable a cut that was drawn is made; it hides all other damage behind it.
+    """
+    result = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 5))):
+        place, other = rng.randrange(len(result)), rng.randrange(len(result))
+        block = min(rng.choice(blocks), len(result) - max(place, other))
+        accident = rng.choice(("bit", "byte", "noise", "zeros", "swap", "cut", "lose", "grow"))
+        if accident == "bit":
+            result[place] ^= 1 << rng.randrange(8)
+        elif accident == "byte":
+            result[place] = rng.choice((0, 127, 128, 255))
+        elif accident == "noise":
+            result[place : place + block] = rng.randbytes(block)
+        elif accident == "zeros":
+            result[place : place + block] = bytes(block)
+        elif accident == "swap" and abs(place - other) >= block:
+            first, second = result[place : place + block], result[other : other + block]
+            result[place : place + block], result[other : other + block] = second, first
+        elif accident == "cut" and rng.random() < cut_prob:
+            del result[max(place, 1) :]
+        elif accident == "lose" and len(result) > 2 * block:
+            del result[place : place + block]
+        elif accident == "grow":
+            result[place:place] = rng.randbytes(block)
+    return bytes(result)
+
+
+VERSIONS = {"openvima": "9.8.7", "mujoco": "1.2.3"}
+CONFIG = {"policies": ["mine", "oracle", "random"], "tasks": ["all"], "levels": ["L1", "L3"], "episodes": 10}
+
+
+def outcomes(num_solved: int) -> tuple[EpisodeOutcome, ...]:
+    failed = ("object 6 (red <swirl> letter A) left the workspace", "object left the workspace")
+    return tuple(EpisodeOutcome(i, i < num_solved, 2, *(() if i < num_solved else failed)) for i in range(10))
+
+
+@pytest.fixture
+def results() -> Results:
+    """Three policies on two tasks at L1 and one at L3; `mine` solves 9 and 6 of 10 at L1."""
+    solved = {
+        "mine": {("rotate", "L1"): 9, ("stack<b>", "L1"): 6, ("rotate", "L3"): 3},
+        "oracle": {("rotate", "L1"): 10, ("stack<b>", "L1"): 10, ("rotate", "L3"): 10},
+        "random": {("rotate", "L1"): 0, ("stack<b>", "L1"): 1, ("rotate", "L3"): 0},
+    }
+    rows = tuple(
+        Row(policy, task, level, 1, outcomes(number))
+        for policy, cells in solved.items()
+        for (task, level), number in cells.items()
+    )
+    policies = {
+        "mine": {"kind": "run", "sha256": "ab" * 32},
+        "oracle": {"kind": "oracle"},
+        "random": {"kind": "random"},
+    }
+    return Results(rows, CONFIG, VERSIONS, policies)
+
+
+def prompt_image(name: str, rows: slice, columns: slice, colour: tuple[int, int, int]) -> PromptImage:
+    rgb = np.full((3, 128, 256), 255, np.uint8)
+    segm = np.full((128, 256), 255, np.uint8)
+    rgb[:, rows, columns] = np.array(colour, np.uint8)[:, None, None]
+    segm[rows, columns] = 0
+    views = ("front", "top")
+    record = ObjectRecord(0, "block", "red")
+    return PromptImage(name, "object", dict.fromkeys(views, rgb), dict.fromkeys(views, segm), (record,))
+
+
+@pytest.fixture
+def prompt() -> RenderedPrompt:
+    """A prompt with a green and a red picture."""
+    images = {
+        "a": prompt_image("a", slice(50, 80), slice(100, 130), (0, 200, 0)),
+        "b": prompt_image("b", slice(40, 90), slice(90, 170), (200, 0, 0)),
+    }
+    return RenderedPrompt("Put the {a} into the {b}.", images)
+
+
+@pytest.fixture
+def clip() -> Clip:
+    """A filmed failure; the film itself is not a real one."""
+    picture = png(Image.new("RGB", (40, 20), (10, 120, 200)))
+    prompt = ("Put the", picture, "into the", picture, ".")
+    return Clip("mine", "rotate", "L1", 9, False, 2, "object <6> left", prompt, b"not a film", picture)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from lock_holders import holding
 from openvima import atomic_io as module
 from openvima.atomic_io import LOCK_NAME, folder_lock
 from openvima.errors import FolderLockedError, StorageError
+from worker_jobs import holding
 
 
 def write_owner(folder: Path, host: str, process: int, **changes: object) -> Path:

@@ -20,7 +20,7 @@ from openvima.data.appearances import (
 )
 from openvima.data.manifest import MANIFEST_NAME
 from openvima.errors import LevelError
-from recorded_seeds import seeds_of
+from small_data_sets import seeds_of
 
 TASKS = ("rearrange", "visual_manipulation", "novel_noun", "sweep_without_exceeding")
 

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from noisy_extractor import HOOK, NoisyExtractor
-from object_rows import rows_of
 from openvima.cli.main import main
 from openvima.data import Dataset
 from openvima.data.object_cache import (
@@ -24,6 +22,8 @@ from openvima.data.verification import verify
 from openvima.errors import DatasetError, WorkerError
 from openvima.perception.boxes import object_iou
 from openvima.perception.objects import GROUND_TRUTH, observe
+from plugged_extractors import HOOK, NoisyExtractor
+from small_data_sets import rows_of
 
 CLUMSY = Boxes("clumsy-1", NoisyExtractor)
 

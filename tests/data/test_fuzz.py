@@ -12,13 +12,13 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from damage import damaged
 from openvima.data import Dataset, Demonstration, Shard, VerifyConfig, verify
 from openvima.data.encoding import ShardInfo
 from openvima.data.schema import COLUMNS
 from openvima.errors import DatasetError, ShardError
 from small_data_sets import (
     contents,
+    damaged,
     edit_manifest,
     read_all,
     read_damaged_shards,

@@ -22,8 +22,7 @@ from openvima.data.subsets import SubsetConfig, sample
 from openvima.env import TabletopEnv
 from openvima.errors import DatasetError, OracleError, SamplingError, ShardError
 from openvima.scene import Outcome
-from small_data_sets import contents
-from small_generations import TASKS, config
+from small_data_sets import TASKS, config, contents
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ from openvima.data import GenerateConfig, GenerationProgress, generate, plan
 from openvima.data.manifest import is_finished
 from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
 from openvima.multiprocess import ray_imap_unordered
-from small_data_sets import contents
-from small_generations import config
+from small_data_sets import config, contents
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,7 @@ from openvima.cli.main import main
 from openvima.data import Dataset, GenerationProgress, generate
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, ShardError, StorageError
-from small_data_sets import contents
-from small_generations import TASKS, config
+from small_data_sets import TASKS, config, contents
 
 NUM_KILLS = 6  # for each of two beginnings
 

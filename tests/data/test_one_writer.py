@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from lock_holders import holding
 from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, generate
 from openvima.data.encoding import ShardInfo
@@ -15,8 +14,8 @@ from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.data.verification import VerifyConfig, verify
 from openvima.errors import FolderLockedError
-from small_data_sets import contents, with_plain_images, write_folder
-from small_generations import config
+from small_data_sets import config, contents, with_plain_images, write_folder
+from worker_jobs import holding
 
 NO_REPLAY = VerifyConfig(replay=0)
 

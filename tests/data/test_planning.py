@@ -11,7 +11,7 @@ from openvima.data.planning import MAX_EPISODES, MAX_FIRST_SEED, generate_comman
 from openvima.env import EnvConfig
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
 from openvima.tasks.sampling import MAX_SEED
-from small_generations import config
+from small_data_sets import config
 
 
 def test_shards_grow_with_their_number() -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-import naive_detection as naive
+import naive
 
 torch = pytest.importorskip("torch")
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from object_rows import rows_of
 from openvima.data import Dataset
 from openvima.data.preprocessed import preprocess
 from openvima.detector.plugins import (
@@ -21,6 +20,7 @@ from openvima.detector.plugins import (
 from openvima.env import TabletopEnv
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth
+from small_data_sets import rows_of
 
 EXTRACTORS = Path(__file__).parents[1] / "plugged_extractors.py"
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import naive_detection as naive
+import naive
 
 torch = pytest.importorskip("torch")
 

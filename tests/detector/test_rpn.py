@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-import naive_detection as naive
+import naive
 
 torch = pytest.importorskip("torch")
 from openvima.detector.boxes import decode_boxes  # noqa: E402

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 import openvima
-from full_repr import full_repr
 from openvima.env import make_vec
 from openvima.tasks import list_tasks
-from playing import random_action
+from task_cases import full_repr, random_action
 
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import openvima
-from box_assets import BoxAssets
 from openvima.env import TabletopEnv
 from openvima.env.tabletop import MODALITIES
 from openvima.errors import ConfigError, ShapeError
@@ -14,6 +13,7 @@ from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.render import CAMERAS, VIEWS, Rasteriser, points_from_depth, project
 from openvima.scene import Action, Placement, Pose, Scene
 from openvima.sim.ur5 import HOME
+from sim_cases import BoxAssets
 
 HALF_ULP_M = 2**-14  # of float32 between 1024 and 2048, where distances lie
 

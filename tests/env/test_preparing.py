@@ -11,13 +11,12 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import create_empty_array
 
 import openvima
-from full_repr import full_repr
 from openvima.env import TabletopEnv, stack_actions
 from openvima.env.sub_environments import SubEnvironments
 from openvima.errors import ConfigError, SamplingError
 from openvima.scene import RenderedPrompt
 from openvima.tasks import list_tasks, sample_episode
-from playing import random_action
+from task_cases import full_repr, random_action
 
 SLOW_TASKS = [pytest.param(task, marks=pytest.mark.slow) for task in list_tasks() if task != "rotate"]
 

@@ -11,7 +11,7 @@ from openvima.env import TabletopEnv
 from openvima.scene import Scene
 from openvima.sim.model import FLOOR_Z_M
 from openvima.tasks import list_tasks, task_spec
-from playing import random_action
+from task_cases import random_action
 
 SINKING_M = 0.002  # by which the lowest corner may be below the floor: contacts are springs
 FARTHEST_M = 3.0  # from the robot; nothing slides that far

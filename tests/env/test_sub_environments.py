@@ -5,8 +5,8 @@ from typing import Any  # infos are nested dictionaries
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from full_repr import full_repr
 from openvima.env.sub_environments import batch_infos
+from task_cases import full_repr
 
 
 class Gathering(VectorEnv):

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from lock_holders import holding
 from openvima.env import EnvConfig
 from openvima.errors import AssetError, CheckpointError, ConfigError, FolderLockedError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 from openvima.evaluation.config import plan
+from worker_jobs import holding
 
 ORACLE = EvaluationConfig(
     ("oracle",), ("rotate", "sweep_without_exceeding"), ("L2",), episodes=3, seed=40, batch=2

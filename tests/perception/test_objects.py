@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from naive import crop_and_box, most_interior
 from openvima.env import TabletopEnv
 from openvima.errors import PolicyError, ShapeError
 from openvima.perception.objects import (
@@ -20,7 +21,6 @@ from openvima.perception.objects import (
 )
 from openvima.render.camera import CAMERAS, unproject
 from openvima.scene import ObjectRecord, PromptImage
-from slow_perception import crop_and_box, most_interior
 
 VIEWS = ("front", "top")
 ID = 9

@@ -29,7 +29,7 @@ from openvima.policies.nn.heads import (  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.variants import with_head, with_visual_residual  # noqa: E402
-from training_examples import collate_examples, examples_of  # noqa: E402
+from small_networks import collate_examples, examples_of  # noqa: E402
 
 # One decoder; and cross-attention, with the last slot or with a query token as the action query.
 CONFIGS = {

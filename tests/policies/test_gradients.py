@@ -18,8 +18,11 @@ from openvima.policies.nn.prompt_encoder import (  # noqa: E402
 )
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.sizes import VOCABULARY_SIZE, Size  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
-from training_examples import collate_examples, examples_of  # noqa: E402
+from small_networks import (  # noqa: E402
+    collate_examples,
+    examples_of,
+    narrow_small,
+)
 
 PUBLISHED = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
 NUM_LAYERS = 3  # of the text encoder

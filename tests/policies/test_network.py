@@ -12,7 +12,7 @@ from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn.actions import from_unit_range, to_unit_range  # noqa: E402
 from openvima.policies.pointer.inputs import yaw_to_bin  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from training_examples import check_mixed_precision, collate_examples, examples_of  # noqa: E402
+from small_networks import check_mixed_precision, collate_examples, examples_of  # noqa: E402
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):

@@ -13,7 +13,7 @@ from openvima.data.appearances import appearances_of, find_leaks
 from openvima.scene import ObjectImage, Placement, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.sampling import make_rng
-from recorded_seeds import seeds_of
+from small_data_sets import seeds_of
 
 FOLDER = Path(openvima.__file__).parent / "policies" / "trained" / "openvima-small"
 RECORD = json.loads((FOLDER / "training_data.json").read_text(encoding="utf-8"))

@@ -16,7 +16,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.variants import SWITCHES, image_tokens, with_variant  # noqa: E402
 from openvima.training.config import ModelConfig  # noqa: E402
-from training_examples import collate_examples, examples_of  # noqa: E402
+from small_networks import collate_examples, examples_of  # noqa: E402
 
 VARIANTS = [
     ("vima-nano", {"conditioning": "prefix"}),

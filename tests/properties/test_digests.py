@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from full_repr import full_repr
 from openvima.tasks import list_tasks, sample_episode, task_spec
+from task_cases import full_repr
 
 RECORD = Path(__file__).parents[1] / "golden" / "episode_digests.json"
 NUM_SEEDS = 20

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import naive
-from box_assets import random_mesh, triangle
 from openvima.catalog import TriangleMesh
 from openvima.catalog.bodies import block
 from openvima.render import FRONT, TOP
@@ -26,6 +25,7 @@ from openvima.render.kernels import (
 )
 from openvima.render.labels import CEILING_M, empty_labels
 from openvima.scene import Pose
+from sim_cases import random_mesh, triangle
 
 SMALL = {
     camera.view: replace(camera, width=32, height=16, focal_px=camera.focal_px / 8) for camera in (FRONT, TOP)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from box_assets import BoxAssets
 from openvima.render import CELL_M, LABEL_SHAPE, cell_centres, empty_labels, label_raster, stamp
 from openvima.scene import Placement, Pose, Scene
+from sim_cases import BoxAssets
 
 ASSETS = BoxAssets()
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from box_assets import COLOURS, BoxAssets
 from openvima.catalog import OBJECTS
 from openvima.catalog.bodies import block
 from openvima.catalog.procedural import ProceduralAssets
 from openvima.errors import ConfigError, ShapeError, UnknownObjectError
 from openvima.render import CAMERAS, VIEWS, Drawable, Rasteriser, project
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
+from sim_cases import COLOURS, BoxAssets
 
 BLOCK = (0.07, 0.07, 0.07)
 

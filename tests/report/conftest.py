@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from made_up_results import clip, prompt, results
+from small_data_sets import clip, prompt, results
 from studio_page import browser_or_skip
 
 __all__ = ["clip", "prompt", "results"]

@@ -6,7 +6,7 @@ import pytest
 from openvima.render import Rasteriser
 from openvima.sim import ur5
 from openvima.sim.arm_view import arm_drawables
-from sim_tables import ASSETS, table
+from sim_cases import ASSETS, table
 
 
 @pytest.mark.parametrize(

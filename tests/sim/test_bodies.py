@@ -9,7 +9,7 @@ from openvima.scene import Pose, Scene
 from openvima.sim.bodies import Bodies
 from openvima.sim.model import body_shape
 from openvima.sim.primitive_state import SETTLE_LIMIT_TICKS, Settling, is_at_rest
-from sim_tables import ALL_OBJECTS, ASSETS, table
+from sim_cases import ALL_OBJECTS, ASSETS, table
 
 
 @pytest.mark.parametrize("name", ALL_OBJECTS)

@@ -9,7 +9,7 @@ from openvima.scene import Action, Pose
 from openvima.sim import World
 from openvima.sim.bodies import Bodies
 from openvima.sim.world import body_under_probe
-from sim_tables import ASSETS, table
+from sim_cases import ASSETS, table
 
 
 def assert_same_pose(pose: Pose, other: Pose, tolerance_m: float = 1e-6) -> None:

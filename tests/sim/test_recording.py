@@ -9,7 +9,7 @@ import pytest
 from openvima.scene import Action
 from openvima.sim import World, ur5
 from openvima.sim.primitive_state import FREE_SPEED
-from sim_tables import ASSETS, table
+from sim_cases import ASSETS, table
 
 CASES = [
     (

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from full_repr import full_repr
 from openvima.scene import Action
 from openvima.sim import World
-from sim_tables import ASSETS, random_action, random_table, table
+from sim_cases import ASSETS, random_action, random_table, table
+from task_cases import full_repr
 
 SEEDS = range(12)
 NUM_ACTIONS = 4

@@ -10,7 +10,7 @@ from openvima.sim import World
 from openvima.sim.primitive_state import MONITOR_TICKS, PrimitiveState
 from openvima.sim.spatula import SWEEP_M_S, Spatula
 from openvima.sim.ur5 import COMPAT_SHORTFALL_M
-from sim_tables import ASSETS, Body, table
+from sim_cases import ASSETS, Body, table
 
 
 def blocks(*poses: tuple[float, float, float]) -> World:

@@ -22,7 +22,7 @@ from openvima.sim.ur5 import (
     highest_tip_z,
     tool_pose,
 )
-from sim_tables import ASSETS, random_table, table
+from sim_cases import ASSETS, random_table, table
 
 ON, OFF = ToolCommand(0, 0, 0, 0, True), ToolCommand(0, 0, 0, 0, False)
 

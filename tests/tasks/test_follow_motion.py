@@ -5,12 +5,11 @@ import math
 
 import pytest
 
-from frequencies import assert_uniform
 from openvima.catalog import object_spec, pool
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, ObjectImage, Placement, Pose, Problem, SceneImage
 from openvima.tasks import sample_episode, task_spec
-from playing import played
+from task_cases import assert_uniform, played
 
 TASK = "follow_motion"
 NUM_EPISODES = 2000

@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import Assets, pool
 from openvima.env import TabletopEnv
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, Placement, Pose, Problem, SceneImage
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.follow_order import all_stackings
-from playing import played
+from task_cases import assert_frequencies, assert_uniform, played
 
 TASK = "follow_order"
 NUM_EPISODES = 2000

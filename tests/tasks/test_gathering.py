@@ -2,12 +2,11 @@
 
 import pytest
 
-from base_cases import beside, judged
-from gathering_cases import roles, tolerance_m
 from openvima.errors import ConfigError
 from openvima.scene import Outcome, Pose, Problem
 from openvima.tasks import advance, begin, sample_episode
 from openvima.tasks.table import is_in_the_way
+from task_cases import beside, group_roles, judge_step, tolerance_m
 
 LEVELS = {"same_texture": "L4", "same_shape": "train"}
 FAR_AWAY = Pose.planar(0.9, 0.0)
@@ -22,7 +21,7 @@ def problem_of(task: str, seed: int = 0, **options: object) -> Problem:
 def problem_with(task: str, *, bowl: bool, **options: object) -> Problem:
     """The first problem whose base is a bowl, or is none."""
     problems = (problem_of(task, seed, **options) for seed in range(100))
-    return next(problem for problem in problems if (roles(problem)[0].object == "bowl") is bowl)
+    return next(problem for problem in problems if (group_roles(problem)[0].object == "bowl") is bowl)
 
 
 @both_tasks
@@ -34,7 +33,7 @@ def test_difficulty_sets_the_counts_and_the_steps(
 ) -> None:
     for seed in range(20):
         episode = sample_episode(task, level=LEVELS[task], seed=seed, difficulty=difficulty)
-        base, dragged, distractors = roles(episode.problem)
+        base, dragged, distractors = group_roles(episode.problem)
         assert (len(dragged), len(distractors)) == (num_dragged, num_distractors)
         assert len(episode.problem.scene.placements) == 1 + num_dragged + num_distractors
         assert base.fixed and not any(p.fixed for p in (*dragged, *distractors))
@@ -45,7 +44,7 @@ def test_difficulty_sets_the_counts_and_the_steps(
 def test_counts_can_be_chosen(task: str) -> None:
     for num_dragged, num_distractors in ((1, 0), (3, 1), (1, 3)):
         options = {"num_dragged": num_dragged, "num_distractors": num_distractors}
-        _, dragged, distractors = roles(problem_of(task, **options))
+        _, dragged, distractors = group_roles(problem_of(task, **options))
         assert (len(dragged), len(distractors)) == (num_dragged, num_distractors)
     for name, count, low, high in (
         ("num_dragged", 0, 1, 3),
@@ -63,12 +62,12 @@ def test_counts_can_be_chosen(task: str) -> None:
 def test_nothing_is_decided_at_the_start(task: str) -> None:
     for seed in range(200):
         problem = problem_of(task, seed, difficulty="hard" if seed % 2 else "easy")
-        base, dragged, distractors = roles(problem)
+        base, dragged, distractors = group_roles(problem)
         limit = tolerance_m(problem)
         assert all(not is_in_the_way(p, base) for p in (*dragged, *distractors))
         assert all(p.pose.planar_distance(base.pose) >= limit for p in (*dragged, *distractors))
         assert all(d.pose.planar_distance(p.pose) >= limit for d in distractors for p in dragged)
-        assert judged(problem, {}) == Outcome()
+        assert judge_step(problem, {}) == Outcome()
 
 
 def test_with_compat_an_episode_may_be_lost_at_the_start() -> None:
@@ -76,7 +75,7 @@ def test_with_compat_an_episode_may_be_lost_at_the_start() -> None:
         problem_of("same_texture", seed, compat=True, after_bowl=False, difficulty="hard")
         for seed in range(100)
     )
-    assert any(judged(problem, {}).failure for problem in problems)
+    assert any(judge_step(problem, {}).failure for problem in problems)
 
 
 @both_tasks
@@ -85,7 +84,7 @@ def test_an_object_may_be_laid_near_another_of_its_kind(task: str) -> None:
     """Only what would decide the episode is kept apart."""
     distances = []
     for seed in range(200):
-        _, (first, second), _ = roles(problem_of(task, seed))
+        _, (first, second), _ = group_roles(problem_of(task, seed))
         distances.append(first.pose.planar_distance(second.pose))
     assert min(distances) < 0.125
 
@@ -94,20 +93,20 @@ def test_an_object_may_be_laid_near_another_of_its_kind(task: str) -> None:
 @pytest.mark.parametrize(("bowl", "limit"), [(True, 0.0875), (False, 0.125)])
 def test_all_objects_have_to_be_near_the_base(task: str, bowl: bool, limit: float) -> None:
     problem = problem_with(task, bowl=bowl)
-    base, (first, second), _ = roles(problem)
+    base, (first, second), _ = group_roles(problem)
     assert tolerance_m(problem) == limit
     near, far = (beside(problem, base.pose, d, moved_id=second.id) for d in (limit - 1e-3, limit + 1e-3))
-    assert judged(problem, {first.id: base.pose, second.id: near}).success
-    assert judged(problem, {first.id: base.pose, second.id: near.rotated(2.0).moved(dz=0.1)}).success
-    assert judged(problem, {first.id: base.pose, second.id: far}) == Outcome()
-    assert judged(problem, {first.id: base.pose}) == Outcome()
+    assert judge_step(problem, {first.id: base.pose, second.id: near}).success
+    assert judge_step(problem, {first.id: base.pose, second.id: near.rotated(2.0).moved(dz=0.1)}).success
+    assert judge_step(problem, {first.id: base.pose, second.id: far}) == Outcome()
+    assert judge_step(problem, {first.id: base.pose}) == Outcome()
 
 
 @both_tasks
 @pytest.mark.parametrize("first_index", [0, 1])
 def test_objects_count_in_any_order_and_may_leave_once_counted(task: str, first_index: int) -> None:
     problem = problem_of(task)
-    base, dragged, _ = roles(problem)
+    base, dragged, _ = group_roles(problem)
     first, second = dragged[first_index], dragged[1 - first_index]
     progress, outcome = advance(problem, begin(problem), problem.scene.with_poses({first.id: base.pose}))
     assert outcome == Outcome() and progress.open_goals == (1 - first_index,)
@@ -118,34 +117,34 @@ def test_objects_count_in_any_order_and_may_leave_once_counted(task: str, first_
 @both_tasks
 def test_an_object_that_is_not_counted_yet_must_stay_on_the_table(task: str) -> None:
     problem = problem_of(task)
-    base, (first, second), (distractor,) = roles(problem)
-    lost = judged(problem, {first.id: base.pose, second.id: FAR_AWAY})
+    base, (first, second), (distractor,) = group_roles(problem)
+    lost = judge_step(problem, {first.id: base.pose, second.id: FAR_AWAY})
     assert lost.failure and "left the workspace" in lost.reason
-    assert judged(problem, {distractor.id: FAR_AWAY}) == Outcome()
+    assert judge_step(problem, {distractor.id: FAR_AWAY}) == Outcome()
 
 
 @both_tasks
 @pytest.mark.parametrize("bowl", [True, False])
 def test_a_distractor_near_the_base_is_a_failure(task: str, bowl: bool) -> None:
     problem = problem_with(task, bowl=bowl)
-    base, (first, second), (distractor,) = roles(problem)
+    base, (first, second), (distractor,) = group_roles(problem)
     limit = tolerance_m(problem)
     near, far = (beside(problem, base.pose, d, moved_id=distractor.id) for d in (limit - 1e-3, limit + 1e-3))
-    assert "of the target of" in judged(problem, {distractor.id: near}).reason
-    assert judged(problem, {distractor.id: far}) == Outcome()
+    assert "of the target of" in judge_step(problem, {distractor.id: near}).reason
+    assert judge_step(problem, {distractor.id: far}) == Outcome()
     done = {first.id: base.pose, second.id: base.pose}
-    assert judged(problem, {**done, distractor.id: near}).failure
-    assert judged(problem, done).success
+    assert judge_step(problem, {**done, distractor.id: near}).failure
+    assert judge_step(problem, done).success
 
 
 @both_tasks
 def test_an_object_near_a_distractor_is_a_failure_wherever_that_is(task: str) -> None:
     problem = problem_of(task)
-    base, (first, second), (distractor,) = roles(problem)
+    base, (first, second), (distractor,) = group_roles(problem)
     limit = tolerance_m(problem)
     near, far = (beside(problem, distractor.pose, d, moved_id=first.id) for d in (limit - 1e-3, limit + 1e-3))
-    assert judged(problem, {first.id: near}).failure
-    assert judged(problem, {first.id: far}) == Outcome()
+    assert judge_step(problem, {first.id: near}).failure
+    assert judge_step(problem, {first.id: far}) == Outcome()
     progress, _ = advance(problem, begin(problem), problem.scene.with_poses({first.id: base.pose}))
     end = problem.scene.with_poses({first.id: near, second.id: base.pose})
     assert advance(problem, progress, end)[1].failure  # even once it has been counted
@@ -168,7 +167,7 @@ def test_compat_keeps_the_wide_tolerance_where_no_bowl_can_occur() -> None:
 @both_tasks
 def test_compat_places_base_then_objects_then_distractors(task: str) -> None:
     for seed in range(10):
-        base, dragged, distractors = roles(problem_of(task, seed, compat=True, difficulty="medium"))
+        base, dragged, distractors = group_roles(problem_of(task, seed, compat=True, difficulty="medium"))
         assert [p.id for p in (base, *dragged, *distractors)] == [5, 6, 7, 8, 9]
 
 
@@ -189,4 +188,4 @@ def test_sampling_hardly_ever_has_to_start_anew(task: str) -> None:
 def test_the_prompt_shows_the_base_and_nothing_else(task: str) -> None:
     problem = problem_of(task)
     ((name, image),) = problem.prompt.images
-    assert name == "base_obj" and image.placement == roles(problem)[0]
+    assert name == "base_obj" and image.placement == group_roles(problem)[0]

@@ -6,13 +6,12 @@ import re
 
 import pytest
 
-from base_cases import beside, judged
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets
 from openvima.errors import ConfigError
 from openvima.render.labels import label_raster
 from openvima.scene import AtPose, DistractorsApart, InOrder, ObjectImage, Outcome, Placement, Pose, Problem
 from openvima.tasks import advance, begin, sample_episode, task_spec
+from task_cases import assert_frequencies, assert_uniform, beside, judge_step
 
 TASK = "manipulate_old_neighbor"
 STEPS = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}  # row, column
@@ -141,7 +140,7 @@ def test_the_prompt_shows_object_and_base_but_not_the_neighbour() -> None:
 @pytest.mark.parametrize("level", ["train", "L3"])
 def test_nothing_overlaps_and_nothing_is_decided_at_the_start(level: str, assets: Assets) -> None:
     for problem in problems(level, num=100):
-        assert judged(problem, {}) == Outcome()
+        assert judge_step(problem, {}) == Outcome()
         covered = sum((label_raster([p], assets) > 0).astype(int) for p in problem.scene.placements)
         assert covered.max() == 1
 
@@ -165,13 +164,13 @@ def test_object_then_neighbour_is_a_success() -> None:
 def test_the_neighbour_must_not_come_first() -> None:
     problem = problems()[0]
     dragged, neighbour, base, distractors = roles(problem)
-    outcome = judged(problem, {neighbour.id: base.pose})
+    outcome = judge_step(problem, {neighbour.id: base.pose})
     assert outcome.failure and "came before" in outcome.reason
-    assert judged(problem, {neighbour.id: base.pose, dragged.id: base.pose}).success  # both at once
-    both_wrong = judged(problem, {neighbour.id: base.pose, distractors[0].id: base.pose})
+    assert judge_step(problem, {neighbour.id: base.pose, dragged.id: base.pose}).success  # both at once
+    both_wrong = judge_step(problem, {neighbour.id: base.pose, distractors[0].id: base.pose})
     assert "came before" in both_wrong.reason  # the order is looked at first
     missed = beside(problem, base.pose, 0.101, moved_id=neighbour.id)
-    assert judged(problem, {neighbour.id: missed}) == Outcome()  # only a step wasted
+    assert judge_step(problem, {neighbour.id: missed}) == Outcome()  # only a step wasted
 
 
 def test_the_object_may_be_taken_out_again() -> None:
@@ -188,11 +187,11 @@ def test_a_wrong_object_in_the_base_is_a_failure() -> None:
     progress, _ = advance(problem, begin(problem), problem.scene.with_poses({dragged.id: base.pose}))
     for distractor in distractors:
         near, far = (beside(problem, base.pose, d, moved_id=distractor.id) for d in (0.099, 0.101))
-        assert judged(problem, {distractor.id: near}).failure
-        assert judged(problem, {distractor.id: far}) == Outcome()
+        assert judge_step(problem, {distractor.id: near}).failure
+        assert judge_step(problem, {distractor.id: far}) == Outcome()
         second = problem.scene.with_poses({dragged.id: base.pose, distractor.id: near})
         assert advance(problem, progress, second)[1].failure
-        assert judged(problem, {distractor.id: FAR_AWAY}) == Outcome()
+        assert judge_step(problem, {distractor.id: FAR_AWAY}) == Outcome()
 
 
 def test_an_object_pushed_against_a_distractor_is_a_failure() -> None:
@@ -200,15 +199,15 @@ def test_an_object_pushed_against_a_distractor_is_a_failure() -> None:
     dragged, neighbour, _, distractors = roles(problem)
     for moved in (dragged, neighbour):
         near, far = (beside(problem, distractors[0].pose, d, moved_id=moved.id) for d in (0.099, 0.101))
-        assert judged(problem, {moved.id: near}).failure
-        assert judged(problem, {moved.id: far}) == Outcome()
+        assert judge_step(problem, {moved.id: near}).failure
+        assert judge_step(problem, {moved.id: far}) == Outcome()
 
 
 def test_both_objects_have_to_stay_on_the_table() -> None:
     problem = problems()[0]
     dragged, neighbour, base, _ = roles(problem)
     for lost in ({dragged.id: FAR_AWAY}, {neighbour.id: FAR_AWAY, dragged.id: base.pose}):
-        outcome = judged(problem, lost)
+        outcome = judge_step(problem, lost)
         assert outcome.failure and "left the workspace" in outcome.reason
 
 

@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from base_cases import assert_judged_at_its_limits, roles, roles_with_twins
-from frequencies import assert_uniform
 from openvima.catalog import TEXTURE_SETS, Assets, Pool, pool
 from openvima.catalog.textures import texture_spec
 from openvima.errors import ConfigError
@@ -16,6 +14,7 @@ from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Action, ObjectImage, Placement, Pose, Problem, Scene
 from openvima.sim.world import World
 from openvima.tasks import TableSampler, sample_episode, task_spec
+from task_cases import assert_judged_at_its_limits, assert_uniform, roles, roles_with_twins
 
 TASK = "novel_adj"
 NUM_EPISODES = 2000

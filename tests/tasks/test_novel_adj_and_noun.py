@@ -5,12 +5,17 @@ import re
 
 import pytest
 
-from base_cases import assert_judged_at_its_limits, roles, roles_with_twins
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import pool
 from openvima.errors import ConfigError
 from openvima.scene import ObjectImage, Problem
 from openvima.tasks import sample_episode, task_spec
+from task_cases import (
+    assert_frequencies,
+    assert_judged_at_its_limits,
+    assert_uniform,
+    roles,
+    roles_with_twins,
+)
 
 TASK = "novel_adj_and_noun"
 NUM_EPISODES = 2000

@@ -4,12 +4,11 @@ import re
 
 import pytest
 
-from base_cases import assert_judged_at_its_limits, roles
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, pool
 from openvima.errors import ConfigError
 from openvima.scene import ObjectImage, Problem
 from openvima.tasks import sample_episode
+from task_cases import assert_frequencies, assert_judged_at_its_limits, assert_uniform, roles
 
 TASK = "novel_noun"
 NUM_EPISODES = 2000

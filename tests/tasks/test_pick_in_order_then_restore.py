@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from base_cases import judged
-from frequencies import assert_uniform
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets, object_spec, pool
 from openvima.errors import ConfigError
 from openvima.scene import (
@@ -23,6 +21,7 @@ from openvima.scene import (
 )
 from openvima.sim import World
 from openvima.tasks import Progress, TableSampler, advance, begin, sample_episode, task_spec
+from task_cases import assert_uniform, judge_step
 
 TASK = "pick_in_order_then_restore"
 CELLS = [(x, y) for x in (0.375, 0.625) for y in (-0.25, 0.0, 0.25)]
@@ -176,7 +175,7 @@ def test_the_object_lies_in_its_base_and_stays_there(base: str, assets: Assets) 
 def test_there_and_back_in_order_is_a_success() -> None:
     for problem in problems(difficulty="hard", num=30):
         _, source, (one, two, three), _ = roles(problem)
-        assert judged(problem, {}) == Outcome()
+        assert judge_step(problem, {}) == Outcome()
         progress, outcome = after(problem, one.pose, two.pose, three.pose)
         assert progress.open_goals == (3,) and outcome == Outcome()
         assert after(problem, one.pose, two.pose, three.pose, source.pose)[1].success

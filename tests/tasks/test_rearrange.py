@@ -2,13 +2,12 @@
 
 import pytest
 
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, Assets, pool
 from openvima.errors import ConfigError, OracleError
 from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem
 from openvima.tasks import advance, begin, make_rng, oracle_action, sample_episode, task_spec
 from openvima.tasks.table import is_in_the_way
-from playing import judged, pictured
+from task_cases import assert_frequencies, assert_uniform, judged, pictured
 
 TASK = "rearrange"
 NUM_EPISODES = 2500

@@ -5,12 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from frequencies import assert_uniform
 from openvima.catalog import Assets, pool
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, Outcome, Placement, Pose, Problem, in_workspace
 from openvima.tasks import Progress, TableSampler, advance, begin, oracle_action, sample_episode, task_spec
-from playing import judged
+from task_cases import assert_uniform, judged
 
 TASK = "rearrange_then_restore"
 FAR_AWAY = Pose.planar(0.9, 0.0)

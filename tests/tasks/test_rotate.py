@@ -5,10 +5,10 @@ import re
 
 import pytest
 
-from frequencies import assert_uniform
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, Problem, angle_difference
 from openvima.tasks import sample_episode, task_spec
+from task_cases import assert_uniform
 
 NUM_EPISODES = 1500
 

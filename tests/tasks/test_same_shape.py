@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frequencies import assert_frequencies, assert_uniform
-from gathering_cases import roles
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets, object_spec, pool
 from openvima.errors import ConfigError
 from openvima.scene import Placement
 from openvima.tasks import TableSampler, sample_episode, task_spec
+from task_cases import assert_frequencies, assert_uniform, group_roles
 
 TASK = "same_shape"
 ALIKE = {
@@ -29,7 +28,7 @@ Roles = tuple[Placement, list[Placement], list[Placement]]
 
 @functools.cache
 def all_roles(level: str, num_episodes: int) -> list[Roles]:
-    return [roles(sample_episode(TASK, level=level, seed=seed).problem) for seed in range(num_episodes)]
+    return [group_roles(sample_episode(TASK, level=level, seed=seed).problem) for seed in range(num_episodes)]
 
 
 @pytest.mark.parametrize(("level", "num_episodes"), [("train", 2000), ("L1", 300), ("L2", 300), ("L3", 500)])

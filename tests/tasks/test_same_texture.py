@@ -2,12 +2,11 @@
 
 import pytest
 
-from frequencies import assert_uniform
-from gathering_cases import roles
 from openvima.catalog import TEXTURE_SETS
 from openvima.catalog.objects import OBJECTS
 from openvima.scene import Placement
 from openvima.tasks import sample_episode, task_spec
+from task_cases import assert_uniform, group_roles
 
 BASES = ("pan", "bowl", "container", "frame", "pallet", "square")
 KIT = tuple(name for name, spec in OBJECTS.items() if spec.kind == "kit")
@@ -17,7 +16,9 @@ Roles = tuple[Placement, list[Placement], list[Placement]]
 
 @pytest.fixture(scope="module")
 def all_roles() -> list[Roles]:
-    return [roles(sample_episode("same_texture", level="L4", seed=seed).problem) for seed in range(2000)]
+    return [
+        group_roles(sample_episode("same_texture", level="L4", seed=seed).problem) for seed in range(2000)
+    ]
 
 
 @pytest.mark.slow

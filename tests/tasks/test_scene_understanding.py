@@ -6,12 +6,11 @@ import re
 import numpy as np
 import pytest
 
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, Assets, pool
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem
 from openvima.tasks import TableSampler, advance, begin, sample_episode, task_spec
-from playing import pictured
+from task_cases import assert_frequencies, assert_uniform, pictured
 
 TASK = "scene_understanding"
 NUM_EPISODES = 2000

@@ -7,12 +7,12 @@ import re
 import numpy as np
 import pytest
 
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS
 from openvima.errors import ConfigError
 from openvima.scene import InZone, NeverTouches, ObjectImage, Placement, Problem, ZoneKeptClear, block_points
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.pushes import Rectangle
+from task_cases import assert_frequencies, assert_uniform
 
 NUM_EPISODES = 1500
 EXCEEDING, TOUCHING = "sweep_without_exceeding", "sweep_without_touching"

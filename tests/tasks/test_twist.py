@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import Assets, Pool, pool
 from openvima.errors import ConfigError
 from openvima.scene import (
@@ -21,6 +20,7 @@ from openvima.scene import (
     angle_difference,
 )
 from openvima.tasks import TableSampler, advance, begin, sample_episode, task_spec
+from task_cases import assert_frequencies, assert_uniform
 
 TASK = "twist"
 NUM_EPISODES = 2000

@@ -4,11 +4,11 @@ import collections
 
 import pytest
 
-from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, pool
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, Placement, Pose, Problem
 from openvima.tasks import advance, begin, sample_episode, task_spec
+from task_cases import assert_frequencies, assert_uniform
 
 NUM_EPISODES = 2000
 

@@ -13,7 +13,7 @@ from openvima.data import Dataset, torch_dataset  # noqa: E402
 from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.training.batches import BatchMaker, BatchOrder, ExampleSource, read_batches  # noqa: E402
-from training_examples import source_of_episodes  # noqa: E402
+from small_networks import source_of_episodes  # noqa: E402
 
 
 def epoch_of(order: BatchOrder, epoch: int) -> list[np.ndarray]:

@@ -14,7 +14,7 @@ from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectVie
 from openvima.perception.preprocessing import ImageStack  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from training_examples import collate_examples, examples_of  # noqa: E402
+from small_networks import collate_examples, examples_of  # noqa: E402
 
 SETTINGS = {
     "objects": {"layout": "objects"},

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 from openvima.evaluation import EvaluationConfig, evaluate  # noqa: E402
 from openvima.policies import presets  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from training_examples import train_until  # noqa: E402
+from small_networks import train_until  # noqa: E402
 
 pytestmark = [
     pytest.mark.slow,

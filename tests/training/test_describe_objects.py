@@ -7,7 +7,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from object_rows import rows_of  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache import open_object_cache  # noqa: E402
 from openvima.data.preprocessed import preprocess  # noqa: E402
@@ -31,6 +30,7 @@ from openvima.training.batches import Example  # noqa: E402
 from openvima.training.building import training_texts  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
+from small_data_sets import rows_of  # noqa: E402
 
 TASKS = (
     "visual_manipulation",

@@ -12,7 +12,6 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import load_file  # noqa: E402
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
-from noisy_extractor import HOOK, NoisyExtractor  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache import CACHE_VERSION, open_object_cache  # noqa: E402
 from openvima.data.preprocessed import preprocess  # noqa: E402
@@ -29,7 +28,8 @@ from openvima.training.augmentation.prompts import motion_prompt  # noqa: E402
 from openvima.training.batches import BatchMaker, Example, ExampleSource  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.source import alternative_source, split_examples  # noqa: E402
-from training_examples import train_until  # noqa: E402
+from plugged_extractors import HOOK, NoisyExtractor  # noqa: E402
+from small_networks import train_until  # noqa: E402
 
 
 class Guesses:
@@ -306,13 +306,13 @@ def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None
 @pytest.mark.slow
 def test_another_detector_is_another_run(settings, tmp_path) -> None:
     file = tmp_path / "extractors.py"
-    file.write_text("from noisy_extractor import make\n")
+    file.write_text("from plugged_extractors import make\n")
     config = TrainingConfig.of(
         {**settings, "pretraining.steps": 0, "schedule.steps": 2, "loader.boxes": f"{file}:make"}
     )
     train(config)
     train(config)
-    file.write_text("from noisy_extractor import make  # changed\n")
+    file.write_text("from plugged_extractors import make  # changed\n")
     with pytest.raises(ConfigError, match=r"demonstrations\.boxes is 'make-\w+' there"):
         train(config)
 

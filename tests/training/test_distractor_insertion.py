@@ -7,7 +7,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from object_rows import rows_of  # noqa: E402
 from openvima.data.preprocessed import number_images, preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
@@ -21,7 +20,8 @@ from openvima.training.augmentation.demonstrations import (  # noqa: E402
 )
 from openvima.training.batches import BatchMaker  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from training_examples import rngs_of, source_of_episodes, stack_images  # noqa: E402
+from small_data_sets import rows_of  # noqa: E402
+from small_networks import rngs_of, source_of_episodes, stack_images  # noqa: E402
 
 TASKS = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "same_shape", "rearrange")
 

@@ -24,7 +24,7 @@ from openvima.training.batches import Example  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
 from openvima.training.config import ModelConfig  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from training_examples import rngs_of  # noqa: E402
+from small_networks import rngs_of  # noqa: E402
 
 PROCESSORS = {
     name: Processor.of(preset(name).inputs) for name in ("nano", "midas-nano", "gpt-nano")

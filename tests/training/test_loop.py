@@ -16,7 +16,7 @@ from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.config import ScheduleConfig  # noqa: E402
 from openvima.training.loop import learning_rate_at, step_generator, step_seed  # noqa: E402
 from openvima.training.run_folder import RunFolder  # noqa: E402
-from training_examples import train_until  # noqa: E402
+from small_networks import train_until  # noqa: E402
 
 
 def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:

@@ -25,8 +25,12 @@ from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
 from openvima.training.config import AugmentationConfig, LoaderConfig  # noqa: E402
 from openvima.training.learner import PolicyLearner  # noqa: E402
 from openvima.training.parallel import Parallel  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
-from training_examples import collate_examples, examples_of, source_of  # noqa: E402
+from small_networks import (  # noqa: E402
+    collate_examples,
+    examples_of,
+    narrow_small,
+    source_of,
+)
 
 pytestmark = pytest.mark.slow
 

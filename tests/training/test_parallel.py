@@ -13,7 +13,6 @@ torch = pytest.importorskip("torch")
 
 from torch.utils import backend_registration  # noqa: E402
 
-from noisy_extractor import HOOK  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.build import config_to_dict  # noqa: E402
@@ -22,6 +21,7 @@ from openvima.training.parallel import (  # noqa: E402
     join_processes,
     start_peers,
 )
+from plugged_extractors import HOOK  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from object_rows import rows_of  # noqa: E402
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.data.preprocessed import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
@@ -34,7 +33,8 @@ from openvima.training.batches import Example  # noqa: E402
 from openvima.training.building import training_texts  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from training_examples import rngs_of  # noqa: E402
+from small_data_sets import rows_of  # noqa: E402
+from small_networks import rngs_of  # noqa: E402
 
 NAMED = (
     "visual_manipulation",

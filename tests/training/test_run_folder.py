@@ -9,7 +9,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from lock_holders import holding  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.errors import FolderLockedError  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
@@ -18,6 +17,7 @@ from openvima.training.run_folder import (  # noqa: E402
     git_state,
     provenance,
 )
+from worker_jobs import holding  # noqa: E402
 
 
 def test_a_second_run_in_a_folder_is_refused_at_once_and_writes_nothing(settings) -> None:

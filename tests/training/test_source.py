@@ -38,7 +38,7 @@ from openvima.training.source import (  # noqa: E402
     open_demonstrations,
     split_examples,
 )
-from training_examples import collate_examples, examples_of, rngs_of  # noqa: E402
+from small_networks import collate_examples, examples_of, rngs_of  # noqa: E402
 
 OBJECTS, VIEWS = Processor("objects"), Processor("views")
 

@@ -1,5 +1,5 @@
 """Made-up results, prompts and clips."""
 
-from made_up_results import clip, prompt, results
+from small_data_sets import clip, prompt, results
 
 __all__ = ["clip", "prompt", "results"]

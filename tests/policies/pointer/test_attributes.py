@@ -21,8 +21,12 @@ from openvima.policies.pointer.words import Attributes  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
 from openvima.policies.variants import with_attributes  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
-from training_examples import check_mixed_precision, collate_examples, examples_of  # noqa: E402
+from small_networks import (  # noqa: E402
+    check_mixed_precision,
+    collate_examples,
+    examples_of,
+    narrow_small,
+)
 
 SAME = "Put all objects with the same profile as {base_obj} into it."
 TOKENIZER = WordTokenizer(

@@ -22,8 +22,11 @@ from openvima.policies.pointer.inputs import HeadInputs, ObjectSet  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import benchmark_vocabulary  # noqa: E402
 from openvima.training.augmentation.prompts import with_motion_prompt  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
-from training_examples import collate_examples, examples_of  # noqa: E402
+from small_networks import (  # noqa: E402
+    collate_examples,
+    examples_of,
+    narrow_small,
+)
 
 TASKS = ("rearrange_then_restore", "follow_order", "twist", "visual_manipulation", "scene_understanding")
 

@@ -13,7 +13,7 @@ from openvima.policies.pointer.config import ObjectHeadConfig  # noqa: E402
 from openvima.policies.pointer.inputs import HeadInputs, at, carried_to, relative_yaw, yaw_to_bin  # noqa: E402  # noqa: E402
 from openvima.policies.pointer.object_head import ObjectPointerHead  # noqa: E402
 from openvima.scene import Action  # noqa: E402
-from pointer_inputs import object_set, pointer_prompt  # noqa: E402
+from small_networks import object_set, pointer_prompt  # noqa: E402
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
 
