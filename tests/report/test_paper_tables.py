@@ -8,7 +8,7 @@ import pytest
 from openvima.evaluation.comparison import compare_pairs
 from openvima.evaluation.results import Results
 from openvima.report.table import latex, latex_text, markdown
-from openvima.report.tables import paper_tables
+from openvima.report.tables import compact_tables, paper_tables
 
 
 @pytest.fixture
@@ -131,3 +131,21 @@ def test_other_prompts_are_named_and_not_compared_with_published_ones(results: R
     assert "(published)" in markdown(paper_tables(results))
     first = markdown(paper_tables(text)[:1])
     assert "(published)" not in first and "Prompts: text." in first
+
+
+def test_a_weak_difference_is_marked_in_markdown_and_latex(results):
+    comparison = compare_pairs(results, [("mine", "random")])[0]
+    weak = replace(comparison.tasks[0], difference=0.3, interval=(0.1, 0.5), p_holm=0.2)
+    assert weak.verdict == "unsure"
+    tables = paper_tables(results, [replace(comparison, tasks=(weak, *comparison.tasks[1:]))])
+    assert "+30.0 (+10.0 to +50.0) ?" in markdown(tables)
+    assert r"+30.0 {\footnotesize(+10.0 to +50.0)} ?" in latex(tables)
+    assert "?: weak" in tables[-1].caption
+
+
+def test_the_compact_table_has_the_best_policy_of_each_level_in_bold(results):
+    (table,) = compact_tables(results, published=False)
+    assert cells_of(markdown([table]), "mine")[0][0].startswith("**75.0** (")
+    assert cells_of(markdown([table]), "oracle")[0][0].startswith("100.0 (")  # an upper bound
+    assert r"\textbf{75.0} {\footnotesize(" in latex([table])
+    assert latex([table]).count(r"\textbf") == 2  # one a level

@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -28,6 +28,7 @@ def main(
     metrics: Path | None = None,
     markdown: bool = False,
     latex: bool = False,
+    tables: Literal["all", "levels"] = "all",
     published: bool = True,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -48,6 +49,8 @@ def main(
         metrics: The same for a single metrics.jsonl.
         markdown: Print tables in Markdown for a paper.
         latex: Print tables in LaTeX for a paper; they need the package booktabs.
+        tables: Which tables to write in Markdown or LaTeX: all, or levels, a compact one of the means by
+            level with the best policy of each level in bold.
         published: Whether to show published numbers of the same tasks beside those measured.
         as_json: Print the comparisons as JSON.
 
@@ -58,7 +61,7 @@ def main(
     from openvima.evaluation.comparison import compare_pairs, default_pairs
     from openvima.report.table import latex as as_latex
     from openvima.report.table import markdown as as_markdown
-    from openvima.report.tables import paper_tables
+    from openvima.report.tables import compact_tables, paper_tables
     from openvima.report.text import finding
 
     _check(results, out)
@@ -70,15 +73,19 @@ def main(
     suffix = out.suffix.lower() if out else ""
     confirmations = _confirmations(evaluations)
     confirmed = all(each.confirmed for each in confirmations)
-    tables = paper_tables(found, comparisons, published=published, confirmed=confirmed)
+    written = (
+        paper_tables(found, comparisons, published=published, confirmed=confirmed)
+        if tables == "all"
+        else compact_tables(found, published=published)
+    )
     if suffix in (*_MARKDOWN, *_LATEX) and out is not None:
-        atomic_write_file(out, as_latex(tables) if suffix in _LATEX else as_markdown(tables))
+        atomic_write_file(out, as_latex(written) if suffix in _LATEX else as_markdown(written))
         print(f"Tables: {out}")
         return 0
     if markdown:
-        print(as_markdown(tables), end="")
+        print(as_markdown(written), end="")
     if latex:
-        print(as_latex(tables), end="")
+        print(as_latex(written), end="")
     if as_json:
         print(json.dumps([comparison.record() for comparison in comparisons], indent=1))
     prints = markdown or latex or as_json

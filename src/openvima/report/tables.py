@@ -9,6 +9,7 @@ from openvima.errors import UnknownTaskError
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import LevelMean, Results
 from openvima.evaluation.statistics import Interval, difference_of_means, mean_of_rates, ratio_of_means
+from openvima.policies.naming import ORACLE
 from openvima.report.ablations import rate_figures
 from openvima.report.figures import RateCurve, RateFigure, RatePanel, RatePoint, rate_table
 from openvima.report.published import (
@@ -228,7 +229,7 @@ def _published_lines(results: Results, first: str, last: str) -> list[Line]:
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
 _CONFIRMED = "Measured outcomes are confirmed by replaying the recorded actions; who acted is declared."
 _UNCONFIRMED = "Outcomes are not confirmed by replay, as `openvima verify-results` does."
-_NOISE_MARK = "≈"
+_NOISE_MARK, _WEAK_MARK = "≈", "?"
 
 
 def paper_tables(
@@ -268,6 +269,30 @@ def paper_tables(
     if confirmed:
         return [replace(table, caption=f"{table.caption} {_CONFIRMED}") for table in tables]
     return [replace(tables[0], caption=f"{tables[0].caption} {_UNCONFIRMED}"), *tables[1:]]
+
+
+def compact_tables(results: Results, *, published: bool = True) -> list[Table]:
+    """Means by level alone, the best policy of each level in bold; the oracle, an upper bound, is none."""
+    table = _mean_table(results, results.means(), published=published and is_comparable(results))
+    policies = results.policy_names()
+    rivals = [n for n in policies if results.policies.get(n, {}).get("kind") != ORACLE]
+    best = {
+        column: max((c.value for c in cells if isinstance(c, Estimate)), default=None)
+        for column, cells in enumerate(zip(*(r.cells for r in table.lines if r.name in rivals), strict=True))
+    }
+    lines = [
+        replace(
+            row,
+            cells=tuple(
+                replace(cell, is_best=row.name in rivals and cell.value == best.get(column))
+                if isinstance(cell, Estimate)
+                else cell
+                for column, cell in enumerate(row.cells)
+            ),
+        )
+        for row in table.lines
+    ]
+    return [replace(table, lines=tuple(lines))]
 
 
 def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
@@ -340,14 +365,14 @@ def _difference_table(comparison: Comparison) -> Table:
         f"Success rate of {a} minus that of {b} on the same episodes, in percentage points, with 95 % "
         "intervals; episodes solved by one of them only; exact McNemar test, p as it is and after Holm for "
         f"the number of such tests in all comparisons made. {_NOISE_MARK}: not significant, the "
-        "interval contains 0."
+        f"interval contains 0. {_WEAK_MARK}: weak, it does not, but p (Holm) is at least 0.05."
     )
     columns = ("task", "level", "difference", "one only", "p", "p (Holm)")
     return Table(f"difference-{a}-{b}".replace(", ", "-"), caption, columns, tuple(lines))
 
 
 def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
-    mark = _NOISE_MARK if difference.verdict == "noise" else ""
+    mark = {"noise": _NOISE_MARK, "unsure": _WEAK_MARK}.get(difference.verdict, "")
     cells = (
         difference.level or "all",
         Estimate(difference.difference, difference.interval, signed=True, mark=mark),
