@@ -157,6 +157,8 @@ class Processor:
 
     def batch_prompts(self, prompts: Sequence[PreprocessedPrompt]) -> PromptBatch:
         """Pad prompts to equal length and number objects across the batch."""
+        # Layouts say where tokens and objects of a prompt go; they are few, and cached. What is left are flat
+        # arrays of all tokens (W,) and of all objects (S,) of the batch, without a loop over either.
         layouts = [self._layout_of(prompt) for prompt in prompts]
         # All tokens, and where they stand in the padded arrays.
         word, row, part, is_valid = np.concatenate([layout.tokens for layout in layouts]).T
@@ -175,6 +177,7 @@ class Processor:
         word_ids_BL, object_index_BL = np.full(shape, PADDING_ID), np.full(shape, WORD)
         mask_BL = np.zeros(shape, np.bool_)
         word_ids_BL[place] = word
+        # Numbered by part first: all first tokens of objects (their front views) before all second ones.
         object_index_BL[place] = np.where(row == WORD, WORD, row + part * len(b) + _starts(counts)[place[0]])
         mask_BL[place] = is_valid
         arrays = (
