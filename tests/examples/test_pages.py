@@ -1,11 +1,22 @@
-"""Pages that begin with an example quote it as it stands."""
+"""Pages quote their examples as they stand, and the Python blocks of every page run from top to bottom."""
 
+import re
 from pathlib import Path
 
 import pytest
+from PIL import Image
+
+from openvima.data import GenerateConfig, generate
+from openvima.tasks import registry
+from user_shapes import restored_assets
 
 ROOT = Path(__file__).parents[2]
-PAGES = {
+BLOCK = re.compile(r"^```python(.*?)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+EXAMPLES = {file.read_text(encoding="utf-8") for file in ROOT.glob("examples/*.py")}
+# Pages whose blocks run in tests of their own, which also check what they give.
+ELSEWHERE = {"format", "midas", "policies", "reinforcement_learning", "studies"}
+PAGES = [ROOT / "README.md", ROOT / "docs/site/index.md", *sorted((ROOT / "docs").glob("*.md"))]
+BEGINNINGS = {  # page to the example that it begins with
     "compose": "compose_a_scene",
     "explain": "explain_a_decision",
     "observations": "joints_and_depth",
@@ -17,7 +28,64 @@ PAGES = {
 }
 
 
-@pytest.mark.parametrize(("page", "example"), PAGES.items())
+def blocks(page: Path) -> list[str]:
+    """Return the code of a page that runs as it stands; without examples that do work, which run as such."""
+    found = BLOCK.findall(page.read_text(encoding="utf-8"))
+    return [
+        code
+        for mark, code in found
+        if mark.strip() != "no-run" and (code not in EXAMPLES or "__main__" in code)
+    ]
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Demonstrations of two tasks, a batch in all."""
+    out = tmp_path_factory.mktemp("data") / "demos"
+    generate(GenerateConfig(out=out, tasks=("rotate", "twist"), episodes=32, workers=1))
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.stem not in ELSEWHERE and blocks(page)],
+    ids=lambda page: page.stem,
+)
+def test_the_code_of_a_page_runs(
+    page: Path, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    Path("examples").symlink_to(ROOT / "examples")
+    if page.stem != "generating":
+        Path("demos").symlink_to(demos)
+    Image.new("RGB", (48, 48), (200, 30, 30)).save("photo.png")
+    for name, scene in re.findall(r"^```yaml\n# (\S+)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
+        Path(name).write_text(scene, encoding="utf-8")
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))  # pages register tasks
+    # Below its guard stands all that this page does; the others have examples there, which run as such.
+    names: dict[str, object] = {"__name__": "__main__" if page.stem == "generating" else "page"}
+    with restored_assets():
+        for code in blocks(page):
+            exec(compile(code, str(page), "exec"), names)
+
+
+def test_blocks_that_do_not_run_are_few_and_begin_like_python() -> None:
+    marked = [code for page in PAGES for mark, code in BLOCK.findall(page.read_text("utf-8")) if mark.strip()]
+    assert len(marked) <= 15
+    for code in marked:
+        compile(code, "page", "exec")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_code_that_starts_worker_processes_has_a_guard(page: Path) -> None:
+    for _, code in BLOCK.findall(page.read_text(encoding="utf-8")):
+        starts = re.search(r"(?<!num_)workers=(?!1\b)|make_vec\(.*num_workers=(?!0\b)", code)
+        assert not starts or 'if __name__ == "__main__":' in code, code
+
+
+@pytest.mark.parametrize(("page", "example"), BEGINNINGS.items())
 def test_the_page_begins_with_its_example(page: str, example: str) -> None:
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     code = (ROOT / "examples" / f"{example}.py").read_text(encoding="utf-8")

@@ -1,0 +1,160 @@
+"""What the pages of networks say in code and numbers is so, and their figures can be drawn."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+
+from findings import Findings
+from openvima.cli.detector import COMMANDS
+from openvima.detector.config import detector_config
+from openvima.detector.network import MaskRCNN
+from openvima.policies import preset
+from openvima.policies.build import policy_size
+from openvima.policies.naming import BUNDLED, SMALL
+from openvima.policies.pointer.candidates import GridCandidates
+from openvima.training.recipes import RECIPES
+from publish import _FIGURES, weights_tables
+from tables import tables
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+DETECTOR, MIDAS, POLICIES, OPENVIMA_SMALL = (
+    (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    for page in ("detector", "midas", "policies", "openvima_small")
+)
+MARKS = {
+    *(f"{name}-figure" for name in _FIGURES),
+    *(*weights_tables(BUNDLED[SMALL].folder), *tables(Findings({}), {})),
+}
+
+
+def draw(name: str, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.syspath_prepend(str(DOCS / "images"))
+    monkeypatch.delitem(sys.modules, "policy", raising=False)
+    figure = runpy.run_path(str(DOCS / "images" / f"{name}.py"))["draw"]()
+    sys.modules.pop("policy", None)
+    return figure
+
+
+def test_the_page_names_every_command_of_the_detector() -> None:
+    assert set(re.findall(r"^openvima detector (\w+)", DETECTOR, re.MULTILINE)) == COMMANDS.keys()
+
+
+def test_the_sizes_of_detectors_are_those_of_the_networks() -> None:
+    counts = {}
+    for name in ("small", "resnet50"):
+        with torch.device("meta"):
+            network = MaskRCNN(detector_config(name))
+        counts[name] = sum(parameter.numel() for parameter in network.parameters()) / 1e6
+    assert f"{counts['small']:.2f} M, {4 * counts['small']:.1f} MB" in DETECTOR
+    assert f"| {counts['resnet50']:.0f} M |" in DETECTOR
+    assert ", ".join(f"{size:g}" for size in detector_config("small").anchor_sizes) in DETECTOR
+
+
+@pytest.mark.slow
+def test_the_code_of_the_policies_runs_from_top_to_bottom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for kind, code in re.findall(r"^```python(.*?)\n(.*?)^```", POLICIES, flags=re.MULTILINE | re.DOTALL):
+        if kind.strip() == "no-run":  # needs downloads; its imports are tried all the same
+            code = "\n".join(line for line in code.splitlines() if line.startswith("from "))
+        exec(compile(code, "policies.md", "exec"), names)
+    assert {"sampling", "MyDetector", "load_t5"} <= names.keys()
+
+
+def test_the_code_of_midas_runs() -> None:
+    names: dict[str, object] = {}
+    for code in re.findall(r"^```python\n(.*?)^```", MIDAS, flags=re.MULTILINE | re.DOTALL):
+        exec(compile(code, "midas.md", "exec"), names)
+    assert names["vima"].decoder == preset("vima-nano").decoder
+    plain, vima = names["plain"].head, preset("vima-nano").head
+    assert type(plain) is type(vima) and plain.hidden_width == vima.hidden_width
+
+
+@pytest.mark.parametrize(
+    ("text", "pattern", "some"),
+    [
+        (POLICIES, r"^\| `([\w-]+)` \| (\d.*) \|$", {f"vima-{size}" for size in ("2m", "9m", "200m")}),
+        (MIDAS, r"^\| `(midas-\d*\w+)` \| (\d.*) \|$", {"midas-nano", "midas-92m"}),
+    ],
+    ids=["policies", "midas"],
+)
+def test_the_tables_of_sizes_are_those_of_the_presets(text: str, pattern: str, some: set[str]) -> None:
+    rows = re.findall(pattern, text, flags=re.MULTILINE)
+    assert {name for name, _ in rows} > some
+    for name, row in rows:
+        size = policy_size(preset(name))
+        counts = [count.total for count in size.parts.values()]
+        counts += [size.parameters.total, size.parameters.trainable]
+        millions = [f"{count / 1e6:.2f}" for count in counts]
+        assert row.split(" | ") == [str(size.width), str(size.num_layers), str(size.num_heads), *millions]
+
+
+def test_totals_of_the_baselines_are_as_near_to_vima_as_the_page_says() -> None:
+    for size in ("2m", "43m", "200m"):
+        ours = policy_size(preset(f"vima-{size}")).parameters.total
+        for family, share in {"gato": 0.02, "gpt": 0.02, "flamingo": 0.05}.items():
+            theirs = policy_size(preset(f"{family}-{size}")).parameters.total
+            assert abs(theirs / ours - 1) < share
+
+
+def test_every_recipe_that_the_page_of_midas_names_is_there() -> None:
+    assert set(re.findall(r"^\| `(midas-[a-z-]+[a-z])` \| [^\d]", MIDAS, flags=re.MULTILINE)) <= {*RECIPES}
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/openvima_small.md", BUNDLED[SMALL].model_card])
+def test_every_mark_has_an_end_and_a_table_or_figure(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    begun = re.findall(r"<!-- small:(\S+) -->", text)
+    assert begun and begun == re.findall(r"<!-- /small:(\S+) -->", text)
+    assert set(begun) <= MARKS
+
+
+def test_numbers_of_openvima_small_are_between_marks() -> None:
+    outside = re.sub(r"<!-- small:(\S+) -->.*?<!-- /small:\1 -->", "", OPENVIMA_SMALL, flags=re.DOTALL)
+    assert not re.search(r"\d(\.\d+)? ?(%|points|M\b|million)", outside)
+    assert f"{len(GridCandidates(1).points_mm)} grid candidates" in OPENVIMA_SMALL
+
+
+def test_the_figure_of_the_policies_shows_every_crop_and_patch(monkeypatch: pytest.MonkeyPatch) -> None:
+    (axes,) = draw("policy", monkeypatch).axes
+    # VIMA: 4 crops of the prompt, 4 views, 12 crops; Gato: 64 patches; the others: 4 pairs of frames each
+    assert len(axes.images) == (4 + 4 + 12) + 64 + 2 * 4
+    texts = [text.get_text() for text in axes.texts]
+    assert texts.count("put") == 4 and texts.count("output: 12 action bins") == 2
+
+
+def test_the_figure_of_midas_shows_every_crop_and_component(monkeypatch: pytest.MonkeyPatch) -> None:
+    (axes,) = draw("midas", monkeypatch).axes
+    # 4 crops of the prompt and 6 of the step; 3 frames, and the 6 objects of each in both views; those of
+    # two prompts in context, with an observation of each
+    assert len(axes.images) == 4 + 6 + 3 + 3 * 12 + 7
+    texts = [text.get_text() for text in axes.texts]
+    assert texts.count("qw₁") == 2 and texts.count("motion") == 1
+
+
+def test_the_figure_of_openvima_small_shows_every_crop_and_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    (axes,) = draw("openvima_small_network", monkeypatch).axes
+    # one object in the prompt and two in view, two crops each; the prompt's scene, two views, two top views
+    assert len(axes.images) == 2 + 4 + 1 + 2 + 2
+    assert {"query", "restore"} <= {text.get_text() for text in axes.texts}
+
+
+def test_the_figure_of_the_detector_shows_anchors_grids_and_masks() -> None:
+    pytest.importorskip("matplotlib")
+    names = runpy.run_path(str(DOCS / "images" / "detector.py"))
+    figure, num_objects = names["draw"](), len(names["frame"]().boxes)
+    anchors, grids, masks = figure.axes
+    assert len(anchors.patches) > num_objects > 1
+    assert len(grids.collections) == 2 * num_objects  # lines in two directions
+    assert len(masks.images) == 1 + num_objects
