@@ -210,7 +210,7 @@ class ForcedPolicy(PromptedRolloutPolicy):
             for env, seen in zip(self._envs, observations, strict=True)
             if seen is not None
         ]
-        decode_step: Any = network.decode_step  # Any: its arguments are passed on
+        decode_step: Any = network.decode_step
 
         def restricted(*inputs: Any) -> Any:
             return decode_step(*inputs[:-1], self._restricted(inputs[-1]))

@@ -51,7 +51,7 @@ NUM_CORES = 16
 TRAINING_COLUMNS = [*(name for name in ARRAYS if name != "poses"), "prompt", "prompt_images", "end_effector"]
 FORMATS = ("lz4", "zstd", "no_images", "png", "png_all", "jpeg")
 
-Numbers = dict[str, Any]  # Any: nested JSON
+Numbers = dict[str, Any]
 
 
 def play(env: TabletopEnv, seed: int) -> Demonstration | None:

@@ -85,7 +85,7 @@ def batches(_: argparse.Namespace) -> dict[str, dict[str, str]]:
     """Return the digest of each tensor over ten batches by preset; without pretraining, so with crops."""
     found = {}
     for preset in RECIPES:
-        totals: dict[str, Any] = {}  # Any: hashlib has no public type
+        totals: dict[str, Any] = {}
         with watched_batches() as seen:
             train(preset, "--schedule.steps=10", "--pretraining.steps=0")
             for batch in seen:
@@ -123,7 +123,7 @@ def outcomes(options: argparse.Namespace) -> dict[str, str]:
     }
 
 
-PARTS: dict[str, Callable[[argparse.Namespace], Any]] = {  # Any: JSON
+PARTS: dict[str, Callable[[argparse.Namespace], Any]] = {
     each.__name__: each for each in (names, episodes, shards, batches, losses, outcomes)
 }
 
@@ -138,7 +138,7 @@ def watched_batches() -> Iterator[list[object]]:
     seen: list[object] = []
     forward = learner.PolicyLearner.forward
 
-    def watch(self: torch.nn.Module, batch: Any) -> Any:  # Any: as the method has it
+    def watch(self: torch.nn.Module, batch: Any) -> Any:
         if self.training:
             seen.append(batch)
         return forward(self, batch)
@@ -220,7 +220,7 @@ def differences(found: object, recorded: object, *, part: str) -> Iterator[str]:
             yield f"{path}: {one} instead of {other}"
 
 
-def _names(names_of: Any) -> list[str]:  # Any: JSON
+def _names(names_of: Any) -> list[str]:
     return [f"{package}.{name}" for package, found in names_of.items() for name in found]
 
 

@@ -41,7 +41,7 @@ NUM_ROUNDS = 5
 PROGRESS = re.compile(r": ([\d,]+) of ([\d,]+) \(")
 MB = 2**20
 
-Entry = dict[str, Any]  # Any: plain values
+Entry = dict[str, Any]
 
 
 def memory_mb(pid: int) -> float:

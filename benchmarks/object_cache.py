@@ -36,7 +36,7 @@ from openvima.tasks import list_tasks, task_spec
 from openvima.training.batches import BatchOrder
 from sim import circumstances
 
-Numbers = dict[str, Any]  # Any: nested JSON
+Numbers = dict[str, Any]
 
 
 def ways_of(cache: ObjectCache, batch: int) -> dict[str, Callable[[], object]]:

@@ -136,9 +136,7 @@ class Decision:
         self._network.encode_images(self._images[self._history.crop_index_BTVN[:, -1].flatten()])
         self._decode(self._encoded, self._history, self._features)
 
-    def _decode(
-        self, prompt: Any, history: HistoryBatch, features: torch.Tensor
-    ) -> None:  # Any: the model's own
+    def _decode(self, prompt: Any, history: HistoryBatch, features: torch.Tensor) -> None:
         state, has_previous = self._network.init_cache(prompt), torch.arange(HISTORY)[None] > 0
         self._network.decode_step(prompt, state, history, features, self._actions, has_previous)
 

@@ -71,7 +71,7 @@ def scripted_server(*frames: object, metadata: object = None) -> Iterator[str]:
     """A server that answers each request with the next of some frames; a function is called instead."""
     first = {"protocol": PROTOCOL} if metadata is None else metadata
 
-    def converse(connection: Any) -> None:  # Any: of websockets
+    def converse(connection: Any) -> None:
         connection.send(first if isinstance(first, str) else pack(first))
         for _, frame in zip(connection, frames, strict=False):
             if callable(frame):
@@ -85,7 +85,7 @@ def scripted_server(*frames: object, metadata: object = None) -> Iterator[str]:
 
 
 @contextmanager
-def running(converse: Callable[[Any], None], **options: Any) -> Iterator[str]:  # Any: of websockets
+def running(converse: Callable[[Any], None], **options: Any) -> Iterator[str]:
     """Serve in a thread; each connection is given to a function."""
     server = serve(converse, "127.0.0.1", 0, compression=None, **options)
     thread = threading.Thread(target=server.serve_forever)

@@ -126,7 +126,7 @@ def rows_of(table: ObjectTable) -> np.ndarray:
     )
 
 
-def seeds_of(entry: Mapping[str, Any]) -> list[int]:  # Any: JSON
+def seeds_of(entry: Mapping[str, Any]) -> list[int]:
     """All seeds of a task in the record."""
     return [seed for first, last in entry["seeds"] for seed in range(first, last + 1)]
 

@@ -18,7 +18,7 @@ def find_browser() -> str | None:
 
 
 @contextmanager
-def launched_browser() -> Iterator[Any]:  # Any: playwright may be missing
+def launched_browser() -> Iterator[Any]:
     """Launch the system's browser without a window."""
     from playwright.sync_api import sync_playwright
 
@@ -28,7 +28,7 @@ def launched_browser() -> Iterator[Any]:  # Any: playwright may be missing
         launched.close()
 
 
-def browser_or_skip() -> Iterator[Any]:  # Any: as above
+def browser_or_skip() -> Iterator[Any]:
     """Yield the system's browser for a fixture; skip where there is none."""
     pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
     if find_browser() is None:

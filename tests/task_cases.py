@@ -165,7 +165,7 @@ def random_action(rng: np.random.Generator, scene: Scene) -> dict[str, np.ndarra
     }
 
 
-def full_repr(value: Any) -> str:  # Any: narrowed below
+def full_repr(value: Any) -> str:
     """Return what the `__repr__` that dataclasses generate returns; those of the package are brief."""
     kind = type(value)
     if kind is tuple:

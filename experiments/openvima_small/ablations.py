@@ -44,7 +44,7 @@ _SHORT_PRETRAINING = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000}
 FULL = "full"
 _NO_ATTRIBUTES = {"model.attributes": False, "pretraining.attribute_loss_weight": 0.0}
 
-Settings = dict[str, Any]  # Any: as in `TrainingConfig`
+Settings = dict[str, Any]
 Solved = dict[str, dict[str, str]]  # outcomes by level and task
 
 
@@ -250,7 +250,7 @@ def settings_of(name: str, recipe: str) -> Settings:
     return override(recipe_settings(recipe), {**alone, **pretraining, **VARIANTS[name].settings})
 
 
-def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:  # Any: plain JSON values
+def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:
     variant, row = VARIANTS[name], _row_file(given.runs or given.out, name, seed)
     folder, preset = row.with_suffix(""), f"small-{name}"
     pretrained, stored = load_network(given.crops)

@@ -12,7 +12,7 @@ from openvima.report.published import leading_models
 
 INK, FAINT, GRID, PAPER = "#1f2933", "#77818c", "#dfe3e9", "#ffffff"
 OURS, PUBLISHED = "#0072b2", "#a9b2bc"
-STYLE: Any = {  # Any: the type of matplotlib's settings is not public either
+STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "text.color": INK,

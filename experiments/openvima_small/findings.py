@@ -212,7 +212,7 @@ def read_trainings(files: Sequence[Path]) -> tuple[Training, ...]:
     return tuple(trainings)
 
 
-def _training(record: dict[str, Any], folder: Path) -> Training:  # Any: JSON
+def _training(record: dict[str, Any], folder: Path) -> Training:
     path = Path(record["evaluation"])
     if not path.exists() and (folder / path).exists():
         path = folder / path

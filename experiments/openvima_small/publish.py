@@ -52,7 +52,7 @@ _PAGE = """# openvima-small
 """
 
 
-def record(findings: Findings) -> dict[str, Any]:  # Any: plain JSON values
+def record(findings: Findings) -> dict[str, Any]:
     """Return all numbers as plain values; outcomes of single episodes stay with the evaluations."""
     return {
         "scores": {name: _score_record(results) for name, results in findings.scores.items()},
@@ -61,7 +61,7 @@ def record(findings: Findings) -> dict[str, Any]:  # Any: plain JSON values
     }
 
 
-def _score_record(results: Results) -> dict[str, Any]:  # Any: plain JSON values
+def _score_record(results: Results) -> dict[str, Any]:
     return {
         "weights": next(iter(results.policies.values())).get("sha256", ""),
         "config": results.config,
@@ -71,7 +71,7 @@ def _score_record(results: Results) -> dict[str, Any]:  # Any: plain JSON values
     }
 
 
-def _mean_record(mean: LevelMean) -> dict[str, Any]:  # Any: plain JSON values
+def _mean_record(mean: LevelMean) -> dict[str, Any]:
     return {
         "level": mean.level,
         "mean": round(mean.mean, 6),
@@ -80,7 +80,7 @@ def _mean_record(mean: LevelMean) -> dict[str, Any]:  # Any: plain JSON values
     }
 
 
-def _row_record(row: Row) -> dict[str, Any]:  # Any: plain JSON values
+def _row_record(row: Row) -> dict[str, Any]:
     return {
         "task": row.task,
         "level": row.level,
@@ -93,7 +93,7 @@ def _row_record(row: Row) -> dict[str, Any]:  # Any: plain JSON values
     }
 
 
-def _training_record(training: Training) -> dict[str, Any]:  # Any: plain JSON values
+def _training_record(training: Training) -> dict[str, Any]:
     return {
         "name": training.name,
         "what": training.what,
@@ -106,7 +106,7 @@ def _training_record(training: Training) -> dict[str, Any]:  # Any: plain JSON v
     }
 
 
-def recorded_means(recorded: Mapping[str, Any]) -> dict[str, LevelMean]:  # Any: JSON
+def recorded_means(recorded: Mapping[str, Any]) -> dict[str, LevelMean]:
     """Return success by level of the bundled weights, from a record; empty where it has none."""
     levels = recorded.get("scores", {}).get("default", {}).get("levels", [])
     return {
@@ -146,7 +146,7 @@ def write(
     out: Path,
     images: Path,
     pages: Sequence[Path],
-    where: Mapping[str, Any],  # Any: plain JSON values
+    where: Mapping[str, Any],
     evaluation: Path | None = None,
 ) -> None:
     """Write record, figures and tables.

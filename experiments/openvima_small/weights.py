@@ -134,5 +134,5 @@ def settings(folder: Path) -> list[tuple[str, str]]:
     return [(name, f"{value:g}") for name, value in chosen.items() if _SETTING.search(name) and value]
 
 
-def _sessions(run: Path) -> list[dict[str, Any]]:  # Any: JSON
+def _sessions(run: Path) -> list[dict[str, Any]]:
     return [values for _, values in whole_lines(run / SESSIONS_FILE)]

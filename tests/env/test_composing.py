@@ -308,7 +308,7 @@ def random_scene(rng: random.Random) -> dict[str, Any]:
     }
 
 
-def _random_image(rng: random.Random, handles: list[str]) -> Any:  # Any: one of the forms of an image
+def _random_image(rng: random.Random, handles: list[str]) -> Any:
     handle = rng.choice(handles)
     appearance = [rng.choice(list(CATALOGUE)), rng.choice(list(TEXTURES))]
     position = [rng.uniform(0.3, 0.7), rng.uniform(-0.45, 0.45)]

@@ -22,7 +22,7 @@ ROTATE = {"tasks": ("rotate",), "levels": ("L1",), "episodes": 1, "prompts": "te
 
 
 @pytest.fixture(params=["primitives", "end_effector"])
-def policy(request: pytest.FixtureRequest) -> Any:  # Any: of a file
+def policy(request: pytest.FixtureRequest) -> Any:
     return load_policy(f"{FILE}:{request.param}")
 
 
@@ -68,7 +68,7 @@ def test_the_rule_solves_every_episode_that_colours_tell(policy: Any) -> None:
 
 
 def test_the_rule_reads_the_text() -> None:
-    policy: Any = load_policy(f"{FILE}:primitives")  # Any: of a file
+    policy: Any = load_policy(f"{FILE}:primitives")
     model = policy.model
     policy.model = lambda text, images, state: model(text.replace("degrees", "centimetres"), images, state)
     (row,) = score({"deaf": policy}, **ROTATE).rows

@@ -12,6 +12,6 @@ __all__ = ["clip", "prompt", "results"]
 
 
 @pytest.fixture
-def browser() -> Iterator[Any]:  # Any: playwright may be missing
+def browser() -> Iterator[Any]:
     """The system's Chromium."""
     yield from browser_or_skip()

@@ -13,7 +13,7 @@ from openvima.scene.action import ToolCommand, is_valid_batch
 from strategies import angles
 
 
-def arrays(**changes: object) -> dict[str, Any]:  # Any: also what is no array
+def arrays(**changes: object) -> dict[str, Any]:
     action: dict[str, Any] = {
         "pose0_position": np.array([0.4, 0.1], np.float32),
         "pose0_rotation": np.array([0, 0, 0, 1], np.float32),

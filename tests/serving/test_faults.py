@@ -88,7 +88,7 @@ class Fuzzer:
             bad[self._random.randrange(min(200, len(bad)))] = self._random.randrange(256)
         return bytes(bad) + b"!"
 
-    def _junk(self, depth: int = 3) -> Any:  # Any: whatever can be packed
+    def _junk(self, depth: int = 3) -> Any:
         random = self._random
         kind = random.randrange(4) if depth else 0
         if kind == 1:
@@ -97,7 +97,7 @@ class Fuzzer:
             return {random.choice(KEYS): self._junk(depth - 1) for _ in range(random.randrange(4))}
         return self._array() if kind == 3 else random.choice(PLAIN)
 
-    def _array(self) -> dict[bytes, Any]:  # Any: right or wrong
+    def _array(self) -> dict[bytes, Any]:
         random = self._random
         dtypes = ["|O", "O", "<U9", "|V8", "<c16", "<M8[s]", "|S4", "u1,f8", "<f8", "|u1", "x" * 999, 7, None]
         lengths = [0, 1, -1, 3, 2**31, 2**62, -(2**40), 1.5, "3", True, None]

@@ -23,14 +23,14 @@ class Untouched(Telltale):
         pytest.fail("the policy was asked")
 
 
-def refusal(message: Any, policy: Any = None) -> str:  # Any: whatever can be packed, and a policy
+def refusal(message: Any, policy: Any = None) -> str:
     session = Session(policy or Untouched(), 64)
     answer = session.read(pack(message))
     assert isinstance(answer, str)
     return answer
 
 
-def prompt_with(text: str = "Look at {thing}.", **fields: Any) -> dict[str, Any]:  # Any: of a message
+def prompt_with(text: str = "Look at {thing}.", **fields: Any) -> dict[str, Any]:
     sent = encode_prompt(made_up_prompt(1))
     return {"text": text, "images": [{**sent["images"][0], **fields}]}
 
@@ -51,7 +51,7 @@ def test_a_policy_that_reads_language_is_served_descriptions() -> None:
     assert "names of over 200 characters" in str(session.read(pack({"type": "reset", "prompts": [long]})))
 
 
-def records(*ids: int) -> list[dict[str, Any]]:  # Any: of a message
+def records(*ids: int) -> list[dict[str, Any]]:
     return [{"object_id": number, "object": "bowl", "texture": "red"} for number in ids]
 
 
@@ -120,7 +120,7 @@ def test_a_policy_states_its_own_limits() -> None:
 def test_a_request_that_takes_long_to_read_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     reading, finished = threading.Event(), threading.Event()
 
-    def slow(data: bytes) -> Any:  # Any: what was sent
+    def slow(data: bytes) -> Any:
         if data == b"slow":
             reading.set()
             assert finished.wait(10)

@@ -35,7 +35,7 @@ def connection(url: str) -> Iterator[ClientConnection]:
         yield connection
 
 
-def ask(connection: ClientConnection, message: object) -> Any:  # Any: an answer, or the text of an error
+def ask(connection: ClientConnection, message: object) -> Any:
     connection.send(message if isinstance(message, str | bytes) else pack(message))
     answer = connection.recv()
     return answer if isinstance(answer, str) else unpack(answer)

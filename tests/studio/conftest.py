@@ -9,7 +9,7 @@ from studio_page import Page, browser_or_skip
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:  # Any: playwright may be missing
+def browser() -> Iterator[Any]:
     """The system's Chromium, with software WebGL."""
     yield from browser_or_skip()
 

@@ -63,7 +63,7 @@ def studio(browser: Any, open_studio: Callable, results: Path, recorded: Path) -
 
 
 @pytest.fixture
-def page(studio: Any, open_page: Callable) -> Any:  # Any: of an optional package
+def page(studio: Any, open_page: Callable) -> Any:
     opened = open_page(studio.url)
     opened.raw.set_viewport_size({"width": 1200, "height": 800})  # so that the prompt covers no object
     opened.wait_for("Success in % by task and level")  # which is opened last

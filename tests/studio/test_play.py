@@ -13,7 +13,7 @@ NO_POLICY = "no_such_policy"
 
 
 @pytest.fixture(scope="module")
-def studio(browser: Any, open_studio: Callable[..., Any]) -> Any:  # Any: of an optional package
+def studio(browser: Any, open_studio: Callable[..., Any]) -> Any:
     return open_studio()
 
 

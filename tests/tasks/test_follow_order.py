@@ -202,7 +202,7 @@ def test_all_numbers_can_be_chosen() -> None:
     [("num_blocks", 5, "2 to 4"), ("num_frames", 6, "2 to 5"), ("num_distractors", -1, "0 to 6")],
 )
 def test_numbers_out_of_range_are_refused(name: str, value: int, allowed: str) -> None:
-    option: dict[str, Any] = {name: value}  # Any: pyright cannot tell options from the other arguments
+    option: dict[str, Any] = {name: value}
     with pytest.raises(ConfigError, match=f"{name} is {value}; give an integer from {allowed}"):
         sample_episode(TASK, seed=0, **option)
 

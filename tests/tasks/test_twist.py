@@ -218,7 +218,7 @@ def test_angles_within_the_tolerance_are_refused(angles_deg: object) -> None:
     ("name", "value", "allowed"), [("num_objects", 1, "2 to 6"), ("num_examples", 0, "1 to 6")]
 )
 def test_numbers_out_of_range_are_refused(name: str, value: int, allowed: str) -> None:
-    option: dict[str, Any] = {name: value}  # Any: pyright cannot tell options from the other arguments
+    option: dict[str, Any] = {name: value}
     with pytest.raises(ConfigError, match=f"{name} is {value}; give an integer from {allowed}"):
         sample_episode(TASK, seed=0, **option)
 

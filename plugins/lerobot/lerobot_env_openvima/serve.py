@@ -75,7 +75,7 @@ class LerobotPolicy(Policy):
         """Start a batch of episodes."""
         self._episodes = [_Episode(prompt, self._own_network()) for prompt in prompts]
 
-    def act(self, observations: Sequence[Mapping | None]) -> list[Any]:  # Any: of its control
+    def act(self, observations: Sequence[Mapping | None]) -> list[Any]:
         """Decide the next action of every running episode, one after another."""
         return [
             None if observation is None else self._action(episode, observation)
@@ -89,7 +89,7 @@ class LerobotPolicy(Policy):
         network.reset()
         return network
 
-    def _action(self, episode: "_Episode", observation: Mapping[str, Any]) -> Any:  # Any: as above
+    def _action(self, episode: "_Episode", observation: Mapping[str, Any]) -> Any:
         frame = self._layout.frame(observation, episode.prompt)
         batched = {"pixels": frame["pixels"], "agent_pos": frame["agent_pos"][None]}
         seen = {**preprocess_observation(batched), "task": [episode.prompt.text]}
@@ -112,7 +112,7 @@ def _control(config: PreTrainedConfig) -> str:
 
 
 class _Episode:
-    def __init__(self, prompt: RenderedPrompt, network: Any) -> None:  # Any: a PreTrainedPolicy
+    def __init__(self, prompt: RenderedPrompt, network: Any) -> None:
         self.prompt, self.network = prompt, network
         self._seed = prompt_hash(prompt) % 2**62
 

@@ -18,7 +18,7 @@ LOW_LEVEL = {"prompts": "text", "control": "end_effector", "layout": DenseLayout
 
 
 @pytest.fixture(scope="module")
-def make() -> Any:  # Any: a class of a file
+def make() -> Any:
     """What makes an environment; the package around its file imports LeRobot."""
     spec = importlib.util.spec_from_file_location("lerobot_env_openvima_env", FILE)
     assert spec is not None and spec.loader is not None
@@ -27,7 +27,7 @@ def make() -> Any:  # Any: a class of a file
     return partial(module.OpenVimaEnv, "rotate", level="L1", **FIXED)
 
 
-def oracle_row(env: Any) -> np.ndarray:  # Any: as above
+def oracle_row(env: Any) -> np.ndarray:
     return np.concatenate(list(env._env.oracle_decision().action.to_arrays().values()))
 
 

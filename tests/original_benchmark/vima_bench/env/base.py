@@ -22,7 +22,7 @@ class Environment:
         self.task_name, self._attempts = task, 0
         self.global_seed = 0
 
-    def reset(self) -> dict[str, Any]:  # Any: as of the original
+    def reset(self) -> dict[str, Any]:
         self._attempts += 1
         if self.global_seed % 2 and self._attempts == 1:
             raise ValueError("no space")
@@ -63,12 +63,12 @@ class Environment:
     def _column(self) -> int:
         return (self.global_seed + 3 * self._picks) % SIZE[1]
 
-    def _asset(self, kind: str, info: dict | list) -> dict[str, Any]:  # Any: as of the original
+    def _asset(self, kind: str, info: dict | list) -> dict[str, Any]:
         images = {view: np.full((3, *SIZE), self.global_seed % 256, np.uint8) for view in ("front", "top")}
         segm = {view: np.full(SIZE, 255, np.uint8) for view in images}
         return {"rgb": images, "segm": segm | {"obj_info": info}, "placeholder_type": kind}
 
-    def _observation(self) -> dict[str, Any]:  # Any: as of the original
+    def _observation(self) -> dict[str, Any]:
         segm = np.ones(SIZE, np.uint8)
         segm[0] = 0
         segm[1, :3] = 2, 3, 4  # arm and tool
