@@ -187,7 +187,7 @@ def test_every_link_and_script_of_the_page_exists(page: Path) -> None:
         targets = [page.parent / target for target in re.findall(r"\]\((?!\w+:)([^)#\s]+)", line)]
         targets += [
             ROOT / script
-            for script in re.findall(r"\b((?:benchmarks|examples|experiments)/[\w/]+\.py)\b", line)
+            for script in re.findall(r"\b((?:benchmarks|examples|experiments|tests)/[\w/]+\.py)\b", line)
             if script != "benchmarks/NAME.py"
         ]
         missing += [f"{page.relative_to(ROOT)}:{number}: {path}" for path in targets if not path.exists()]
