@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.catalog.images import draw_texture, hashed, value_noise
+from openvima.catalog.images import draw_texture, hash_numbers, value_noise
 from openvima.catalog.textures import TEXTURES, texture_spec
 
 DIGESTS = Path(__file__).parents[1] / "golden" / "procedural_textures.json"
@@ -79,7 +79,7 @@ def test_mean_colours_are_near_those_of_the_benchmark(images, catalogue):
 
 
 def test_hashed_numbers_are_spread_evenly_over_the_unit_interval():
-    numbers = hashed(np.arange(200)[:, None], np.arange(200)[None, :], seed=3)
+    numbers = hash_numbers(np.arange(200)[:, None], np.arange(200)[None, :], seed=3)
     assert numbers.min() >= 0 and numbers.max() < 1
     counts, _ = np.histogram(numbers, bins=10, range=(0, 1))
     assert counts == pytest.approx(4000, rel=0.06)

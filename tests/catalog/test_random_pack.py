@@ -8,7 +8,7 @@ from openvima.catalog.outlines import signed_area
 from openvima.catalog.packs import load_assets
 from openvima.catalog.random_pack import (
     RandomAppearanceAssets,
-    darkened_texture,
+    darken_texture,
     has_visible_heading,
     is_random,
     random_name,
@@ -53,9 +53,9 @@ def test_random_textures_are_of_many_kinds_and_colours():
 
 def test_dark_random_textures_are_made_as_those_of_the_catalogue(looks):
     blue = looks.texture("blue")
-    assert np.abs(darkened_texture(blue).astype(int) - looks.texture("dark blue")).max() <= 1
+    assert np.abs(darken_texture(blue).astype(int) - looks.texture("dark blue")).max() <= 1
     light, dark = looks.texture("random texture 7"), looks.texture("dark random texture 7")
-    assert np.array_equal(dark, darkened_texture(light))
+    assert np.array_equal(dark, darken_texture(light))
     assert (dark <= light).all() and (dark < light).any()
 
 

@@ -12,7 +12,7 @@ from openvima import compose, make
 from openvima.catalog import register_object
 from openvima.scene import Action, AtPose, Scene, Tolerance
 from openvima.tasks import register_task, registry, task_spec
-from openvima.tasks.prompts import rewritten
+from openvima.tasks.prompts import rewrite
 from openvima.wrappers import ProgressReward
 from user_shapes import boxes, restored_assets
 
@@ -94,7 +94,7 @@ def test_objects_go_into_a_hollow_with_a_collision_mesh_and_rest_on_a_hull_witho
 def test_a_registered_object_has_its_aliases_in_text_prompts() -> None:
     problem = compose([("test tray", "green", (0.5, 0.2))], "Move the {a}.").problem
     texts = {
-        rewritten(problem.prompt, problem.scene, "text,paraphrased", np.random.default_rng(seed)).text
+        rewrite(problem.prompt, problem.scene, "text,paraphrased", np.random.default_rng(seed)).text
         for seed in range(20)
     }
     assert texts == {"Move the green test tray.", "Move the green salver."}

@@ -17,7 +17,7 @@ from openvima.render.camera import Camera
 from openvima.render.kernels import (
     KernelBuffers,
     draw_triangles,
-    indexed,
+    index_mesh,
     light_intensity,
     matrix_3x4,
     stamp_triangles,
@@ -41,7 +41,7 @@ def draw(bodies: list[Body], camera: Camera) -> tuple[np.ndarray, np.ndarray, np
     rgb, segm = np.full((3, *shape), 255, dtype=np.uint8), np.full(shape, 255, dtype=np.uint8)
     depth, heights = np.full(shape, np.inf), np.full(shape, np.nan, dtype=np.float32)
     for body, pose, object_id, texture in bodies:
-        mesh = indexed(body)
+        mesh = index_mesh(body)
         draw_triangles(
             mesh.vertices,
             mesh.corners,
@@ -74,7 +74,7 @@ def covered(mesh: TriangleMesh, camera: Camera = UNIT) -> set[tuple[int, int]]:
 def stamped(bodies: list[tuple[TriangleMesh, Pose, int]]) -> tuple[np.ndarray, np.ndarray]:
     labels, heights = empty_labels()
     for body, pose, object_id in bodies:
-        mesh = indexed(body)
+        mesh = index_mesh(body)
         half, cell = 0.0015625, 0.003125
         stamp_triangles(
             mesh.vertices,
@@ -122,7 +122,7 @@ def test_a_mesh_with_shared_corners_is_drawn_as_one_without() -> None:
     rng = np.random.default_rng(4)
     many = random_mesh(rng, 300, 0.1)  # below the number from which equal corners are merged
     twice = TriangleMesh(*(np.tile(a, (2, 1, 1)) for a in (many.vertices, many.normals, many.uvs)))
-    assert len(indexed(twice).vertices) < 2 * len(indexed(many).vertices)
+    assert len(index_mesh(twice).vertices) < 2 * len(index_mesh(many).vertices)
     pose = Pose.planar(0.5, 0.0, 0.3)
     for one, other in zip(
         draw([(many, pose, 5, WHITE)], SMALL["top"]),

@@ -23,7 +23,7 @@ from openvima.scene import (
 )
 from openvima.tasks import advance, begin, monitor, oracle_action
 from openvima.tasks.goals import needs_monitoring
-from openvima.tasks.sampling import RenumberedCondition, shuffled_ids
+from openvima.tasks.sampling import RenumberedCondition, shuffle_ids
 
 HEART, STAR = 5, 6
 
@@ -129,7 +129,7 @@ def test_what_cannot_be_tested_is_refused(changes: dict[str, object]) -> None:
 def test_a_goal_follows_its_objects_when_ids_are_permuted() -> None:
     asked = problem(LeftOfWithMove(HEART, STAR), constraints=(Stays(),))
     seeds = (np.random.default_rng(seed) for seed in range(20))
-    swapped = next(p for rng in seeds if (p := shuffled_ids(asked, rng)).scene[STAR].object == "heart")
+    swapped = next(p for rng in seeds if (p := shuffle_ids(asked, rng)).scene[STAR].object == "heart")
     goal, stays = swapped.goals[0], swapped.constraints[0]
     assert goal.object_id == STAR and stays.monitored
     above = swapped.scene.with_poses({STAR: Pose.planar(0.5, 0.1)})

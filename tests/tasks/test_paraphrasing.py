@@ -9,7 +9,7 @@ from openvima.evaluation.ablations import ablate
 from openvima.evaluation.prompt_ablations import held_out_phrasings
 from openvima.scene.prompt import PLACEHOLDER
 from openvima.tasks import sample_episode, task_spec
-from openvima.tasks.prompts import rephrased, training_paraphrases
+from openvima.tasks.prompts import rephrase, training_paraphrases
 
 TASKS = ("visual_manipulation", "rotate", "scene_understanding", "same_shape", "rearrange")
 
@@ -67,7 +67,7 @@ def test_prompts_of_training_tasks_follow_their_template(task):
     prompts = [
         sample_episode(task, level="train", domain="user", seed=seed).problem.prompt for seed in range(4)
     ]
-    said = [rephrased(prompt.text, template, phrasing) for prompt in prompts]
+    said = [rephrase(prompt.text, template, phrasing) for prompt in prompts]
     assert any(said)  # the definitions of novel_noun come in either order, and the template has one
     for prompt, text in zip(prompts, said, strict=True):
         assert text is None or set(PLACEHOLDER.findall(text)) == {name for name, _ in prompt.images}
@@ -75,24 +75,24 @@ def test_prompts_of_training_tasks_follow_their_template(task):
 
 def test_a_slot_that_occurs_twice_has_one_value_and_an_adverb_may_be_empty():
     template = "This is a {n} {a}. Put the {adv}{n} {a} here."
-    assert rephrased("This is a wug {a}. Put the wug {a} here.", template, "{adv}|{n}") == "|wug"
-    assert rephrased("This is a wug {a}. Put the less wug {a} here.", template, "{adv}|{n}") == "less |wug"
-    assert rephrased("This is a wug {a}. Put the dax {a} here.", template, "{n}") is None
+    assert rephrase("This is a wug {a}. Put the wug {a} here.", template, "{adv}|{n}") == "|wug"
+    assert rephrase("This is a wug {a}. Put the less wug {a} here.", template, "{adv}|{n}") == "less |wug"
+    assert rephrase("This is a wug {a}. Put the dax {a} here.", template, "{n}") is None
 
 
 def test_text_of_another_form_has_no_phrasing():
-    assert rephrased("Spin it.", "Rotate the {x} {n} degrees.", "Turn the {x} by {n}.") is None
+    assert rephrase("Spin it.", "Rotate the {x} {n} degrees.", "Turn the {x} by {n}.") is None
 
 
 def test_values_stay_where_a_phrasing_orders_slots_anew():
-    text = rephrased(
+    text = rephrase(
         "Put the red bowl into the {b}.", "Put the {x} into the {y}.", "Into the {y} goes the {x}."
     )
     assert text == "Into the {b} goes the red bowl."
 
 
 def test_a_description_of_several_words_is_one_value():
-    text = rephrased(
+    text = rephrase(
         "Rotate the red letter A 30 degrees.", "Rotate the {x} {n} degrees.", "By {n} degrees, turn the {x}."
     )
     assert text == "By 30 degrees, turn the red letter A."

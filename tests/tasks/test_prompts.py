@@ -18,7 +18,7 @@ from openvima.scene import (
     Scene,
 )
 from openvima.tasks import list_tasks, make_rng, sample_episode, task_spec
-from openvima.tasks.prompts import PROMPTS, described, rewritten
+from openvima.tasks.prompts import PROMPTS, describe, rewrite
 from openvima.tasks.sampling import has_text_form
 from prompts import is_understood
 
@@ -76,7 +76,7 @@ def test_mixed_prompts_describe_half_of_the_images_and_synonyms_choose_the_same(
 def test_synonyms_are_used_about_half_of_the_time() -> None:
     prompt = prompt_of("Put the {a} away.", a="block")
     words = Counter(
-        rewritten(prompt, Scene(()), "text,paraphrased", make_rng("user", "t", "train", seed, "prompt")).text
+        rewrite(prompt, Scene(()), "text,paraphrased", make_rng("user", "t", "train", seed, "prompt")).text
         for seed in range(60)
     )
     assert set(words) == {"Put the red block away.", "Put the red cube away."}
@@ -95,7 +95,7 @@ def prompt_of(text: str, **images: str) -> Prompt:
 
 
 def text_of(prompt: Prompt) -> str:
-    return rewritten(prompt, Scene(()), "text", make_rng("user", "t", "train", 0, "prompt")).text
+    return rewrite(prompt, Scene(()), "text", make_rng("user", "t", "train", 0, "prompt")).text
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_words_that_fit_another_object_on_the_table_are_ambiguous() -> None:
 
     def is_ambiguous(other: Placement, prompts: str = "text") -> bool:
         results = [
-            rewritten(
+            rewrite(
                 prompt, Scene((image.placement, other)), prompts, make_rng("user", "t", "L1", n, "prompt")
             )
             for n in range(10)
@@ -163,13 +163,13 @@ def test_rendered_prompts_are_described_alike() -> None:
     heart, bowl = ObjectRecord(2, "heart", "red"), ObjectRecord(2, "own shape", "blue")
     images = {"a": image("a", heart), "b": image("b", bowl), "c": image("c", heart, bowl)}
     prompt = RenderedPrompt("Put the {a} into {b} as in {c}.", images)
-    told = described(prompt, "text")
+    told = describe(prompt, "text")
     assert told.text == "Put the red heart into the blue own shape as in {c}."
     assert set(told.images) == {"c"}
-    assert described(prompt, "multimodal") is prompt
-    assert described(prompt, "mixed").text == described(prompt, "mixed").text
+    assert describe(prompt, "multimodal") is prompt
+    assert describe(prompt, "mixed").text == describe(prompt, "mixed").text
     with pytest.raises(PromptError, match="image a has names of over 200"):
-        described(RenderedPrompt("{a}", {"a": image("a", ObjectRecord(2, "x" * 300, "red"))}), "text")
+        describe(RenderedPrompt("{a}", {"a": image("a", ObjectRecord(2, "x" * 300, "red"))}), "text")
 
 
 @pytest.mark.parametrize("task", WITH_TEXT)

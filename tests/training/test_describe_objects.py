@@ -16,7 +16,7 @@ from openvima.perception.preprocessing import split_prompt  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
 from openvima.scene import ObjectRecord  # noqa: E402
-from openvima.tasks.prompts import described, description_of, image_descriptions, synonyms  # noqa: E402
+from openvima.tasks.prompts import describe, description_of, image_descriptions, synonyms  # noqa: E402
 from openvima.training import source as source_module  # noqa: E402
 from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
 from openvima.training.augmentation.prompts import (  # noqa: E402
@@ -56,7 +56,7 @@ def demos() -> dict[str, Demonstration]:
 def test_all_object_images_become_the_text_of_text_prompts(demos, task, kind) -> None:
     episode = preprocess(demos[task], kind)
     changed = with_descriptions(episode, 1.0, np.random.default_rng(0))
-    text = described(demos[task].prompt, "text")
+    text = describe(demos[task].prompt, "text")
     assert changed.prompt.text == text.text
     assert changed.prompt.image_names == tuple(text.images)
     assert all(changed.prompt.is_scene) and len(changed.prompt.is_scene) == len(text.images)

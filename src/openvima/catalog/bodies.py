@@ -19,7 +19,7 @@ from openvima.catalog.geometry import (
     TriangleMesh,
     Vector3,
 )
-from openvima.catalog.meshes import combined, draped, prism, revolved, scaled_geometry, sheared_up, slab_hull
+from openvima.catalog.meshes import combine, drape, prism, revolve, scale_geometry, sheared_up, slab_hull
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.catalog.outlines import arc, outline, rectangle, regular_polygon, signed_area
 from openvima.errors import AssetError
@@ -190,10 +190,10 @@ def bowl_mesh() -> TriangleMesh:
     inside = [radius for radius, _ in _BOWL_WALL[5:]]
     wall_radii = [_BOWL_TEXTURE_PER_M * distance for distance in (*outside, *inside)]
     bottom_radii = [_BOWL_TEXTURE_PER_M * radius for radius, _ in _BOWL_BOTTOM]
-    return combined(
+    return combine(
         [
-            revolved(_BOWL_BOTTOM, _BOWL_SIDES, texture_radii=bottom_radii),
-            revolved(_BOWL_WALL, _BOWL_SIDES, texture_radii=wall_radii),
+            revolve(_BOWL_BOTTOM, _BOWL_SIDES, texture_radii=bottom_radii),
+            revolve(_BOWL_WALL, _BOWL_SIDES, texture_radii=wall_radii),
         ]
     )
 
@@ -231,10 +231,10 @@ def pan_mesh() -> TriangleMesh:
     bottom_radii = [_PAN_TEXTURE_PER_M * radius for radius, _ in _PAN_BOTTOM]
     (x_low, z_low), (x_high, z_high) = _PAN_HANDLE_LOW, _PAN_HANDLE_HIGH
     plate = prism(_handle_loops(), z_low - _PAN_HANDLE_THICKNESS, z_low, texture_per_m=_PAN_TEXTURE_PER_M)
-    return combined(
+    return combine(
         [
-            revolved(_PAN_BOTTOM, _PAN_SIDES, texture_radii=bottom_radii),
-            revolved(_PAN_DISH, _PAN_SIDES, texture_radii=dish_radii),
+            revolve(_PAN_BOTTOM, _PAN_SIDES, texture_radii=bottom_radii),
+            revolve(_PAN_DISH, _PAN_SIDES, texture_radii=dish_radii),
             sheared_up(plate, (z_high - z_low) / (x_high - x_low), x_low),
         ]
     )
@@ -272,7 +272,7 @@ def hanoi_stand(rod_low_z: float = -_PLATE_THICKNESS_M / 2) -> Geometry:
     half, middles = _PLATE_THICKNESS_M / 2, (-_PLATE_M, 0.0, _PLATE_M)
     plates = [Box((_PLATE_M, _PLATE_M, _PLATE_THICKNESS_M), (0.0, y, 0.0)) for y in middles]
     rod = _rod(rod_low_z, _ROD_TOP_Z)
-    visual = combined([draped(box_mesh(plates)), *(_moved(rod, (0.0, y, 0.0)) for y in middles)])
+    visual = combine([drape(box_mesh(plates)), *(_move(rod, (0.0, y, 0.0)) for y in middles)])
     plate = np.array(rectangle((0.0, 0.0), (_PLATE_M / 2, _PLATE_M / 2)))
     circle = np.array(regular_polygon(_ROD_SIDES, _ROD_RADIUS_M))
     hulls = [slab_hull(plate + np.array((0.0, y)), -half, half) for y in middles]
@@ -303,15 +303,15 @@ def _rod(low: float, high: float) -> TriangleMesh:
     radius = _ROD_RADIUS_M
     sides = ((0.0, low), (radius, low)), ((radius, low), (radius, high)), ((radius, high), (0.0, high))
     distances = (0.0, radius), (radius + high - max(low, 0.0), radius), (radius, 0.0)
-    return combined(
+    return combine(
         [
-            revolved(side, _ROD_SIDES, texture_radii=[_ROD_TEXTURE_PER_M * d for d in distance])
+            revolve(side, _ROD_SIDES, texture_radii=[_ROD_TEXTURE_PER_M * d for d in distance])
             for side, distance in zip(sides, distances, strict=True)
         ]
     )
 
 
-def _moved(mesh: TriangleMesh, offset: Vector3) -> TriangleMesh:
+def _move(mesh: TriangleMesh, offset: Vector3) -> TriangleMesh:
     return TriangleMesh(mesh.vertices + np.array(offset), mesh.normals, mesh.uvs)
 
 
@@ -332,9 +332,9 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
     if not all(factor > 0 for factor in scale):
         raise AssetError(f"scale of {object_name} is {scale}; all three factors must be above 0.")
     if spec.kind == "kit":
-        return scaled_geometry(_kit(spec), scale)
+        return scale_geometry(_kit(spec), scale)
     if object_name in _FIXED_SIZE:
-        return scaled_geometry(_FIXED_SIZE[object_name](), scale)
+        return scale_geometry(_FIXED_SIZE[object_name](), scale)
     build, needed_lengths = BOX_SHAPES[object_name]
     product = (size[0] * scale[0], size[1] * scale[1], size[2] * scale[2])
     if not all(length > 0 for length in product[:needed_lengths]):
@@ -342,7 +342,7 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
             f"size of {object_name} is {product} m; its first {needed_lengths} lengths must be above 0."
         )
     geometry = build(product)
-    return replace(geometry, visual=draped(geometry.visual))
+    return replace(geometry, visual=drape(geometry.visual))
 
 
 def has_fixed_size(object_name: str) -> bool:
@@ -379,7 +379,7 @@ def _pallet() -> Geometry:
     parts += [Box((length, 0.007, height - 2 * thickness), (0.0, y, 0.0)) for y in (-0.084, 0.0, 0.084)]
     plan = np.array(rectangle((0.0, 0.0), (length / 2, width / 2)))
     hull = slab_hull(plan, -height / 2, height / 2)
-    return Geometry(draped(box_mesh(parts)), (hull,), rest_z_m=height / 2)
+    return Geometry(drape(box_mesh(parts)), (hull,), rest_z_m=height / 2)
 
 
 def _bowl() -> Geometry:

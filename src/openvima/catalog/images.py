@@ -13,7 +13,7 @@ import numpy as np
 from openvima.catalog.textures import TextureSpec, texture_spec
 
 
-def hashed(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
+def hash_numbers(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
     """Return a number in [0, 1) for each combination of whole numbers.
 
     Args:
@@ -28,11 +28,11 @@ def hashed(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
     state = np.asarray(seed, dtype=np.uint64)
     with np.errstate(over="ignore"):  # overflow is intended
         for coordinate in coordinates:
-            state = _mixed(state * np.uint64(31) + np.asarray(coordinate).astype(np.uint64) + np.uint64(1))
+            state = _mix_bits(state * np.uint64(31) + np.asarray(coordinate).astype(np.uint64) + np.uint64(1))
     return (state >> np.uint64(32)).astype(np.float64) / 2.0**32
 
 
-def _mixed(state: np.ndarray) -> np.ndarray:
+def _mix_bits(state: np.ndarray) -> np.ndarray:
     state = state * np.uint64(0x9E3779B97F4A7C15)
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -53,7 +53,7 @@ def value_noise(shape: tuple[int, int], cells: tuple[int, int], seed: int) -> np
 
     def lattice(row_shift: int, column_shift: int) -> np.ndarray:
         row, column = (top + row_shift) % cells[0], (left + column_shift) % cells[1]
-        return hashed(row[:, None], column[None, :], seed=seed)
+        return hash_numbers(row[:, None], column[None, :], seed=seed)
 
     above = lattice(0, 0) * (1 - right) + lattice(0, 1) * right
     below = lattice(1, 0) * (1 - right) + lattice(1, 1) * right
@@ -147,7 +147,7 @@ def checkerboard() -> np.ndarray:
     row, column = np.indices((side, side))
     light = (row // square + column // square) % 2 == 0
     veins = np.abs(layered_noise((side, side), (6, 6), seed=71, num_layers=3) - 0.5)
-    change = np.where(veins < 0.02, -16, 0) + (12 * hashed(row, column, seed=72)).astype(np.int64) - 5
+    change = np.where(veins < 0.02, -16, 0) + (12 * hash_numbers(row, column, seed=72)).astype(np.int64) - 5
     base = np.where(light[..., None], (192, 186, 170), (76, 76, 71))
     return np.clip(base + change[..., None], 0, 255).astype(np.uint8)
 
@@ -181,7 +181,7 @@ def _paint_drop(canvas: np.ndarray, index: int) -> None:
     """Paint one drop, in a jittered cell of a square grid whose rows are shifted alternately."""
     cell = _PAISLEY_PX * 16 // _PAISLEY_GRID  # in sixteenths of a pixel, like all lengths here
     row, column = divmod(index, _PAISLEY_GRID)
-    dice = [float(hashed(index, k, seed=80)) for k in range(5)]
+    dice = [float(hash_numbers(index, k, seed=80)) for k in range(5)]
     x = column * cell + int((0.5 + 0.3 * (dice[0] - 0.5)) * cell) + (cell // 2 if row % 2 else 0)
     y = row * cell + int((0.5 + 0.3 * (dice[1] - 0.5)) * cell)
     heading, bend = int(16 * dice[2]), 1 if dice[3] < 0.5 else -1
@@ -206,7 +206,7 @@ def _paint_tapered(
 
 def _paint_filler(canvas: np.ndarray, index: int) -> None:
     """Paint a flower, a small drop or a dot where there is still room for it."""
-    x, y, kind, turn = (float(hashed(index, k, seed=81)) for k in range(4))
+    x, y, kind, turn = (float(hash_numbers(index, k, seed=81)) for k in range(4))
     centre = (int(x * _PAISLEY_PX) * 16 + 8, int(y * _PAISLEY_PX) * 16 + 8)
     reach = 160 if index < 300 else 110 if index < 700 else 54
     rows, columns, inside = _disc(centre, reach)
@@ -248,9 +248,9 @@ def brick() -> np.ndarray:
     course = row // course_px
     along = (column + course % 2 * (brick_px // 2)) % (7 * brick_px)
     mortar = (row % course_px < mortar_px) | (along % brick_px < mortar_px)
-    shade = hashed(course, along // brick_px, seed=11)
+    shade = hash_numbers(course, along // brick_px, seed=11)
     bricks = _blend((190, 121, 103), (174, 106, 88), shade)
-    grain = 14 * hashed(row, column, seed=12) - 7
+    grain = 14 * hash_numbers(row, column, seed=12) - 7
     return _to_image(np.where(mortar[..., None], (187, 152, 135), bricks) + grain[..., None])
 
 
@@ -266,8 +266,8 @@ def tiles() -> np.ndarray:
     # A disc that is taller than its row is cut off at the border, as tiles that touch are.
     inside = dx * dx + dy * dy < radius * radius
     palette = np.array([(174, 183, 172), (125, 142, 150), (165, 138, 130)])
-    colour = palette[(3 * hashed(band, tile, seed=21)).astype(np.int64)]
-    tone = 20 * hashed(band, tile, seed=22) - 10 + 8 * hashed(row, column, seed=23) - 4
+    colour = palette[(3 * hash_numbers(band, tile, seed=21)).astype(np.int64)]
+    tone = 20 * hash_numbers(band, tile, seed=22) - 10 + 8 * hash_numbers(row, column, seed=23) - 4
     return _to_image(np.where(inside[..., None], colour + tone[..., None], (72, 67, 61)))
 
 
@@ -276,10 +276,10 @@ def wooden() -> np.ndarray:
     strip_px, board_px = 8, 128
     row, column = np.indices((_SIDE_PX, _SIDE_PX))
     strip = column // strip_px
-    offset = (board_px * hashed(strip, seed=31)).astype(np.int64)
+    offset = (board_px * hash_numbers(strip, seed=31)).astype(np.int64)
     board = (row + offset) // board_px
-    tone = _blend((203, 155, 103), (231, 194, 150), hashed(strip, board, seed=32))
-    fibres = hashed(column, board, seed=33) + value_noise((_SIDE_PX, _SIDE_PX), (8, 128), seed=34) - 1
+    tone = _blend((203, 155, 103), (231, 194, 150), hash_numbers(strip, board, seed=32))
+    fibres = hash_numbers(column, board, seed=33) + value_noise((_SIDE_PX, _SIDE_PX), (8, 128), seed=34) - 1
     joint = (column % strip_px == 0) | ((row + offset) % board_px < 1)
     return _to_image(tone + 14 * fibres[..., None] - np.where(joint, 16, 0)[..., None])
 
@@ -299,7 +299,7 @@ def granite() -> np.ndarray:
         specks = layered_noise(shape, cells, seed=seed, num_layers=2) + 0.25 * cloud
         weight = strength * np.clip((specks - start) / fade, 0, 1)
         stone += (np.array(colour, dtype=np.float64) - stone) * weight[..., None]
-    return _to_image(stone + 12 * hashed(*np.indices(shape), seed=44)[..., None] - 6)
+    return _to_image(stone + 12 * hash_numbers(*np.indices(shape), seed=44)[..., None] - 6)
 
 
 def plastic() -> np.ndarray:
@@ -308,7 +308,7 @@ def plastic() -> np.ndarray:
     x, y = column / _SIDE_PX, row / _SIDE_PX
     tone = np.zeros((_SIDE_PX, _SIDE_PX))
     for i in range(90):
-        px, py, dx, dy, length = (float(hashed(i, k, seed=51)) for k in range(5))
+        px, py, dx, dy, length = (float(hash_numbers(i, k, seed=51)) for k in range(5))
         dx, dy = dx - 0.5, dy - 0.5
         norm = max(abs(dx), abs(dy), 0.05)
         along = ((x - px) * dx + (y - py) * dy) / norm

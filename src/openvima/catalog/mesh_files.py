@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
-from openvima.catalog.meshes import TEXTURE_PER_M, scaled
+from openvima.catalog.meshes import TEXTURE_PER_M, scale_mesh
 from openvima.errors import AssetError, InputFileError, ShapeError
 from openvima.input_files import as_path
 
@@ -159,7 +159,7 @@ class UserMesh:
     def geometry(self, lengths: Vector3) -> Geometry:
         """Return the shape with sides of some lengths, in metres; the origin is the middle of the box."""
         x, y, z = (length / extent for length, extent in zip(lengths, self.extents, strict=True))
-        visual = _textured(scaled(self.visual, (x, y, z)))
+        visual = _drape(scale_mesh(self.visual, (x, y, z)))
         hulls = tuple(CollisionHull(points * (x, y, z)) for points in self.parts)
         return Geometry(visual, hulls, lengths[2] / 2)
 
@@ -181,7 +181,7 @@ def read_mesh(
         AssetError: The mesh cannot be read, or is empty, too large, not finite, flat or open.
     """
     drawn = _read(mesh, what)
-    vertices = _oriented(drawn.vertices, double_sided=double_sided, what=what)
+    vertices = _orient(drawn.vertices, double_sided=double_sided, what=what)
     normals, uvs = drawn.normals, drawn.uvs
     if vertices is not drawn.vertices:  # turned inside out
         normals, uvs = -normals[:, ::-1], uvs[:, ::-1]
@@ -309,7 +309,7 @@ def _parts(mesh: ObjMesh) -> list[np.ndarray]:
     return [mesh.vertices[mesh.parts == part].reshape(-1, 3) for part in np.unique(mesh.parts)]
 
 
-def _oriented(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarray:
+def _orient(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarray:
     """Return the triangles facing outwards; the array itself where they do already.
 
     In a closed mesh each edge, from start to end, has its reverse in a neighbour. Six times its volume is a
@@ -361,7 +361,7 @@ def _extreme_points(points: np.ndarray) -> np.ndarray:
     return points[sorted(farthest)]
 
 
-def _textured(mesh: TriangleMesh) -> TriangleMesh:
+def _drape(mesh: TriangleMesh) -> TriangleMesh:
     """Drape the texture over a mesh from above, unless it has texture coordinates."""
     if mesh.uvs.any():
         return mesh

@@ -40,10 +40,10 @@ def prism(
         ),
     ]
     faces += [_side_walls(loop, z_low, z_high, texture_per_m) for loop in loops]
-    return combined(faces)
+    return combine(faces)
 
 
-def revolved(
+def revolve(
     profile: Sequence[tuple[float, float]], num_sides: int, *, texture_radii: Sequence[float]
 ) -> TriangleMesh:
     """Turn a profile about the z axis, with normals that blend smoothly along and around it.
@@ -65,10 +65,10 @@ def revolved(
         ring = np.stack([points[i], points[i + 1]])
         radii = np.array(texture_radii[i : i + 2], dtype=np.float64)
         parts.append(_revolved_ring(ring, np.stack([start, end]), radii, num_sides))
-    return combined(parts)
+    return combine(parts)
 
 
-def combined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+def combine(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     """Put several meshes together, in order."""
     return TriangleMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -77,7 +77,7 @@ def combined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     )
 
 
-def scaled(mesh: TriangleMesh, scale: Vector3) -> TriangleMesh:
+def scale_mesh(mesh: TriangleMesh, scale: Vector3) -> TriangleMesh:
     """Stretch a mesh along the axes; its texture stretches with it."""
     if scale == (1.0, 1.0, 1.0):
         return mesh
@@ -87,7 +87,7 @@ def scaled(mesh: TriangleMesh, scale: Vector3) -> TriangleMesh:
     return TriangleMesh(mesh.vertices * factors, normals, mesh.uvs)
 
 
-def scaled_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
+def scale_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
     """Stretch a shape along the axes: what is drawn, its hulls and the height at which it rests."""
     if scale == (1.0, 1.0, 1.0):
         return geometry
@@ -96,7 +96,7 @@ def scaled_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
         for shape in geometry.collision
         if isinstance(shape, CollisionHull)
     )
-    return Geometry(scaled(geometry.visual, scale), hulls, geometry.rest_z_m * scale[2])
+    return Geometry(scale_mesh(geometry.visual, scale), hulls, geometry.rest_z_m * scale[2])
 
 
 def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
@@ -109,7 +109,7 @@ def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
     return TriangleMesh(vertices, normals, mesh.uvs)
 
 
-def draped(mesh: TriangleMesh) -> TriangleMesh:
+def drape(mesh: TriangleMesh) -> TriangleMesh:
     """Drape one texture over a group of boxes from above, finer on small ones, within its borders.
 
     Args:
@@ -222,4 +222,4 @@ def _revolved_ring(
         faces.append((corner(0, 0), corner(0, 1), corner(1, 1)))
     if ring[1, 0] > 0:
         faces.append((corner(0, 0), corner(1, 1), corner(1, 0)))
-    return combined([TriangleMesh(*(np.stack(part, axis=1) for part in zip(*f, strict=True))) for f in faces])
+    return combine([TriangleMesh(*(np.stack(part, axis=1) for part in zip(*f, strict=True))) for f in faces])

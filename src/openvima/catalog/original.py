@@ -21,7 +21,7 @@ from openvima.atomic_io import atomic_write
 from openvima.catalog.bodies import BOX_SHAPES, LONG_RODS_Z, hanoi_stand
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
 from openvima.catalog.mesh_files import ObjMesh, parse_obj
-from openvima.catalog.meshes import scaled_geometry
+from openvima.catalog.meshes import scale_geometry
 from openvima.catalog.objects import REGISTERED_OBJECTS, ObjectSpec, object_spec
 from openvima.catalog.procedural import cached_array
 from openvima.catalog.registration import registered_geometry, registered_texture
@@ -371,7 +371,7 @@ def _geometry(files: PackFiles, spec: ObjectSpec, size: Vector3, scale: Vector3)
     if spec.kind == "kit":
         return _kit(files, spec, scale)
     if spec.name == "stand":  # which has no mesh file
-        return scaled_geometry(hanoi_stand(LONG_RODS_Z), scale)
+        return scale_geometry(hanoi_stand(LONG_RODS_Z), scale)
     return _fixed_mesh(files, spec.name, scale)
 
 
@@ -379,13 +379,13 @@ def _kit(files: PackFiles, spec: ObjectSpec, scale: Vector3) -> Geometry:
     kit_scale = spec.kit_scale or 1.0
     metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
     name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
-    visual = _scaled(_mesh(files, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
+    visual = _scale(_mesh(files, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
     return Geometry(visual, (_hull(visual.vertices),), 0.0)
 
 
 def _fixed_mesh(files: PackFiles, object_name: str, scale: Vector3) -> Geometry:
     file, metres, rest_z_m = _FIXED_MESHES[object_name]
-    visual = _scaled(_mesh(files, file), _product(metres, scale))
+    visual = _scale(_mesh(files, file), _product(metres, scale))
     collision = (_hull(visual.vertices),)
     if object_name == "bowl":
         parts_file, parts_metres = _BOWL_PARTS
@@ -395,7 +395,7 @@ def _fixed_mesh(files: PackFiles, object_name: str, scale: Vector3) -> Geometry:
     return Geometry(visual, collision, rest_z_m * scale[2])
 
 
-def _scaled(mesh: ObjMesh, metres: Vector3) -> TriangleMesh:
+def _scale(mesh: ObjMesh, metres: Vector3) -> TriangleMesh:
     """Scale positions only: the benchmark lights every mesh with the normals of its file."""
     return TriangleMesh(mesh.vertices * np.array(metres), mesh.normals, mesh.uvs)
 
@@ -434,14 +434,14 @@ def _protected_texture(files: PackFiles, texture_name: str) -> np.ndarray:
 
 def _image(files: PackFiles, relative_path: str) -> np.ndarray:
     content = files.read(relative_path)
-    return cached_array(_IMAGE_GROUP, _cache_key(relative_path), lambda: _decoded(content, relative_path))
+    return cached_array(_IMAGE_GROUP, _cache_key(relative_path), lambda: _decode(content, relative_path))
 
 
 def _cache_key(relative_path: str) -> str:
     return known_hashes()[relative_path][:32]
 
 
-def _decoded(content: bytes, relative_path: str) -> np.ndarray:
+def _decode(content: bytes, relative_path: str) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     try:

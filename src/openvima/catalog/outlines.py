@@ -175,7 +175,7 @@ def arc(
     return [(centre[0] + radii[0] * math.cos(a), centre[1] + radii[1] * math.sin(a)) for a in angles]
 
 
-def _mirrored(right_half: Sequence[tuple[float, float]]) -> Loop:
+def _mirror(right_half: Sequence[tuple[float, float]]) -> Loop:
     """Close a right half, listed from bottom to top, by its mirror image; points on the axis stay single."""
     return [*right_half, *[(-x, y) for x, y in reversed(right_half) if x != 0]]
 
@@ -191,7 +191,7 @@ def _letter_a() -> list[Loop]:
     notch = [(inner(bar_low), bar_low), (x - leg, -y)]
     top = (x - leg) / slope - y
     return [
-        _mirrored([*notch, (x, -y), (apex, y)]),
+        _mirror([*notch, (x, -y), (apex, y)]),
         [(inner(bar_high), bar_high), (0.0, top), (-inner(bar_high), bar_high)],
     ]
 
@@ -250,7 +250,7 @@ def _letter_m() -> list[Loop]:
         (x - shoulder, y),
         (0.0, notch),
     ]
-    return [_mirrored(right)]
+    return [_mirror(right)]
 
 
 def _letter_r() -> list[Loop]:
@@ -279,13 +279,13 @@ def _letter_r() -> list[Loop]:
 def _letter_t() -> list[Loop]:
     half, width = 0.054, 0.0324
     bar = half - width
-    return [_mirrored([(width / 2, -half), (width / 2, bar), (half, bar), (half, half)])]
+    return [_mirror([(width / 2, -half), (width / 2, bar), (half, bar), (half, half)])]
 
 
 def _letter_v() -> list[Loop]:
     x, y, foot, leg = 0.04226, 0.05107, 0.0078, 0.0218
     slope = (x - foot) / (2 * y)
-    return [_mirrored([(foot, -y), (x, y), (x - leg, y), (0.0, y - (x - leg) / slope)])]
+    return [_mirror([(foot, -y), (x, y), (x - leg, y), (0.0, y - (x - leg) / slope)])]
 
 
 def _cross() -> list[Loop]:
@@ -331,7 +331,7 @@ def _heart() -> list[Loop]:
     notch_deg = math.degrees(math.acos(-centre[0] / radius))
     lobe = arc(centre, (radius, radius), (0, notch_deg), 13)
     lobe[-1] = (0.0, lobe[-1][1])
-    return [_mirrored([*flank, *lobe])]
+    return [_mirror([*flank, *lobe])]
 
 
 def _l_shaped_block() -> list[Loop]:

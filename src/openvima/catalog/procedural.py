@@ -79,7 +79,7 @@ class ProceduralAssets:
 
     def __init__(self) -> None:
         self._textures: dict[str, np.ndarray] = {}
-        self._build = lru_cache(maxsize=_GEOMETRIES_KEPT)(_built)
+        self._build = lru_cache(maxsize=_GEOMETRIES_KEPT)(_build_protected)
 
     def __reduce__(self) -> tuple[Callable[[], "ProceduralAssets"], tuple[()]]:
         return procedural_assets, ()
@@ -109,7 +109,7 @@ def procedural_assets() -> ProceduralAssets:
     return ProceduralAssets()
 
 
-def _built(object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+def _build_protected(object_name: str, size: Vector3, scale: Vector3) -> Geometry:
     return protect(build_geometry(object_name, size, scale))
 
 

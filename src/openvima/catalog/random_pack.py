@@ -12,7 +12,7 @@ import numpy as np
 
 from openvima.catalog.geometry import Assets, Geometry, Vector3, protect
 from openvima.catalog.images import layered_noise, value_noise
-from openvima.catalog.meshes import scaled_geometry
+from openvima.catalog.meshes import scale_geometry
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
 from openvima.catalog.random_shapes import (
     has_heading,
@@ -50,16 +50,14 @@ def random_texture(rng: np.random.Generator) -> np.ndarray:
         return _random_colour(rng).astype(np.uint8).reshape(1, 1, 3)
     colours = _contrasting_colours(rng, count=int(rng.integers(2, 4)))
     field = _FAMILIES[int(rng.integers(len(_FAMILIES)))](rng)
-    image = (
-        _blended(field, colours) if rng.random() < 0.25 else colours[field.astype(np.int64) % len(colours)]
-    )
+    image = _blend(field, colours) if rng.random() < 0.25 else colours[field.astype(np.int64) % len(colours)]
     if rng.random() < 0.3:
         grain = value_noise((_SIDE_PX, _SIDE_PX), (64, 64), _seed(rng)) - 0.5
         image = image + rng.uniform(5, 25) * grain[..., None]
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def darkened_texture(texture: np.ndarray) -> np.ndarray:
+def darken_texture(texture: np.ndarray) -> np.ndarray:
     """Lower the HSV value of each pixel by 0.3, not below 0, as the dark textures of the catalogue are made.
 
     Args:
@@ -86,7 +84,7 @@ def _contrasting_colours(rng: np.random.Generator, *, count: int) -> np.ndarray:
     return np.array(colours)
 
 
-def _blended(field: _Field, colours: np.ndarray) -> np.ndarray:
+def _blend(field: _Field, colours: np.ndarray) -> np.ndarray:
     """Go from colour to colour without a border, shape (S, S, 3)."""
     first = np.floor(field).astype(np.int64)
     weight = (field - first)[..., None]
@@ -190,9 +188,9 @@ class RandomAppearanceAssets:
 
     def __init__(self, base: Assets, num_kept: int = _KEPT) -> None:
         self.base = base
-        self._plain_shape = lru_cache(num_kept)(_drawn_shape)
-        self._shape = lru_cache(_KEPT)(self._stretched)
-        self._texture = lru_cache(num_kept)(_drawn_texture)
+        self._plain_shape = lru_cache(num_kept)(_draw_shape)
+        self._shape = lru_cache(_KEPT)(self._stretch)
+        self._texture = lru_cache(num_kept)(_draw_texture)
 
     @property
     def name(self) -> str:
@@ -209,8 +207,8 @@ class RandomAppearanceAssets:
         """Return a texture's image; see `Assets.texture`."""
         return self._texture(texture_name) if is_random(texture_name) else self.base.texture(texture_name)
 
-    def _stretched(self, name: str, scale: Vector3) -> Geometry:
-        return protect(scaled_geometry(self._plain_shape(name), scale))
+    def _stretch(self, name: str, scale: Vector3) -> Geometry:
+        return protect(scale_geometry(self._plain_shape(name), scale))
 
 
 def random_name(kind: str, rng: np.random.Generator, pool: range = range(_NUM_SEEDS)) -> str:
@@ -244,14 +242,14 @@ def _read(name: str) -> tuple[str, np.random.Generator]:
     return match[2], np.random.default_rng(int(match[3]))
 
 
-def _drawn_shape(name: str) -> Geometry:
+def _draw_shape(name: str) -> Geometry:
     kind, rng = _read(name)
     return protect(_SHAPES[kind](rng))
 
 
-def _drawn_texture(name: str) -> np.ndarray:
+def _draw_texture(name: str) -> np.ndarray:
     _, rng = _read(name)
     image = random_texture(rng)
-    image = darkened_texture(image) if name.startswith("dark ") else image
+    image = darken_texture(image) if name.startswith("dark ") else image
     image.setflags(write=False)
     return image

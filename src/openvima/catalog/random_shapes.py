@@ -6,7 +6,7 @@ import numpy as np
 
 from openvima.catalog import bodies
 from openvima.catalog.geometry import Geometry
-from openvima.catalog.meshes import combined, draped, prism, revolved
+from openvima.catalog.meshes import combine, drape, prism, revolve
 from openvima.catalog.outlines import rectangle, signed_area
 
 _WIDTHS_M = (0.07, 0.125)  # smallest and largest extent of an outline, much as of the kit objects
@@ -71,7 +71,7 @@ def random_grating(rng: np.random.Generator) -> Geometry:
             for x in _spread(length, beam_width, num_slats)
             for y in (-width / 2, width / 2)
         ]
-    return Geometry(draped(bodies.box_mesh(parts)), (), 0.0)
+    return Geometry(drape(bodies.box_mesh(parts)), (), 0.0)
 
 
 def random_eared_container(rng: np.random.Generator) -> Geometry:
@@ -87,7 +87,7 @@ def random_eared_container(rng: np.random.Generator) -> Geometry:
         centre[axis] = rim + sign * (length / 2 - 0.004)
         outline = np.array(rectangle((float(centre[0]), float(centre[1])), (float(half[0]), float(half[1]))))
         ears.append(prism([outline], top - min(height, np.ptp(points[:, 2])), top, texture_per_m=2.9))
-    return Geometry(combined([body.visual, *ears]), (), body.rest_z_m)
+    return Geometry(combine([body.visual, *ears]), (), body.rest_z_m)
 
 
 def random_square_container(rng: np.random.Generator) -> Geometry:
@@ -207,7 +207,7 @@ def _strokes(rng: np.random.Generator) -> list[np.ndarray]:
             break
     loops = _borders(cells)
     if rng.random() < 0.5:
-        loops = [_rounded(_rounded(loop)) for loop in loops]
+        loops = [_round_corners(_round_corners(loop)) for loop in loops]
     slant, taper = rng.uniform(-0.35, 0.35), rng.uniform(-0.12, 0.12)
     stretch = rng.uniform(0.7, 1.4)
 
@@ -238,7 +238,7 @@ def _is_straight(cells: set[Cell]) -> bool:
     return min(len({cell[axis] for cell in cells}) for axis in (0, 1)) < 2
 
 
-def _rounded(loop: np.ndarray) -> np.ndarray:
+def _round_corners(loop: np.ndarray) -> np.ndarray:
     """Cut every corner at a quarter of its sides.
 
     Source: Chaikin, "An algorithm for high speed curve generation" (1974).
@@ -283,7 +283,7 @@ def _borders(cells: set[Cell]) -> list[np.ndarray]:
 def _open_box(rng: np.random.Generator) -> Geometry:
     x, y = rng.uniform(0.12, 0.2, 2)
     geometry = bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07))))
-    return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
+    return Geometry(drape(geometry.visual), (), geometry.rest_z_m)
 
 
 def _spread(length: float, part: float, count: int) -> list[float]:
@@ -293,7 +293,7 @@ def _spread(length: float, part: float, count: int) -> list[float]:
 
 def _flat_square(rng: np.random.Generator) -> Geometry:
     geometry = bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001))
-    return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
+    return Geometry(drape(geometry.visual), (), geometry.rest_z_m)
 
 
 def _frame(rng: np.random.Generator) -> Geometry:
@@ -323,7 +323,7 @@ def _bowl(rng: np.random.Generator, sides: int | None = None) -> Geometry:
     ]
     sides = sides or int(rng.choice((4, 6, 8, 26)))
     radii = [2.5 * (r + (height - z if number < 4 else 0.0)) for number, (r, z) in enumerate(profile)]
-    return Geometry(revolved(profile, sides, texture_radii=radii), (), 0.0)
+    return Geometry(revolve(profile, sides, texture_radii=radii), (), 0.0)
 
 
 _OUTLINES = (_star, _polygon, _blob, _ring, _strokes, _strokes, _strokes)

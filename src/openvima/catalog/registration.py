@@ -216,12 +216,12 @@ def _check_name(name: str, what: str, kind: str, *, alias: bool = False) -> None
         raise AssetError(f"{what}: names that begin with 'random' are reserved; choose another name.")
     known = OBJECTS if kind == "object" else {**TEXTURES, NEUTRAL_TEXTURE: None}
     registered = REGISTERED_OBJECTS if kind == "object" else REGISTERED_TEXTURES
-    taken = {_folded(other): other for other in (*known, *(n for n in registered if alias or n != name))}
-    if (other := taken.get(_folded(name))) is not None:
+    taken = {_fold(other): other for other in (*known, *(n for n in registered if alias or n != name))}
+    if (other := taken.get(_fold(name))) is not None:
         raise AssetError(f"{what}: there is {kind} {other or name!r} already; choose another name.")
 
 
-def _folded(name: str) -> str:
+def _fold(name: str) -> str:
     """A form in which names differ that readers, prompts and files tell apart."""
     return name.casefold().replace("-", " ")
 

@@ -32,7 +32,7 @@ from openvima.policies.tokenizer import UNKNOWN, benchmark_vocabulary
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, ObjectRecord, Prompt, RenderedPrompt
 from openvima.tasks import twist
-from openvima.tasks.prompts import MULTIMODAL, Phrasings, read_phrasings, rephrased, rewritten
+from openvima.tasks.prompts import MULTIMODAL, Phrasings, read_phrasings, rephrase, rewrite
 from openvima.tasks.registry import task_spec
 from openvima.tasks.sampling import make_rng, sample_episode
 from openvima.training.augmentation.prompts import MOTION_TEXT, motion_prompt
@@ -153,7 +153,7 @@ def with_images_of_another(env: TabletopEnv, rng: np.random.Generator) -> Render
             prompt_rng = make_rng(
                 own.domain, own.task, own.level, own.seed, "prompt", attempt=own.num_redraws
             )
-            swapped = rewritten(Prompt(prompt.text, images), other.problem.scene, env.prompts, prompt_rng)
+            swapped = rewrite(Prompt(prompt.text, images), other.problem.scene, env.prompts, prompt_rng)
             return Rasteriser(env.assets).prompt(swapped)
     raise SamplingError(
         f"{_MAX_TRIES} other episodes of {episode.task} at level {episode.level} have no images for "
@@ -281,4 +281,4 @@ def in_held_out_phrasing(text: str, task: str, rng: np.random.Generator) -> str:
         rng: Draws the phrasing.
     """
     phrasings = held_out_phrasings()[task]
-    return rephrased(text, task_spec(task).template, phrasings[int(rng.integers(len(phrasings)))]) or text
+    return rephrase(text, task_spec(task).template, phrasings[int(rng.integers(len(phrasings)))]) or text

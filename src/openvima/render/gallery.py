@@ -79,10 +79,10 @@ def draw_thumbnail(
     enlarge = 2 * detail * _SAMPLES
     rendered = rasteriser.scene(Scene(()), views=(view,), extra=(body,), enlarge=enlarge)[view]
     opaque = rendered.segm == _OBJECT_ID
-    return _antialiased(_cropped(channels_last(rendered.rgb), opaque, enlarge), _SAMPLES)
+    return _antialias(_crop(channels_last(rendered.rgb), opaque, enlarge), _SAMPLES)
 
 
-def _cropped(rgb: np.ndarray, opaque: np.ndarray, enlarge: int) -> np.ndarray:
+def _crop(rgb: np.ndarray, opaque: np.ndarray, enlarge: int) -> np.ndarray:
     """Crop the window around the object, shape (H, W, 4), uint8."""
     height, width = (round(length * _PX_PER_M * enlarge) for length in (_HEIGHT_M, _WIDTH_M))
     rows, columns = np.flatnonzero(opaque.any(axis=1)), np.flatnonzero(opaque.any(axis=0))
@@ -93,7 +93,7 @@ def _cropped(rgb: np.ndarray, opaque: np.ndarray, enlarge: int) -> np.ndarray:
     return image[top + height : top + 2 * height, left + width : left + 2 * width]
 
 
-def _antialiased(image: np.ndarray, samples: int) -> np.ndarray:
+def _antialias(image: np.ndarray, samples: int) -> np.ndarray:
     """Average squares of pixels; transparent ones give no colour."""
     height, width = image.shape[0] // samples, image.shape[1] // samples
     squares = image.reshape(height, samples, width, samples, 4)

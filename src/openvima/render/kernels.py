@@ -280,7 +280,7 @@ class IndexedMesh:
 
 
 @lru_cache(maxsize=256)
-def indexed(mesh: TriangleMesh) -> IndexedMesh:
+def index_mesh(mesh: TriangleMesh) -> IndexedMesh:
     """Return a mesh in indexed form; the same mesh object gives the same arrays."""
     num_triangles = len(mesh.vertices)
     flattened = mesh.vertices.reshape(-1, 3)
@@ -304,7 +304,7 @@ def indexed(mesh: TriangleMesh) -> IndexedMesh:
 
 
 @lru_cache(maxsize=64)
-def magnified(mesh: TriangleMesh, factor: float) -> TriangleMesh:
+def magnify(mesh: TriangleMesh, factor: float) -> TriangleMesh:
     """Return a mesh scaled by `factor` about its origin."""
     return TriangleMesh(mesh.vertices * factor, mesh.normals, mesh.uvs)
 

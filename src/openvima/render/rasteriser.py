@@ -16,8 +16,8 @@ from openvima.render.kernels import (
     IndexedMesh,
     KernelBuffers,
     draw_triangles,
-    indexed,
-    magnified,
+    index_mesh,
+    magnify,
     matrix_3x4,
 )
 from openvima.scene import (
@@ -165,7 +165,7 @@ class Rasteriser:
     ) -> Drawable:
         mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
         return Drawable(
-            mesh if magnification == 1 else magnified(mesh, magnification),
+            mesh if magnification == 1 else magnify(mesh, magnification),
             placement.pose if pose is None else pose,
             placement.id if object_id is None else object_id,
             self.assets.texture(placement.texture),
@@ -181,7 +181,7 @@ class Rasteriser:
         depth: bool = False,
         enlarge: int = 1,
     ) -> dict[View, Image]:
-        prepared = [_prepared(body) for body in bodies]
+        prepared = [_prepare(body) for body in bodies]
         images: dict[View, Image] = {}
         for view in views:
             empty = _empty_canvas(CAMERAS[view].enlarged(enlarge), table)
@@ -245,8 +245,8 @@ def _photo_image(name: str, fill: PhotoImage) -> PromptImage:
     return PromptImage(name, "object", rgb, segm, (ObjectRecord(0, PHOTO_OBJECT, PHOTO_TEXTURE),))
 
 
-def _prepared(body: Drawable) -> _Prepared:
-    return indexed(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id)
+def _prepare(body: Drawable) -> _Prepared:
+    return index_mesh(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id)
 
 
 def _draw_body(body: _Prepared, canvas: _Canvas) -> None:
@@ -283,7 +283,7 @@ def _empty_canvas(camera: Camera, table: bool) -> _Canvas:
         floor = Drawable(_rectangle(200.0, 200.0), Pose((0.0, 0.0, FLOOR_Z)), FLOOR_ID, FLOOR_RGB)
         sheet = Drawable(_rectangle(*SHEET_SIZE), Pose((0.5, 0.0, 0.0)), SHEET_ID, SHEET_RGB)
         for body in (floor, sheet):
-            _draw_body(_prepared(body), canvas)
+            _draw_body(_prepare(body), canvas)
     return canvas
 
 

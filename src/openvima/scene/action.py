@@ -84,7 +84,7 @@ class Action:
         values: dict[str, tuple[float, ...]] = {}
         for key, length in ACTION_SHAPES.items():
             if key in action:
-                values[key], problem = _checked(key, action[key], length)
+                values[key], problem = _check_value(key, action[key], length)
                 problems += problem
         if problems:
             raise ActionError(" ".join(problems) + " Nothing was moved.")
@@ -146,7 +146,7 @@ def _key_problems(action: Mapping[str, object]) -> list[str]:
     return problems
 
 
-def _checked(key: str, value: object, length: int) -> tuple[tuple[float, ...], list[str]]:
+def _check_value(key: str, value: object, length: int) -> tuple[tuple[float, ...], list[str]]:
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RuntimeError):

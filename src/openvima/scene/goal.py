@@ -143,7 +143,7 @@ class AtPose:
 
     def renumbered(self, new_of: Mapping[int, int]) -> "AtPose":
         """Return the goal for other object ids."""
-        return _renumbered(self, new_of)
+        return _renumber(self, new_of)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ class InZone:
 
     def renumbered(self, new_of: Mapping[int, int]) -> "InZone":
         """Return the goal for other object ids."""
-        return _renumbered(self, new_of)
+        return _renumber(self, new_of)
 
 
 OracleMove: TypeAlias = AtPose | InZone
@@ -183,7 +183,7 @@ OracleMove: TypeAlias = AtPose | InZone
 _Move = TypeVar("_Move", AtPose, InZone)
 
 
-def _renumbered(goal: _Move, new_of: Mapping[int, int]) -> _Move:
+def _renumber(goal: _Move, new_of: Mapping[int, int]) -> _Move:
     relative_to = None if goal.relative_to is None else new_of[goal.relative_to]
     return replace(goal, object_id=new_of[goal.object_id], relative_to=relative_to)
 

@@ -43,7 +43,7 @@ from openvima.serving.protocol import (
     type_of,
     unpack,
 )
-from openvima.tasks.prompts import MULTIMODAL, check_prompts, described
+from openvima.tasks.prompts import MULTIMODAL, check_prompts, describe
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -235,7 +235,7 @@ class Session:
             self._limits.check(prompt)
         num_objects = sum(len(image.objects) for prompt in prompts for image in prompt.images.values())
         self._check_objects(num_objects, MAX_IN_PROMPTS)
-        return [described(prompt, self._prompts) for prompt in prompts]
+        return [describe(prompt, self._prompts) for prompt in prompts]
 
     def _check_objects(self, count: int, per_episode: int) -> None:
         allowed = max(256, per_episode * self._max_episodes)  # of a single one as many as an image may have

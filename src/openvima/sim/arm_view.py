@@ -114,7 +114,7 @@ def arm_drawables(joints: np.ndarray, end_effector: EndEffector) -> tuple[Drawab
     """
     frames = link_frames(joints)
     return tuple(
-        Drawable(_assembled(parts, frames), _ORIGIN, id, rgb) for (id, rgb), parts in _parts(end_effector)
+        Drawable(_assemble(parts, frames), _ORIGIN, id, rgb) for (id, rgb), parts in _parts(end_effector)
     )
 
 
@@ -144,7 +144,7 @@ def _parts(end_effector: EndEffector) -> tuple[tuple[tuple[int, tuple[int, int, 
     return tuple((key, tuple(parts)) for key, parts in groups.items())
 
 
-def _assembled(parts: _Parts, frames: Sequence[Pose]) -> TriangleMesh:
+def _assemble(parts: _Parts, frames: Sequence[Pose]) -> TriangleMesh:
     """Transform meshes from link frames to the world and join them."""
     vertices = [frames[link].transform(mesh.vertices) for link, mesh in parts]
     rotations = [Pose((0.0, 0.0, 0.0), frame.quaternion) for frame in frames]

@@ -106,7 +106,7 @@ class Spatula:
             ticks = min(STRIDE_TICKS, num_ticks - done)
             self._run(ticks, (dx / time_s, dy / time_s, 0.0), turn / time_s)
             share = ticks / num_ticks
-            self._tip = _moved(self._tip, (dx, dy, 0.0), share)
+            self._tip = _move(self._tip, (dx, dy, 0.0), share)
             self._yaw_rad += turn * share
         self._tip, self._yaw_rad = (x, y, self._tip[2]), yaw_rad
 
@@ -188,7 +188,7 @@ class Spatula:
         )
         way = length if free is None else free
         self._record_frames(direction, way)
-        self._tip = _moved(self._tip, direction, way)
+        self._tip = _move(self._tip, direction, way)
         return length - way
 
     def _carried_bodies(self) -> tuple[int, ...] | None:
@@ -221,8 +221,8 @@ class Spatula:
         left, longest = way, MONITOR_TICKS * SWEEP_M_S * TICK_S
         while left > 0:
             piece = min(left, longest)
-            self._bodies.shift(carried, _moved((0.0, 0.0, 0.0), direction, piece))
-            self._tip = _moved(self._tip, direction, piece)
+            self._bodies.shift(carried, _move((0.0, 0.0, 0.0), direction, piece))
+            self._tip = _move(self._tip, direction, piece)
             left -= piece
             self._state.notify()
             num_ticks = max(1, round(piece / (SWEEP_M_S * TICK_S)))
@@ -248,8 +248,8 @@ class Spatula:
         """Move by a length with physics, at constant speed."""
         self._recent = [*self._recent[1 - _CARRIED_STRIDES :], (self._bodies.coordinates(), self._tip)]
         speed = length / (num_ticks * TICK_S)
-        self._run(num_ticks, _moved((0.0, 0.0, 0.0), direction, speed))
-        self._tip = _moved(self._tip, direction, length)
+        self._run(num_ticks, _move((0.0, 0.0, 0.0), direction, speed))
+        self._tip = _move(self._tip, direction, length)
 
     def _run(self, num_ticks: int, velocity: Vector3, turning: float = 0.0) -> None:
         self._wake(_STRIDE_M)
@@ -289,7 +289,7 @@ class Spatula:
         if not state.path.is_recording or length <= 0:
             return
         scene = state.scene()
-        joints = self._joints_at(*_moved(self._tip, direction, length))
+        joints = self._joints_at(*_move(self._tip, direction, length))
         state.path.move(joints, scene=lambda _: scene, speed=SWEEP_SPEED)
         state.path.waypoints.pop()
 
@@ -312,7 +312,7 @@ def _direction(start: Vector3, end: Vector3, distance: float) -> Vector3:
     return ((end[0] - start[0]) / distance, (end[1] - start[1]) / distance, (end[2] - start[2]) / distance)
 
 
-def _moved(point: Vector3, direction: Vector3, length: float) -> Vector3:
+def _move(point: Vector3, direction: Vector3, length: float) -> Vector3:
     return (
         point[0] + direction[0] * length,
         point[1] + direction[1] * length,

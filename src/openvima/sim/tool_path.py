@@ -68,12 +68,12 @@ def onward_path(action: Action, object_id: int, world: ToolWorld, *, compat: boo
         return [Waypoint(replace(pose, z=ur5.HOVER_TIP_Z_M), tool=False)]
     if tool == "spatula":
         plan = sweep_plan(action, compat=compat)
-        return [] if plan is None else _sweep(plan)[_passed(plan, world) :]
+        return [] if plan is None else _sweep(plan)[_count_passed(plan, world) :]
     path = tool_path(action, tool, compat=compat)
     if world.grasp is None:
         above, *rest = path
         return rest if _is_above(above.pose, pose) else [_approach(above, pose), *rest]
-    place = _carried(world.grasp, action) if world.grasped == object_id else pose
+    place = _carry(world.grasp, action) if world.grasped == object_id else pose
     path = _pick_and_place(pose, replace(place, z=ur5.HOVER_TIP_Z_M))[2:]
     if _is_above(place, pose):
         return path[3 if world.is_down else 2 :]
@@ -113,7 +113,7 @@ def _sweep(plan: SweepPlan) -> list[Waypoint]:
     ]
 
 
-def _carried(grasp: ToolPose, action: Action) -> ToolPose:
+def _carry(grasp: ToolPose, action: Action) -> ToolPose:
     """Where a tool that grasped an object has it where an action moves it."""
     before = Pose.planar(*action.pose0_position, action.yaw0_rad)
     after = Pose.planar(*action.pose1_position, action.yaw1_rad)
@@ -128,7 +128,7 @@ def _is_above(goal: ToolPose, pose: ToolPose, period_rad: float = 2 * math.pi) -
     return math.dist((goal.x, goal.y), (pose.x, pose.y)) <= near_m and turn <= _NEAR_RAD
 
 
-def _passed(plan: SweepPlan, world: ToolWorld) -> int:
+def _count_passed(plan: SweepPlan, world: ToolWorld) -> int:
     """How many waypoints of a sweep the spatula has behind it."""
     pose, (x0, y0), (x1, y1) = world.pose, plan.start, plan.legs[-1]
     fraction = 0.0

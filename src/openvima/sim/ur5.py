@@ -123,11 +123,11 @@ def inverse(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
     # The arm's plane passes the shoulder's axis at a constant side offset, hence the arcsine; `reach` and
     # `height` are the wrist in that plane. The elbow stays up, so one of the two triangles is left out.
     pan = math.atan2(y, x) - math.asin(SIDE_OFFSET_M / distance) - math.pi
-    pan = _wrapped(pan, -1.5 * math.pi)
+    pan = _wrap(pan, -1.5 * math.pi)
     lift = -math.atan2(height, reach) - _corner(UPPER_ARM_M, length, FOREARM_M)
     elbow = math.pi - _corner(UPPER_ARM_M, FOREARM_M, length)
     wrist1 = -math.pi / 2 - lift - elbow
-    wrist3 = _wrapped(pan + math.pi - yaw_rad, -math.pi)
+    wrist3 = _wrap(pan + math.pi - yaw_rad, -math.pi)
     return np.array([pan, lift, elbow, wrist1, -math.pi / 2, wrist3])
 
 
@@ -169,7 +169,7 @@ def _corner(a: float, b: float, opposite: float) -> float:
     return math.acos(max(-1.0, min(1.0, cosine)))
 
 
-def _wrapped(angle: float, low: float) -> float:
+def _wrap(angle: float, low: float) -> float:
     """The equivalent angle in [low, low + 2π)."""
     return (angle - low) % (2 * math.pi) + low
 

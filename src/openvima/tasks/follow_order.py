@@ -77,7 +77,7 @@ def sample(
         tries=num_distractors + 10,
     )
 
-    frames = [_stacked(table, blocks, stacks) for stacks in stackings]
+    frames = [_stack(table, blocks, stacks) for stacks in stackings]
     images = [_by_place(frame) for frame in frames] if table.compat else frames
     goals = goals_between(frames)
     return Problem(
@@ -117,7 +117,7 @@ def _row(num_places: int) -> list[Pose]:
     return [Pose.planar(0.5, WORKSPACE_LOW[1] + n * distance_m) for n in range(1, num_places + 1)]
 
 
-def _stacked(table: TableSampler, blocks: list[Placement], stacks: Stacks) -> Frame:
+def _stack(table: TableSampler, blocks: list[Placement], stacks: Stacks) -> Frame:
     """Place the blocks in stacks; with `compat` spaced by nominal height."""
     sampler, poses = table.blank(), {}
     for stack, place in zip(stacks, _row(len(stacks)), strict=True):

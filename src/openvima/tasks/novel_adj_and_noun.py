@@ -19,9 +19,9 @@ from openvima.tasks.novel_words import (
     choose_words,
     comparison_text,
     gray_image,
-    in_any_order,
     place_base_and_pair,
     sample_adjective_example,
+    shuffle_sentences,
 )
 from openvima.tasks.placing import into_base
 from openvima.tasks.registry import register_task
@@ -63,7 +63,7 @@ def sample(
         table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons
     )
     noun, base_noun = choose_words(table, "nouns", nouns, count=2)
-    introductions = in_any_order(table, INTRODUCTIONS)
+    introductions = shuffle_sentences(table, INTRODUCTIONS)
     base, target, others = place_base_and_pair(
         table, example, num_distractors=num_distractors, difficulty=difficulty
     )

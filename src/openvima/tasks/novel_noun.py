@@ -10,7 +10,7 @@ Source:   VIMA paper, task list of the appendix, "Novel noun".
 from collections.abc import Sequence
 
 from openvima.scene import Problem, Prompt
-from openvima.tasks.novel_words import NOUNS, choose_words, gray_image, in_any_order
+from openvima.tasks.novel_words import NOUNS, choose_words, gray_image, shuffle_sentences
 from openvima.tasks.options import check_num_distractors, textures_by_difficulty
 from openvima.tasks.placing import into_base, of_a_third_shape, place_base_and_target, place_distractors
 from openvima.tasks.registry import register_task
@@ -51,7 +51,7 @@ def sample(
     draw_distractor = of_a_third_shape(table, base, target, (*dragged_textures, *base_textures))
     distractors = place_distractors(table, draw_distractor, count=num_distractors)
     prompt = Prompt.parse(
-        " ".join((*in_any_order(table, INTRODUCTIONS), REQUEST)),
+        " ".join((*shuffle_sentences(table, INTRODUCTIONS), REQUEST)),
         novel_name_1=noun,
         novel_name_2=base_noun,
         dragged_obj_1=gray_image(target),

@@ -42,7 +42,7 @@ def choose_words(
     return tuple(listed[int(i)] for i in table.rng.permutation(len(listed))[:count])
 
 
-def in_any_order(table: TableSampler, sentences: Sequence[str]) -> list[str]:
+def shuffle_sentences(table: TableSampler, sentences: Sequence[str]) -> list[str]:
     """Return sentences in random order."""
     return [sentences[int(i)] for i in table.rng.permutation(len(sentences))]
 

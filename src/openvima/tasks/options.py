@@ -101,7 +101,7 @@ class TaskOptions:
         """
         if not isinstance(text, str):
             raise ConfigError(f"task_options is {echo(repr(text))}; give text such as 'num_distractors=3'.")
-        return _parsed(text)
+        return _parse(text)
 
     def __str__(self) -> str:
         return ",".join(f"{task and task + '.'}{name}={value}" for task, name, value in self.entries)
@@ -117,7 +117,7 @@ class TaskOptions:
             if task == spec.name and name not in spec.options:
                 raise ConfigError(unknown_name(f"option of task {task!r}:", name, spec.options))
             if task == spec.name or (not task and name in spec.options):
-                options[name] = _converted(spec, name, value)
+                options[name] = _convert(spec, name, value)
         return options
 
     def check(self, tasks: Sequence[str]) -> None:
@@ -153,7 +153,7 @@ def option_descriptions(spec: TaskSpec) -> dict[str, str]:
 
 
 @lru_cache
-def _parsed(text: str) -> TaskOptions:
+def _parse(text: str) -> TaskOptions:
     if len(text) > MAX_OPTIONS_TEXT:
         raise ConfigError(f"task_options has {len(text)} characters; at most {MAX_OPTIONS_TEXT} are allowed.")
     found: dict[tuple[str, str], str] = {}
@@ -171,7 +171,7 @@ def _parsed(text: str) -> TaskOptions:
     return TaskOptions(tuple((task, name, found[task, name]) for task, name in sorted(found)))
 
 
-def _converted(spec: TaskSpec, name: str, value: str) -> Any:  # Any: of the option's type
+def _convert(spec: TaskSpec, name: str, value: str) -> Any:  # Any: of the option's type
     """Convert a value to the type that the task declares, or else to that of the default."""
     default = spec.options[name]
     try:

@@ -42,7 +42,7 @@ def check_prompts(prompts: str) -> None:
         raise ConfigError(unknown_name("form of prompts", prompts, PROMPTS, allowed))
 
 
-def rewritten(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generator) -> Prompt:
+def rewrite(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generator) -> Prompt:
     """Replace object images of a prompt by descriptions: texture and name.
 
     Images of scenes stay. Images of a shape alone, which are gray, are described by the name alone.
@@ -57,7 +57,7 @@ def rewritten(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generat
         The prompt with the remaining images, marked where its words are ambiguous.
 
     Example:
-        >>> rewritten(prompt, scene, "text", rng).text  # doctest: +SKIP
+        >>> rewrite(prompt, scene, "text", rng).text  # doctest: +SKIP
         'Put the red swirl letter A into the blue bowl.'
     """
     shown = {name: fill.placement for name, fill in prompt.images if isinstance(fill, ObjectImage)}
@@ -70,8 +70,8 @@ def rewritten(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generat
     )
 
 
-def described(prompt: RenderedPrompt, prompts: str) -> RenderedPrompt:
-    """Replace object images of a rendered prompt by descriptions, as `rewritten` does before rendering.
+def describe(prompt: RenderedPrompt, prompts: str) -> RenderedPrompt:
+    """Replace object images of a rendered prompt by descriptions, as `rewrite` does before rendering.
 
     Args:
         prompt: The prompt. Equal ones give equal choices.
@@ -179,13 +179,13 @@ def with_phrases(text: str, phrases: Mapping[str, str]) -> str:
         if number % 2 == 0:
             result += piece
         elif piece in phrases:
-            result = _continued(result, phrases[piece])
+            result = _append_phrase(result, phrases[piece])
         else:
             result += f"{{{piece}}}"
     return result
 
 
-def _continued(before: str, phrase: str) -> str:
+def _append_phrase(before: str, phrase: str) -> str:
     """Append a phrase to the beginning of a text."""
     article = "an" if _VOWEL.match(phrase) else "a"
     if _INTRODUCED.search(before):
@@ -215,7 +215,7 @@ def read_phrasings(package: str, name: str) -> Phrasings:
         return {task: tuple(templates) for task, templates in read_yaml(path).items()}
 
 
-def rephrased(text: str, template: str, phrasing: str) -> str | None:
+def rephrase(text: str, template: str, phrasing: str) -> str | None:
     """Return the text of a prompt in another phrasing.
 
     Args:
@@ -228,7 +228,7 @@ def rephrased(text: str, template: str, phrasing: str) -> str | None:
         The text; None where it does not follow the template.
 
     Example:
-        >>> rephrased("Rotate the {a} 30 degrees.", "Rotate the {x} {n} degrees.", "Turn the {x} by {n}.")
+        >>> rephrase("Rotate the {a} 30 degrees.", "Rotate the {x} {n} degrees.", "Turn the {x} by {n}.")
         'Turn the {a} by 30.'
     """
     found = _pattern(template).fullmatch(text)

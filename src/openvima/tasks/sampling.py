@@ -32,7 +32,7 @@ from openvima.scene.goal import (
     unmet_reason,
 )
 from openvima.tasks.options import TaskOptions
-from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewritten
+from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewrite
 from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, check_steps, list_tasks, task_spec
 from openvima.tasks.table import TableSampler
 from openvima.user_code import described
@@ -91,7 +91,7 @@ def _name_words(name: str) -> tuple[int, int]:
     return int.from_bytes(digest[:4], "little"), int.from_bytes(digest[4:8], "little")
 
 
-def shuffled_ids(problem: Problem, rng: np.random.Generator) -> Problem:
+def shuffle_ids(problem: Problem, rng: np.random.Generator) -> Problem:
     """Permute the ids of a problem's objects.
 
     Tasks place objects in a fixed order of roles, so their order would reveal the target.
@@ -112,15 +112,15 @@ def shuffled_ids(problem: Problem, rng: np.random.Generator) -> Problem:
     }
     new_in_prompt = _permutation(sorted(prompt_ids), rng)  # one for all frames
     images = tuple(
-        (name, _renumbered_image(fill, new_of, new_in_prompt)) for name, fill in problem.prompt.images
+        (name, _renumber_image(fill, new_of, new_in_prompt)) for name, fill in problem.prompt.images
     )
     return replace(
         problem,
-        scene=_renumbered_scene(problem.scene, new_of),
+        scene=_renumber_scene(problem.scene, new_of),
         prompt=Prompt(problem.prompt.text, images),
-        goals=tuple(_renumbered(goal, new_of) for goal in problem.goals),
-        constraints=tuple(_renumbered(constraint, new_of) for constraint in problem.constraints),
-        prerequisites=tuple(_renumbered(goal, new_of) for goal in problem.prerequisites),
+        goals=tuple(_renumber(goal, new_of) for goal in problem.goals),
+        constraints=tuple(_renumber(constraint, new_of) for constraint in problem.constraints),
+        prerequisites=tuple(_renumber(goal, new_of) for goal in problem.prerequisites),
     )
 
 
@@ -128,12 +128,12 @@ def _permutation(ids: Sequence[int], rng: np.random.Generator) -> dict[int, int]
     return dict(zip(ids, rng.permutation(ids).tolist(), strict=True))
 
 
-def _renumbered_scene(scene: Scene, new_of: dict[int, int]) -> Scene:
+def _renumber_scene(scene: Scene, new_of: dict[int, int]) -> Scene:
     placements = (replace(placement, id=new_of[placement.id]) for placement in scene.placements)
     return replace(scene, placements=tuple(sorted(placements, key=lambda placement: placement.id)))
 
 
-def _renumbered(condition: Any, new_of: dict[int, int]) -> Any:  # Any: a goal gives a goal
+def _renumber(condition: Any, new_of: dict[int, int]) -> Any:  # Any: a goal gives a goal
     """Return a goal or constraint for new ids."""
     if hasattr(condition, "renumbered"):
         return condition.renumbered(new_of)
@@ -185,12 +185,12 @@ class RenumberedCondition:
         return RenumberedCondition(self.condition, {old: new_of[new] for old, new in self.new_of.items()})
 
     def _as_made(self, scene: Scene) -> Scene:
-        return _renumbered_scene(scene, {new: old for old, new in self.new_of.items()})
+        return _renumber_scene(scene, {new: old for old, new in self.new_of.items()})
 
 
-def _renumbered_image(fill: PromptFill, new_of: dict[int, int], new_in_prompt: dict[int, int]) -> PromptFill:
+def _renumber_image(fill: PromptFill, new_of: dict[int, int], new_in_prompt: dict[int, int]) -> PromptFill:
     if isinstance(fill, SceneImage):
-        return SceneImage(_renumbered_scene(fill.scene, new_in_prompt))
+        return SceneImage(_renumber_scene(fill.scene, new_in_prompt))
     if isinstance(fill, PhotoImage):
         return fill
     placement: Placement = fill.placement
@@ -269,10 +269,10 @@ def sample_episode(
                 "docs/your_own_task.md."
             )
         if not compat:
-            problem = shuffled_ids(problem, make_rng(domain, task, level, number, "ids", attempt=attempt))
+            problem = shuffle_ids(problem, make_rng(domain, task, level, number, "ids", attempt=attempt))
         if prompts != MULTIMODAL:
             rng = make_rng(domain, task, level, number, "prompt", attempt=attempt)
-            problem = replace(problem, prompt=rewritten(problem.prompt, problem.scene, prompts, rng))
+            problem = replace(problem, prompt=rewrite(problem.prompt, problem.scene, prompts, rng))
         oracle_max_steps = problem.oracle_max_steps or spec.oracle_max_steps
         check_steps(task, oracle_max_steps)
         max_steps = oracle_max_steps + EXTRA_STEPS

@@ -192,7 +192,7 @@ class TableSampler:
     def move(self, placement: Placement, place: Placement) -> Placement:
         """Move an object to a pose from `find_place`; return it there."""
         self.placements[self.placements.index(placement)] = place
-        self._labels, self._heights = self._stamped(self.placements)
+        self._labels, self._heights = self._stamp_all(self.placements)
         return place
 
     def add(
@@ -290,7 +290,7 @@ class TableSampler:
         geometry = self.assets.geometry(placement.object, placement.size, placement.scale)
         pose = placement.pose
         raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
-        return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
+        return self._stamp_all([replace(placement, id=1, pose=raised)])[0] > 0
 
     def scene(self) -> Scene:
         """Return the scene placed so far."""
@@ -327,7 +327,7 @@ class TableSampler:
 
         stamp(labels, heights, placement, self.assets)
 
-    def _stamped(self, placements: Sequence[Placement]) -> tuple[np.ndarray, np.ndarray]:
+    def _stamp_all(self, placements: Sequence[Placement]) -> tuple[np.ndarray, np.ndarray]:
         """Labels and heights of these objects."""
         from openvima.render.labels import empty_labels
 

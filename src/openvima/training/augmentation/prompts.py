@@ -19,7 +19,7 @@ from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, i
 from openvima.policies.tokenizer import UNKNOWN
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS
-from openvima.tasks.prompts import rephrased, synonyms, training_paraphrases, with_phrases
+from openvima.tasks.prompts import rephrase, synonyms, training_paraphrases, with_phrases
 from openvima.tasks.registry import task_spec
 from openvima.tasks.sweep_table import NUMBER_WORDS
 
@@ -149,7 +149,7 @@ def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> Prepro
         template = task_spec(episode.task).template
     except UnknownTaskError:  # demonstrations of a task that is not installed here
         return episode
-    text = rephrased(episode.prompt.text, template, phrasings[int(rng.integers(len(phrasings)))])
+    text = rephrase(episode.prompt.text, template, phrasings[int(rng.integers(len(phrasings)))])
     return episode if text is None else with_prompt(episode, text, images_by_name(episode.prompt))
 
 
