@@ -177,10 +177,10 @@ def test_first_sweeps_around_a_line_touch_nothing(difficulty: str) -> None:
 def test_a_group_is_parted_without_pushing_a_block_along_the_edge() -> None:
     problem = problem_with({4: (0.713, 0.107), 5: (0.748, 0.113)}, {})
     goals = [goal for goal in problem.goals if isinstance(goal, InZone)]
-    parting = next(separating_sweeps(View.of(goals, problem.scene, problem)))
+    parting = next(separating_sweeps(View.build(goals, problem.scene, problem)))
     assert parting.goal.object_id == 5
     inwards = problem_with({4: (0.643, 0.107), 5: (0.678, 0.113)}, {})
-    assert next(separating_sweeps(View.of(goals, inwards.scene, inwards))).goal.object_id == 4
+    assert next(separating_sweeps(View.build(goals, inwards.scene, inwards))).goal.object_id == 4
 
 
 def test_sweeps_of_blocks_at_the_edge_start_within_reach_of_an_action() -> None:

@@ -210,7 +210,7 @@ class View:
     overlap_m: float = 0.0
 
     @staticmethod
-    def of(goals: Sequence[InZone], scene: Scene, problem: Problem) -> "View":
+    def build(goals: Sequence[InZone], scene: Scene, problem: Problem) -> "View":
         """Build the view of a scene with these open goals.
 
         Raises:

@@ -203,7 +203,7 @@ def plan_sweep(goals: Sequence[InZone], scene: Scene, problem: Problem, *, compa
     """
     if compat:
         return published_sweep(goals[0], scene, problem)
-    view = View.of(goals, scene, problem)
+    view = View.build(goals, scene, problem)
     nudging, shoving = replace(view, overlap_m=_NUDGE_M), replace(view, overlap_m=_SHOVE_M)
     sweeps = itertools.chain(
         _direct_sweeps(view),
