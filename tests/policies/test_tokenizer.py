@@ -182,6 +182,18 @@ def test_unknown_words_are_all_named_once_and_the_first_gets_a_suggestion() -> N
         WordTokenizer().encode("the quokka")  # another policy
 
 
+@pytest.mark.parametrize(
+    ("word", "suggestion"),
+    [("rotat", "rotate"), ("rotatte", "rotate"), ("rotade", "rotate"), ("rotation", None), ("fellows", None)],
+)
+def test_only_a_word_within_one_edit_is_suggested(word: str, suggestion: str | None) -> None:
+    tokenizer = WordTokenizer(Vocabulary(("rotate", "yellow")))
+    with pytest.warns(UnknownWordWarning) as caught:
+        tokenizer.encode(word)
+    message = str(caught[0].message)
+    assert "Did you mean" not in message if suggestion is None else f"Did you mean {suggestion!r}?" in message
+
+
 def test_a_vocabulary_without_an_unknown_token_drops_unknown_words() -> None:
     tokenizer = WordTokenizer(Vocabulary(("put", "the")))
     with pytest.warns(UnknownWordWarning, match="'quokka'"):

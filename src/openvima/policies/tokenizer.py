@@ -226,7 +226,7 @@ class WordTokenizer:
         if not new:
             return
         self._warned.update(new)
-        near = difflib.get_close_matches(new[0], self._ids, n=1)
+        near = [word for word in difflib.get_close_matches(new[0], self._ids) if _is_one_edit(new[0], word)]
         shown = echo(", ".join(map(repr, new)), _MAX_SHOWN)
         last = " Further unknown words are not named." if len(self._warned) == _MAX_WARNED else ""
         hint = f" Did you mean {near[0]!r}?" if near else ""
@@ -236,6 +236,15 @@ class WordTokenizer:
             UnknownWordWarning,
             stacklevel=2,
         )
+
+
+def _is_one_edit(one: str, other: str) -> bool:
+    """Whether words differ by a letter that is inserted, deleted or replaced."""
+    alike = next(
+        (n for n, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other))
+    )
+    rest, other_rest = one[alike:], other[alike:]
+    return rest[1:] in (other_rest, other_rest[1:]) or rest == other_rest[1:]
 
 
 def _is_number(piece: str) -> bool:
