@@ -10,7 +10,7 @@ import yaml
 
 torch = pytest.importorskip("torch")
 from openvima.detector import detector_folder, load_detector  # noqa: E402
-from openvima.detector.checkpoint import (  # noqa: E402  # noqa: E402
+from openvima.detector.checkpoint import (  # noqa: E402
     detectron2_config,
     from_detectron2,
     load_detectron2,

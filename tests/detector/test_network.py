@@ -9,7 +9,7 @@ from PIL import Image
 torch = pytest.importorskip("torch")
 from openvima.detector.config import resnet50, small  # noqa: E402
 from openvima.detector.detection import DetectedObjects  # noqa: E402
-from openvima.detector.network import (  # noqa: E402  # noqa: E402
+from openvima.detector.network import (  # noqa: E402
     FrameDetector,
     Instances,
     MaskRCNN,

@@ -14,7 +14,7 @@ from safetensors.torch import load_file  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import outline_network  # noqa: E402
 from openvima.policies.nn.decoder import PrefixDecoderConfig  # noqa: E402
-from openvima.policies.published import config_from_published, from_published, load_published, to_published  # noqa: E402  # noqa: E402
+from openvima.policies.published import config_from_published, from_published, load_published, to_published  # noqa: E402
 from published_policies import with_unused_entries  # noqa: E402
 
 FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"

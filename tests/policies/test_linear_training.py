@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 from openvima.policies.nn.layers import (  # noqa: E402
     Linear,
     Unpadder,
-    rounded_rows,
+    round_rows,
 )
 
 
@@ -31,7 +31,7 @@ def test_outputs_and_gradients_are_those_of_torch(shape, bias):
 
 def test_rows_take_few_numbers_and_grow_little():
     counts = range(1, 20_000)
-    rounded = [rounded_rows(count) for count in counts]
+    rounded = [round_rows(count) for count in counts]
     assert all(0 <= new - old <= old / 16 for old, new in zip(counts, rounded, strict=True))
     assert len({new for new in rounded if new >= 256}) < 130
 
@@ -42,7 +42,7 @@ def test_rounded_rows_change_neither_outputs_nor_gradients():
     x = torch.randn(40, 20, 8, requires_grad=True)
     unpadder = Unpadder(valid)
     rows = unpadder.unpad(x)
-    assert len(rows) == rounded_rows(int(valid.sum())) > int(valid.sum())
+    assert len(rows) == round_rows(int(valid.sum())) > int(valid.sum())
     unpadder.pad(3 * rows).square().sum().backward()
     torch.testing.assert_close(x.grad, 18 * x.detach() * valid[..., None])
     torch.testing.assert_close(unpadder.pad(rows), x.detach() * valid[..., None])

@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.policies import PRESETS, preset  # noqa: E402
-from openvima.policies.build import (  # noqa: E402  # noqa: E402
+from openvima.policies.build import (  # noqa: E402
     PARTS,
     Count,
     build_network,

@@ -22,7 +22,7 @@ from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig  # n
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig  # noqa: E402
 from openvima.policies.presets import SIZE_NAMES  # noqa: E402
-from openvima.policies.published import config_from_published, from_published, load_published, to_published  # noqa: E402  # noqa: E402
+from openvima.policies.published import config_from_published, from_published, load_published, to_published  # noqa: E402
 from openvima.policies.sizes import Size  # noqa: E402
 from published_policies import with_unused_entries  # noqa: E402
 

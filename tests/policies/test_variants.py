@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network, config_from_dict, config_to_dict, outline_network  # noqa: E402  # noqa: E402
+from openvima.policies.build import build_network, config_from_dict, config_to_dict, outline_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.image_encoders import Resampler, ResamplerConfig  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402

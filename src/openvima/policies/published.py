@@ -197,15 +197,15 @@ class PublishedAdapter:
 
 def to_ours(rules: Iterable[Rule], name: str) -> tuple[str, bool] | None:
     """Return our name of a published weight and whether to transpose it; None if there is no such weight."""
-    return _renamed(name, [(rule.published, rule.ours, rule.transposed) for rule in rules])
+    return _rename(name, [(rule.published, rule.ours, rule.transposed) for rule in rules])
 
 
 def to_theirs(rules: Iterable[Rule], name: str) -> tuple[str, bool] | None:
     """Return the published name of one of our weights and whether to transpose it; None if it has none."""
-    return _renamed(name, [(rule.ours, rule.published, rule.transposed) for rule in rules])
+    return _rename(name, [(rule.ours, rule.published, rule.transposed) for rule in rules])
 
 
-def _renamed(name: str, rows: list[tuple[str, str, bool]]) -> tuple[str, bool] | None:
+def _rename(name: str, rows: list[tuple[str, str, bool]]) -> tuple[str, bool] | None:
     for before, after, transposed in rows:
         match = _pattern(before).fullmatch(name)
         if match:
@@ -302,7 +302,7 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     for name, tensor in without_prefix(weights).items():
         if not is_unused(name):
             ours, transposed = to_ours(adapter.rules, name) or (name, False)
-            result[ours] = _converted(tensor, transposed)
+            result[ours] = _convert(tensor, transposed)
     return result
 
 
@@ -329,7 +329,7 @@ def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
             without_name.append(ours)
         else:
             name, transposed = renamed
-            result[name] = _converted(tensor, transposed)
+            result[name] = _convert(tensor, transposed)
     if without_name:
         raise CheckpointError(
             f"this network has parts that no published policy has: {', '.join(without_name)}. "
@@ -338,7 +338,7 @@ def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     return result
 
 
-def _converted(tensor: torch.Tensor, transposed: bool) -> torch.Tensor:
+def _convert(tensor: torch.Tensor, transposed: bool) -> torch.Tensor:
     tensor = tensor.detach()
     tensor = tensor.float() if tensor.is_floating_point() else tensor
     return (tensor.T if transposed and tensor.ndim == 2 else tensor).contiguous()

@@ -17,7 +17,7 @@ from openvima.policies.batch import Batch
 from openvima.policies.build import config_to_dict
 from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.naming import TOKENIZER_FOLDER, WEIGHTS_FILE
-from openvima.policies.nn.layers import rounded_rows
+from openvima.policies.nn.layers import round_rows
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
@@ -137,7 +137,7 @@ class PolicyLearner(Learner):
         network, features = self.network, self.features
         if (images := batch.images) is not None:
             if self.training:
-                images = F.pad(images, (0, 0) * 3 + (0, rounded_rows(len(images)) - len(images)))
+                images = F.pad(images, (0, 0) * 3 + (0, round_rows(len(images)) - len(images)))
             features = network.encode_images(images)
         assert features is not None  # batches lack images only where there are features
         prompt = network.encode_prompt(batch.prompts, features)

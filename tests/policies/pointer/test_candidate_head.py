@@ -12,7 +12,7 @@ from openvima.policies.nn.actions import ActionTargets  # noqa: E402
 from openvima.policies.pointer.candidate_head import CandidatePointerHead  # noqa: E402
 from openvima.policies.pointer.candidates import PlaceCandidates  # noqa: E402
 from openvima.policies.pointer.config import CandidateHeadConfig  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, relative_yaw, rotated  # noqa: E402  # noqa: E402
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, relative_yaw, rotate  # noqa: E402  # noqa: E402
 from small_networks import object_set, pointer_prompt  # noqa: E402
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
@@ -106,7 +106,7 @@ def targets_at(inputs: HeadInputs, place_BT2, *, yaw: float = 0.0, place_slot: i
     held = inputs.grasps_BTN2[:, :, 0] + 0.01 - inputs.positions_BTN2[:, :, 0]
     actions = torch.zeros(batch, T, 12, dtype=torch.float64)
     actions[..., 0:2] = inputs.positions_BTN2[:, :, 0] + held
-    tool = place_BT2 + rotated(held, torch.full((batch, T), yaw, dtype=torch.float64))
+    tool = place_BT2 + rotate(held, torch.full((batch, T), yaw, dtype=torch.float64))
     actions[..., 6:8] = torch.where(inputs.has_suction_BT[..., None], tool, place_BT2)
     actions[..., 5], actions[..., 10], actions[..., 11] = 1, math.sin(yaw / 2), math.cos(yaw / 2)
     slots = torch.zeros(batch, T, dtype=torch.int64)
@@ -139,7 +139,7 @@ def test_the_centre_goes_to_the_candidate_whatever_grasp_and_rotation(head, inpu
     torch.testing.assert_close(decided[..., 0:2], inputs.grasps_BTN2[:, :, 0])
     angle = relative_yaw(decided)
     torch.testing.assert_close(angle, torch.full_like(angle, yaw))
-    held = rotated(inputs.grasps_BTN2[:, :, 0] - inputs.positions_BTN2[:, :, 0], angle)
+    held = rotate(inputs.grasps_BTN2[:, :, 0] - inputs.positions_BTN2[:, :, 0], angle)
     goal = place_of(inputs, candidate)
     tool = torch.where(inputs.has_suction_BT[..., None], goal + held, goal)  # what is pushed is not held
     torch.testing.assert_close(decided[..., 6:8], tool)

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets  # noqa: E402
 from openvima.policies.pointer.config import ObjectHeadConfig  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs, at, carried_to, relative_yaw, yaw_to_bin  # noqa: E402  # noqa: E402
+from openvima.policies.pointer.inputs import HeadInputs, at, carry, relative_yaw, yaw_to_bin  # noqa: E402
 from openvima.policies.pointer.object_head import ObjectPointerHead  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 from small_networks import object_set, pointer_prompt  # noqa: E402
@@ -212,7 +212,7 @@ def test_an_object_held_elsewhere_still_goes_where_it_was_demonstrated():
         [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]], dtype=torch.float64
     )
     demonstrated = action[0, 0, 6:8] + rotation @ (corner - action[0, 0, :2])
-    own = carried_to(action, grasp)[0, 0] + rotation @ (corner - grasp[0, 0])
+    own = carry(action, grasp)[0, 0] + rotation @ (corner - grasp[0, 0])
     torch.testing.assert_close(own, demonstrated, atol=1e-6, rtol=0)
 
 

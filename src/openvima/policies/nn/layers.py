@@ -2,7 +2,7 @@
 
 Training uses oneDNN, which takes half the time of torch's default library on AMD CPUs (results/
 2026-11-28_training_step.md); both compute in float32. Its kernels are compiled for each number of rows, so
-`rounded_rows` keeps these few.
+`round_rows` keeps these few.
 
 Shape suffixes: B batch, L positions, N positions of all rows that are computed, D width.
 """
@@ -123,7 +123,7 @@ def _product(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = 
     return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
 
 
-def rounded_rows(count: int) -> int:
+def round_rows(count: int) -> int:
     """Round a number of rows up to one of 16 in each octave, if it is large."""
     if count < _MIN_TRAINING_ROWS:
         return count
@@ -176,7 +176,7 @@ def layer_of(stack: nn.Module, index: int) -> nn.Linear:
 class Unpadder:
     """Packs the valid positions of a padded batch and scatters them back.
 
-    In training the rows are rounded up by copies of the first, which are dropped again; see `rounded_rows`.
+    In training the rows are rounded up by copies of the first, which are dropped again; see `round_rows`.
 
     Args:
         valid_BL: The positions that are computed; the others are zero, and visible to attention alone.
@@ -188,7 +188,7 @@ class Unpadder:
         self._index_N = None if len(index_N) == valid_BL.numel() else index_N
         self._count = len(index_N)
         if self._index_N is not None and torch.is_grad_enabled():
-            self._index_N = F.pad(index_N, (0, rounded_rows(self._count) - self._count))
+            self._index_N = F.pad(index_N, (0, round_rows(self._count) - self._count))
 
     def unpad(self, x_BLD: torch.Tensor) -> torch.Tensor:
         """Return the valid rows, (N, D), or the batch unchanged if all are."""

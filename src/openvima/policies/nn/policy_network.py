@@ -57,7 +57,7 @@ class Replay:
         return self._choices[len(self.logits) - 1]
 
 
-def normalized(weights_BL: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
+def normalize_weights(weights_BL: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
     """Scale weights to a sum of 1; equal ones where nothing has any."""
     weights_BL = weights_BL * mask_BL
     total_B1 = weights_BL.sum(dim=-1, keepdim=True)
@@ -216,7 +216,9 @@ class PolicyNetwork(nn.Module):
         finally:
             hook.remove()
         # An autoregressive head goes on with the components of the action.
-        return StepTrace(replay.logits, {"decoder": normalized(weights[0].mean(dim=1), prompt.mask_BL)})
+        return StepTrace(
+            replay.logits, {"decoder": normalize_weights(weights[0].mean(dim=1), prompt.mask_BL)}
+        )
 
     def add_end_effector(self, tokens_BTQE: torch.Tensor, end_effector_BT: torch.Tensor) -> torch.Tensor:
         """Fuse image tokens with the end effector, and map them to the decoder's width, (B, T, Q, D)."""

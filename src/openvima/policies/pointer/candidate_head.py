@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
 from openvima.policies.nn.layers import mlp
-from openvima.policies.nn.policy_network import Replay, StepTrace, normalized
+from openvima.policies.nn.policy_network import Replay, StepTrace, normalize_weights
 from openvima.policies.pointer.candidates import (
     NUM_GEOMETRY,
     GridCandidates,
@@ -31,13 +31,13 @@ from openvima.policies.pointer.inputs import (
     accuracy,
     at,
     bin_to_yaw,
-    carried_to,
+    carry,
     mask_scores,
     offset_loss,
     pick_and_place,
     pointing_metrics,
     relative_yaw,
-    rotated,
+    rotate,
     yaw_to_bin,
 )
 from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
@@ -148,7 +148,7 @@ class CandidatePointerHead(nn.Module):
         offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         yaw = bin_to_yaw(strategy(yaw_logits), self.config.num_yaw_bins, offset.dtype)
         goal = goal + offset
-        held = rotated(grasp - start, yaw)
+        held = rotate(grasp - start, yaw)
         return pick_and_place(grasp, torch.where(inputs.has_suction_BT[..., None], goal + held, goal), yaw)
 
     def trace(self, inputs: HeadInputs, choices: Sequence[torch.Tensor]) -> StepTrace:
@@ -161,7 +161,7 @@ class CandidatePointerHead(nn.Module):
         }
         return StepTrace(
             replay.logits,
-            {name: normalized(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
+            {name: normalize_weights(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
             candidates.positions_BTC2[:, 0],
             candidates.masks_BTC[:, 0],
             candidates.kinds_C,
@@ -199,7 +199,7 @@ class CandidatePointerHead(nn.Module):
     def _goal(self, inputs: HeadInputs, targets: ActionTargets, pick_BT: torch.Tensor) -> torch.Tensor:
         """Where the centre of the picked object goes, or the tool that pushes it, (B, T, 2), metres."""
         actions = targets.actions_BTC
-        centre = carried_to(actions, at(inputs.positions_BTN2, pick_BT))
+        centre = carry(actions, at(inputs.positions_BTN2, pick_BT))
         return torch.where(inputs.has_suction_BT[..., None], centre, actions[..., 6:8])
 
 

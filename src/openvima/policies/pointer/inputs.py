@@ -155,7 +155,7 @@ def relative_yaw(actions_BTC: torch.Tensor) -> torch.Tensor:
     return yaws[1] - yaws[0]
 
 
-def carried_to(actions_BTC: torch.Tensor, grasp_BT2: torch.Tensor) -> torch.Tensor:
+def carry(actions_BTC: torch.Tensor, grasp_BT2: torch.Tensor) -> torch.Tensor:
     """Where a point of an object ends when the object moves as demonstrated.
 
     The demonstrator may hold an object by another point than the policy would. The object moves rigidly, so
@@ -169,10 +169,10 @@ def carried_to(actions_BTC: torch.Tensor, grasp_BT2: torch.Tensor) -> torch.Tens
         Their places, shape (B, T, 2), metres.
     """
     held_BT2 = grasp_BT2 - actions_BTC[..., 0:2]
-    return actions_BTC[..., 6:8] + rotated(held_BT2, relative_yaw(actions_BTC))
+    return actions_BTC[..., 6:8] + rotate(held_BT2, relative_yaw(actions_BTC))
 
 
-def rotated(vectors_BT2: torch.Tensor, yaw_BT: torch.Tensor) -> torch.Tensor:
+def rotate(vectors_BT2: torch.Tensor, yaw_BT: torch.Tensor) -> torch.Tensor:
     """Rotate vectors on the table by angles in radians, counter-clockwise seen from above."""
     x, y = vectors_BT2.unbind(-1)
     cosine, sine = torch.cos(yaw_BT), torch.sin(yaw_BT)

@@ -11,14 +11,14 @@ from torch.nn import functional as F
 
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
 from openvima.policies.nn.layers import mlp
-from openvima.policies.nn.policy_network import Replay, StepTrace, normalized
+from openvima.policies.nn.policy_network import Replay, StepTrace, normalize_weights
 from openvima.policies.pointer.config import ObjectHeadConfig
 from openvima.policies.pointer.inputs import (
     OFFSET_UNIT_M,
     HeadInputs,
     at,
     bin_to_yaw,
-    carried_to,
+    carry,
     mask_scores,
     offset_loss,
     pick_and_place,
@@ -56,7 +56,7 @@ class ObjectPointerHead(nn.Module):
         pick_logits, place_logits = self.pick(inputs), self.place_logits(inputs, pick)
         offset, yaw_logits = self.relate(inputs, pick, place)
         actions = targets.actions_BTC
-        carried = carried_to(actions, at(inputs.grasps_BTN2, pick))
+        carried = carry(actions, at(inputs.grasps_BTN2, pick))
         true_place = torch.where(inputs.has_suction_BT[..., None], carried, actions[..., 6:8])
         true_offset = true_place - at(inputs.positions_BTN2, place)
         yaw = yaw_to_bin(relative_yaw(actions), self.config.num_yaw_bins)
@@ -91,7 +91,7 @@ class ObjectPointerHead(nn.Module):
         weights = {"pick": self.pick.prompt_weights(inputs), "place": self.place.prompt_weights(inputs)}
         return StepTrace(
             replay.logits,
-            {name: normalized(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
+            {name: normalize_weights(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
             inputs.positions_BTN2[:, 0],
             inputs.masks_BTN[:, 0],
             torch.zeros(inputs.masks_BTN.shape[-1], dtype=torch.int64),
