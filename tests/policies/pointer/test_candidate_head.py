@@ -12,7 +12,7 @@ from openvima.policies.nn.actions import ActionTargets  # noqa: E402
 from openvima.policies.pointer.candidate_head import CandidatePointerHead  # noqa: E402
 from openvima.policies.pointer.candidates import PlaceCandidates  # noqa: E402
 from openvima.policies.pointer.config import CandidateHeadConfig  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, relative_yaw, rotate  # noqa: E402  # noqa: E402
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, relative_yaw, rotate  # noqa: E402
 from small_networks import object_set, pointer_prompt  # noqa: E402
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
