@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from openvima.cli.main import main
 from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation import EvaluationConfig, Results
 from openvima.evaluation.sources import PolicySource
@@ -18,7 +19,7 @@ def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(resul
     config = EvaluationConfig(("mine=runs/a", "oracle", "random"))
     jobs = report_videos.recording_jobs(config, VideoSelection(2), results)
     recorded = [(job.batch.policy, job.batch.task, job.batch.level, job.batch.first_seed) for job in jobs]
-    assert recorded == [
+    assert sorted(recorded) == [
         *(("mine", "rotate", "L1", seed) for seed in (0, 1, 9)),
         *(("mine", "rotate", "L3", seed) for seed in (0, 1, 3, 4)),
         *(("mine", "stack<b>", "L1", seed) for seed in (0, 1, 6, 7)),
@@ -27,6 +28,28 @@ def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(resul
     ]
     assert {job.batch.source for job in jobs} == {"runs/a", "oracle"}
     assert all(job.batch.episodes == 1 for job in jobs)
+
+
+def test_failures_are_recorded_first_and_within_a_budget(results, monkeypatch):
+    monkeypatch.setattr(report_videos, "MOST_VIDEOS", 4)
+    config = EvaluationConfig(("mine=runs/a", "oracle"))
+    jobs = report_videos.recording_jobs(config, VideoSelection(), results)
+    assert [job.episode for job in jobs] == [
+        *(("mine", *cell) for cell in (("rotate", "L1", 9), ("rotate", "L3", 3), ("stack<b>", "L1", 6))),
+        ("mine", "rotate", "L1", 0),
+    ]
+
+
+def test_the_table_is_printed_before_any_video(tmp_path, monkeypatch, capsys):
+    printed = []
+    monkeypatch.setattr(
+        "openvima.report.evaluate_and_report",
+        lambda *_: printed.append(capsys.readouterr().out),
+        raising=False,
+    )
+    words = "evaluate --policy oracle --tasks rotate --levels L1 --episodes 1 --workers 1 --out"
+    assert main([*words.split(), str(tmp_path / "out")]) == 0
+    assert "success rates" in printed[0] and "100.0" in printed[0]
 
 
 def test_without_trained_policies_all_are_recorded(results):
@@ -62,7 +85,7 @@ def test_further_videos_are_added_to_those_recorded_before(tmp_path):
     evaluate_and_report(
         config, VideoSelection(0, ("rotate/0",)), lambda done, total, note: notes.append(note)
     )
-    assert notes == ["recorded 1 of 1"]
+    assert notes == ["recorded 1 of 1 (--videos 0: none)"]
     assert [clip.seed for clip in load_clips(tmp_path)] == [0, 1]
 
 
@@ -107,7 +130,7 @@ def test_an_evaluation_leaves_results_videos_and_a_report(tmp_path):
         "results.json",
         "videos",
     ]
-    assert notes[-1] == "recorded 1 of 1"
+    assert notes[-1].startswith("recorded 1 of 1")
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert page.count("<video") == 1 and "✓ solved in 1 step" in page
     assert contents(folder) == contents(evaluate_and_report(replace(config, out=tmp_path / "second")).parent)

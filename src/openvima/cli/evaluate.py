@@ -100,7 +100,8 @@ def main(
             nothing.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
-        videos: Solved episodes to record, and failures, of each trained policy, task and level.
+        videos: Solved episodes to record, and failures, of each trained policy, task and level; failures
+            first, at most 40 times as many in all, after the table is printed. 0 records none.
         record_video: Further episodes to record, of every policy, comma-separated: TASK/SEED or
             TASK/LEVEL/SEED.
         report: Whether to record videos and write report.html.
@@ -125,6 +126,7 @@ def main(
     from openvima.evaluation.runner import evaluate_range
     from openvima.multiprocess import num_cpus
     from openvima.report import VideoSelection, evaluate_and_report
+    from openvima.report.videos import requested_episodes, require_extra
 
     if in_context:
         ablations = f"{ablations},{IN_CONTEXT}"
@@ -165,8 +167,11 @@ def main(
             what = "is finished" if (out / FILE_NAME).exists() else "lacks batches of other ranges"
             print(f"{out} {what}.", file=sys.stderr)
             return 0
+    if report:  # what it lacks is named before any episode
+        require_extra()
+        requested_episodes(config, selection)
     with progress_bar("evaluation") as bar:
-        path = evaluate_and_report(config, selection, bar) if report else evaluate(config, bar)
+        path = evaluate(config, bar)
     results = Results.read(path)
     if as_json:
         print(json.dumps(json.loads(path.read_text(encoding="utf-8"))["rows"]))
@@ -185,6 +190,9 @@ def main(
             f"{num_near} (near_ties in {path.name}).",
             file=sys.stderr,
         )
+    if report:  # videos come after the scores; nothing is evaluated again
+        with progress_bar("evaluation") as bar:
+            evaluate_and_report(replace(config, force=False), selection, bar)
     print(
         f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if report else ""),
         file=sys.stderr,

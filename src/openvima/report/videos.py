@@ -5,6 +5,7 @@ import re
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 from openvima.atomic_io import folder_lock
@@ -22,6 +23,7 @@ from openvima.report.text import Confirmation
 from openvima.video.encoder import Clip, load_clips, png, save_clips
 
 REPORT_NAME = "report.html"
+MOST_VIDEOS = 40  # for each of `per_task`; one takes about a second
 _EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")
 
 Progress = Callable[[int, int, str], None]
@@ -32,7 +34,8 @@ class VideoSelection:
     """Which episodes to record for the report.
 
     Args:
-        per_task: Solved episodes, and failures, of each trained policy, task and level.
+        per_task: Solved episodes, and failures, of each trained policy, task and level; failures first, and
+            at most `MOST_VIDEOS` times as many in all.
         record_video: Further episodes, of every policy: "task/seed" at the task's first level, or
             "task/level/seed".
 
@@ -113,7 +116,7 @@ def _recorded(
     for number, (job, clip) in enumerate(imap_unordered(record_clip, missing, config.workers or 1), 1):
         clips[job.episode] = clip
         if note is not None:
-            note(f"recorded {number} of {len(missing)}")
+            note(f"recorded {number} of {len(missing)} (--videos 0: none)")
     requested = [clips.pop(job.episode) for job in jobs]
     found = [*requested, *clips.values()]  # those of an earlier command stay
     if missing:
@@ -152,20 +155,26 @@ def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Re
 
     Of each task and level: the first `videos.per_task` solved episodes and failures of every trained policy.
     Of the oracle the first solved ones of each task. Without trained policies and oracle, of all policies.
-    Then the requested episodes, of every policy.
+    Failures come first, policies take turns, and the budget ends the list. Then the requested episodes, of
+    every policy.
     """
     sources, requested = config.sources, requested_episodes(config, videos)
-    jobs = []
+    failed: list[list[Job]] = []
+    solved: list[list[Job]] = []
     for source in [source for source in sources if source.kind in (*TRAINED_KINDS, ORACLE)] or sources:
+        failed.append([])
+        solved.append([])
         for task in results.tasks():
             levels = (results.row(source.name, task, level) for level in results.levels())
             rows = [row for row in levels if row is not None]
             for row in rows[:1] if source.kind == ORACLE else rows:
-                seeds = [outcome.seed for outcome in row.outcomes if outcome.success][: videos.per_task]
-                if source.kind != ORACLE:
-                    failed = (outcome.seed for outcome in row.outcomes if not outcome.success)
-                    seeds += list(failed)[: videos.per_task]
-                jobs += [_job(config, results, source, row, seed) for seed in seeds]
+                for success, jobs_of in ((True, solved), (False, failed)):
+                    seeds = [outcome.seed for outcome in row.outcomes if outcome.success == success]
+                    if success or source.kind != ORACLE:
+                        first = seeds[: videos.per_task]
+                        jobs_of[-1] += [_job(config, results, source, row, seed) for seed in first]
+    turns = (turn for of_kind in (failed, solved) for turn in zip_longest(*of_kind))
+    jobs = [job for turn in turns for job in turn if job is not None][: MOST_VIDEOS * videos.per_task]
     for source in sources:
         for task, level, seed in requested:
             row = results.row(source.name, task, level)
