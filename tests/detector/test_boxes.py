@@ -4,13 +4,10 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 import naive
-
-torch = pytest.importorskip("torch")
-
-
-from openvima.detector.boxes import (  # noqa: E402
+from openvima.detector.boxes import (
     box_iou,
     cell_anchors,
     clip_boxes,

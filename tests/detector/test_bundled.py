@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 from openvima.detector import load_detector, load_extractor
 from openvima.env import TabletopEnv
 from openvima.perception.boxes import match_ids_to_slots

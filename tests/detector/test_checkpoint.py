@@ -6,20 +6,20 @@ import types
 from dataclasses import replace
 
 import pytest
+import torch
 import yaml
 
-torch = pytest.importorskip("torch")
-from openvima.detector import detector_folder, load_detector  # noqa: E402
-from openvima.detector.checkpoint import (  # noqa: E402
+from openvima.detector import detector_folder, load_detector
+from openvima.detector.checkpoint import (
     detectron2_config,
     from_detectron2,
     load_detectron2,
     load_network,
     save_network,
 )
-from openvima.detector.config import BackboneConfig, DetectorConfig, detector_config, resnet50  # noqa: E402
-from openvima.detector.network import MaskRCNN  # noqa: E402
-from openvima.errors import CheckpointError, ConfigError  # noqa: E402
+from openvima.detector.config import BackboneConfig, DetectorConfig, detector_config, resnet50
+from openvima.detector.network import MaskRCNN
+from openvima.errors import CheckpointError, ConfigError
 
 
 def detectron2_layout(num_classes: int = 1) -> dict[str, tuple[int, ...]]:

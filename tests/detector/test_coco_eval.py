@@ -7,11 +7,10 @@ import pytest
 from PIL import Image
 
 from openvima.detector.detection import Detections
-from openvima.detector.evaluation import draw_detections, save_grid
+from openvima.detector.evaluation import draw_detections, evaluate_detector, save_grid
 from openvima.errors import ConfigError, MissingExtraError
 
-coco = pytest.importorskip("pycocotools")
-from openvima.detector.evaluation import evaluate_detector  # noqa: E402
+pytest.importorskip("pycocotools")
 
 
 class Truthful:

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-torch = pytest.importorskip("torch")
-from openvima.detector.config import resnet50, small  # noqa: E402
-from openvima.detector.detection import DetectedObjects  # noqa: E402
-from openvima.detector.network import (  # noqa: E402
+from openvima.detector.config import resnet50, small
+from openvima.detector.detection import DetectedObjects
+from openvima.detector.network import (
     FrameDetector,
     Instances,
     MaskRCNN,
@@ -17,7 +17,7 @@ from openvima.detector.network import (  # noqa: E402
     resized_shape,
     to_detections,
 )
-from openvima.errors import ShapeError  # noqa: E402
+from openvima.errors import ShapeError
 
 NUM_STEPS = 200  # masks of every seed tried are good by then, whatever the rounding
 

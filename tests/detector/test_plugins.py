@@ -58,7 +58,6 @@ def test_an_invalid_source_is_named(hook, message):
 
 
 def test_a_trained_detector_is_found_by_its_folder(tmp_path):
-    pytest.importorskip("torch")
     with pytest.raises(CheckpointError, match="no folder"):
         plugged_extractor(f"detector={tmp_path / 'none'}")
     with pytest.raises(CheckpointError, match="no checkpoint"):
@@ -96,7 +95,8 @@ def test_the_name_of_a_function_follows_from_its_file(tmp_path):
 
 
 def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tiny, data):
-    torch = pytest.importorskip("torch")
+    import torch
+
     from openvima.detector.checkpoint import save_network
     from openvima.detector.network import MaskRCNN
 
@@ -114,7 +114,8 @@ def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tin
 
 
 def test_the_object_cache_of_a_detector_equals_its_extractor_on_one_thread(tmp_path, tiny, data):
-    torch = pytest.importorskip("torch")
+    import torch
+
     from openvima.detector.checkpoint import save_network
     from openvima.detector.network import MaskRCNN
 

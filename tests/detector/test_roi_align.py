@@ -2,16 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
+from torch.nn import functional as F
 
 import naive
-
-torch = pytest.importorskip("torch")
-
-from torch.nn import functional as F  # noqa: E402
-
-from openvima.detector.config import small  # noqa: E402
-from openvima.detector.layers import MaskHead  # noqa: E402
-from openvima.detector.roi_align import (  # noqa: E402
+from openvima.detector.config import small
+from openvima.detector.layers import MaskHead
+from openvima.detector.roi_align import (
     align_levels,
     box_levels,
     crop_masks,

@@ -3,12 +3,11 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 import naive
-
-torch = pytest.importorskip("torch")
-from openvima.detector.boxes import decode_boxes  # noqa: E402
-from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, RegionProposalNetwork  # noqa: E402
+from openvima.detector.boxes import decode_boxes
+from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, RegionProposalNetwork
 
 HEIGHT, WIDTH = 64, 96
 

@@ -9,22 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
+from openvima.data import Dataset
+from openvima.detector import config as sizes
+from openvima.detector import load_detector
+from openvima.detector.checkpoint import load_network, save_network
+from openvima.detector.network import MaskRCNN
 from openvima.errors import ConfigError, DatasetError
-
-torch = pytest.importorskip("torch")
-from safetensors.torch import load_file  # noqa: E402
-
-from openvima.data import Dataset  # noqa: E402
-from openvima.detector import config as sizes  # noqa: E402
-from openvima.detector import load_detector  # noqa: E402
-from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
-from openvima.detector.network import MaskRCNN  # noqa: E402
-from openvima.training.config import RuntimeConfig, ScheduleConfig  # noqa: E402
-from openvima.training.detector import DetectorTrainingConfig, train_detector  # noqa: E402
-from openvima.training.detector.config import FrameLoaderConfig  # noqa: E402
-from openvima.training.detector.stage import split_episodes  # noqa: E402
-from openvima.training.validation import flatten  # noqa: E402
+from openvima.training.config import RuntimeConfig, ScheduleConfig
+from openvima.training.detector import DetectorTrainingConfig, train_detector
+from openvima.training.detector.config import FrameLoaderConfig
+from openvima.training.detector.stage import split_episodes
+from openvima.training.validation import flatten
 
 
 @pytest.fixture

@@ -60,7 +60,6 @@ def small_bins_sizes():
 
 
 def _narrow(name: str):
-    pytest.importorskip("torch")
     from openvima.policies import preset
     from openvima.policies.nn.image_encoders import ConvConfig
 

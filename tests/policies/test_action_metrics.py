@@ -3,10 +3,9 @@
 import math
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.policies.nn.actions import ActionTargets, action_metrics, yaw_between  # noqa: E402
+from openvima.policies.nn.actions import ActionTargets, action_metrics, yaw_between
 
 
 def action(*, pick=(0.5, 0.0), place=(0.6, 0.2), yaw_deg=0.0) -> list[float]:

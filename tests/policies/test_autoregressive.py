@@ -5,31 +5,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.batch import Batch  # noqa: E402
-from openvima.policies.build import PolicyConfig, build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.action_head import NUM_BINS, decode_bins, encode_bins  # noqa: E402
-from openvima.policies.nn.actions import (  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies import preset
+from openvima.policies.batch import Batch
+from openvima.policies.build import PolicyConfig, build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.action_head import NUM_BINS, decode_bins, encode_bins
+from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ACTION_WIDTH,
     ActionTargets,
     from_unit_range,
     to_unit_range,
 )
-from openvima.policies.nn.heads import (  # noqa: E402
+from openvima.policies.nn.heads import (
     AutoregressiveConfig,
     AutoregressiveHead,
     ComponentTokens,
 )
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.variants import with_head, with_visual_residual  # noqa: E402
-from small_networks import collate_examples, examples_of  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.processor import Processor
+from openvima.policies.variants import with_head, with_visual_residual
+from small_networks import collate_examples, examples_of
 
 # One decoder; and cross-attention, with the last slot or with a query token as the action query.
 CONFIGS = {

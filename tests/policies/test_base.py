@@ -16,7 +16,6 @@ def test_an_unknown_name_gets_a_suggestion():
 
 
 def test_a_folder_without_checkpoint_is_refused(tmp_path):
-    pytest.importorskip("torch")
     with pytest.raises(CheckpointError, match="no checkpoint"):
         load_policy(str(tmp_path))
 

@@ -4,13 +4,11 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-torch = pytest.importorskip("torch")
-
-from hypothesis import given, settings  # noqa: E402
-from hypothesis import strategies as st  # noqa: E402
-
-from openvima.policies.nn.action_head import (  # noqa: E402
+from openvima.policies.nn.action_head import (
     NUM_BINS,
     BinsHead,
     ObservationTokens,
@@ -18,14 +16,14 @@ from openvima.policies.nn.action_head import (  # noqa: E402
     encode_bins,
     spread,
 )
-from openvima.policies.nn.actions import (  # noqa: E402
+from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ActionEncoder,
     ActionTargets,
     from_unit_range,
     to_unit_range,
 )
-from openvima.scene import Action  # noqa: E402
+from openvima.scene import Action
 
 
 def slow_bin(value: float, count: int) -> int:

@@ -6,34 +6,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.cli import quickstart  # noqa: E402
-from openvima.cli.main import main  # noqa: E402
-from openvima.env.config import DEFAULT_ENV_CONFIG  # noqa: E402
-from openvima.errors import CheckpointError, PolicyError, UnknownPolicyError  # noqa: E402
-from openvima.evaluation import Results  # noqa: E402
-from openvima.evaluation.config import Batch  # noqa: E402
-from openvima.evaluation.rollout import play  # noqa: E402
-from openvima.evaluation.rollout_policies import PromptedRolloutPolicy  # noqa: E402
-from openvima.evaluation.sources import policy_sources, weights_hash  # noqa: E402
-from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.naming import (  # noqa: E402
+from openvima.cli import quickstart
+from openvima.cli.main import main
+from openvima.env.config import DEFAULT_ENV_CONFIG
+from openvima.errors import CheckpointError, PolicyError, UnknownPolicyError
+from openvima.evaluation import Results
+from openvima.evaluation.config import Batch
+from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
+from openvima.evaluation.sources import policy_sources, weights_hash
+from openvima.policies import load_policy, presets
+from openvima.policies.build import build_network
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.naming import (
     BUNDLED,
     CHECKPOINTS_FOLDER,
     MODEL_CARD,
     SMALL,
     find_checkpoint,
 )
-from openvima.report import videos  # noqa: E402
-from openvima.report.videos import find_metrics  # noqa: E402
-from openvima.training import TrainingConfig  # noqa: E402
-from openvima.training.building import build_learner  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
+from openvima.report import videos
+from openvima.report.videos import find_metrics
+from openvima.training import TrainingConfig
+from openvima.training.building import build_learner
+from small_networks import narrow_small
 
 
 @pytest.fixture

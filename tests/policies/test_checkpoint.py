@@ -3,34 +3,32 @@
 from dataclasses import replace
 
 import pytest
+import torch
+import yaml
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 
-torch = pytest.importorskip("torch")
-
-import yaml  # noqa: E402
-from safetensors import SafetensorError  # noqa: E402
-from safetensors.torch import load_file, save_file  # noqa: E402
-
-from openvima.errors import CheckpointError  # noqa: E402
-from openvima.policies import checkpoint, preset, tensor_files  # noqa: E402
-from openvima.policies.build import (  # noqa: E402
+from openvima.errors import CheckpointError
+from openvima.policies import checkpoint, preset, tensor_files
+from openvima.policies.build import (
     build_network,
     config_to_dict,
     outline_network,
 )
-from openvima.policies.checkpoint import (  # noqa: E402
+from openvima.policies.checkpoint import (
     CONFIG_FILE,
     WEIGHTS_FILE,
     load_checkpoint,
     load_weights,
     save_checkpoint,
 )
-from openvima.policies.loading import load_policy  # noqa: E402
-from openvima.policies.naming import (  # noqa: E402
+from openvima.policies.loading import load_policy
+from openvima.policies.naming import (
     BEST_FILE,
     CHECKPOINTS_FOLDER,
     checkpoint_folder,
 )
-from openvima.policies.tokenizer import VOCABULARY_FILE  # noqa: E402
+from openvima.policies.tokenizer import VOCABULARY_FILE
 
 
 @pytest.fixture

@@ -4,29 +4,28 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import (  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies import preset
+from openvima.policies.build import (
     build_network,
     config_from_dict,
     config_to_dict,
 )
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.actions import (  # noqa: E402
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.actions import (
     ActionEncoder,
     ActionTargets,
     greedy,
 )
-from openvima.policies.nn.heads import (  # noqa: E402
+from openvima.policies.nn.heads import (
     MixtureConfig,
     RegressionConfig,
     build_head,
 )
-from openvima.policies.variants import with_head  # noqa: E402
-from openvima.scene import Action  # noqa: E402
+from openvima.policies.variants import with_head
+from openvima.scene import Action
 
 WIDTH = 6
 CONFIGS = {"mixture": MixtureConfig(8, 4, num_components=3), "regression": RegressionConfig(8, 4)}

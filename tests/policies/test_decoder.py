@@ -1,11 +1,10 @@
 """Decoders: causality, masks, padding, caches, and limits of length."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError, PolicyError  # noqa: E402
-from openvima.policies.nn.decoder import (  # noqa: E402
+from openvima.errors import ConfigError, PolicyError
+from openvima.policies.nn.decoder import (
     CausalDecoder,
     Decoder,
     DecoderConfig,

@@ -272,7 +272,6 @@ def test_without_a_cache_nothing_is_detected_ahead_and_equal_images_again() -> N
 
 
 def test_an_extractor_is_told_ahead_of_the_images_of_a_batch() -> None:
-    pytest.importorskip("torch")
     from openvima.policies.processor import Processor
 
     detector = Bright()

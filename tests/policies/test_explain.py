@@ -2,17 +2,16 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import PolicyError  # noqa: E402
-from openvima.policies import load_policy, preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.render import TOP, unproject  # noqa: E402
-from openvima.scene.explanation import Explanation, bin_positions  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
+from openvima.env import TabletopEnv
+from openvima.errors import PolicyError
+from openvima.policies import load_policy, preset
+from openvima.policies.build import build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.render import TOP, unproject
+from openvima.scene.explanation import Explanation, bin_positions
+from small_networks import narrow_small
 
 NAMES = ("nano", "small", "nano-bins", "vima-nano")
 FAST = ("nano", "small")

@@ -8,9 +8,6 @@ one differs from the recording by 4.2e-5 at most.
 from functools import cache
 
 import pytest
-
-pytest.importorskip("torch")
-
 from tests.policies.golden import (
     Arrays,
     Recording,

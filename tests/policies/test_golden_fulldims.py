@@ -12,9 +12,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-
 import torch
 from tests.policies.golden import (
     FOLDER,

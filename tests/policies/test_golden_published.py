@@ -6,16 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load_file
 
-torch = pytest.importorskip("torch")
-
-from safetensors.torch import load_file  # noqa: E402
-
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import outline_network  # noqa: E402
-from openvima.policies.nn.decoder import PrefixDecoderConfig  # noqa: E402
-from openvima.policies.published import config_from_published, from_published, load_published, to_published  # noqa: E402
-from published_policies import with_unused_entries  # noqa: E402
+from openvima.policies import preset
+from openvima.policies.build import outline_network
+from openvima.policies.nn.decoder import PrefixDecoderConfig
+from openvima.policies.published import config_from_published, from_published, load_published, to_published
+from published_policies import with_unused_entries
 
 FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"
 SHAPES = FOLDER / "state_dict_shapes.json"

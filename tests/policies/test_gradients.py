@@ -1,24 +1,23 @@
 """The loss of real demonstrations moves every parameter that it is meant to move, and no other."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.architectures import flamingo, gato, gpt, midas, vima  # noqa: E402
-from openvima.policies.batch import PromptBatch  # noqa: E402
-from openvima.policies.build import PolicyConfig, build_network  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.nn.prompt_encoder import (  # noqa: E402
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.policies import preset
+from openvima.policies.architectures import flamingo, gato, gpt, midas, vima
+from openvima.policies.batch import PromptBatch
+from openvima.policies.build import PolicyConfig, build_network
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.prompt_encoder import (
     PromptEncoder,
     PromptEncoderConfig,
     TextEncoderConfig,
 )
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.sizes import VOCABULARY_SIZE, Size  # noqa: E402
-from small_networks import (  # noqa: E402
+from openvima.policies.processor import Processor
+from openvima.policies.sizes import VOCABULARY_SIZE, Size
+from small_networks import (
     collate_examples,
     examples_of,
     narrow_small,

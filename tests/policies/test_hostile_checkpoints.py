@@ -8,18 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
 
-torch = pytest.importorskip("torch")
-
-import yaml  # noqa: E402
-from safetensors.torch import load_file, save_file  # noqa: E402
-
-from openvima.errors import CheckpointError, ConfigError  # noqa: E402
-from openvima.policies.build import build_network, outline_network  # noqa: E402
-from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE  # noqa: E402
-from openvima.policies.published import load_published  # noqa: E402
-from published_policies import small_vima, write_published  # noqa: E402
+from openvima.errors import CheckpointError, ConfigError
+from openvima.policies.build import build_network, outline_network
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
+from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE
+from openvima.policies.published import load_published
+from published_policies import small_vima, write_published
 
 
 @pytest.fixture

@@ -7,25 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import PolicyError, PromptError, ShapeError, UnknownWordWarning  # noqa: E402
-from openvima.perception.objects import GroundTruth, observe  # noqa: E402
-from openvima.policies import inference, preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.actions import (  # noqa: E402
+from openvima.errors import PolicyError, PromptError, ShapeError, UnknownWordWarning
+from openvima.perception.objects import GroundTruth, observe
+from openvima.policies import inference, preset
+from openvima.policies.build import build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ACTION_WIDTH,
     ActionTargets,
     sampling,
 )
-from openvima.policies.nn.decoder import MAX_POSITIONS  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.pointer.model import Pointer  # noqa: E402
-from openvima.scene import RenderedPrompt  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
+from openvima.policies.nn.decoder import MAX_POSITIONS
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.pointer.model import Pointer
+from openvima.scene import RenderedPrompt
+from small_networks import narrow_small
 
 NAMES = ("nano", "nano-bins", "small", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano")
 LENGTHS = (8, 3, 5, 8)  # steps of the episodes that are played together

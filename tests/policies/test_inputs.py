@@ -5,16 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
-
-from openvima.detector.detection import DetectedObjects, Detections  # noqa: E402
-from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
-from openvima.perception.objects import GROUND_TRUTH, GroundTruth  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.scene import RenderedPrompt  # noqa: E402
+from openvima.detector.detection import DetectedObjects, Detections
+from openvima.errors import PolicyError, PromptError, ShapeError
+from openvima.perception.objects import GROUND_TRUTH, GroundTruth
+from openvima.policies import preset
+from openvima.policies.build import build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.processor import Processor
+from openvima.scene import RenderedPrompt
 
 VIEWS = ("front", "top")
 FRAMES = {"layout": "frames", "image_size": (64, 128), "tokens_per_image": 16}

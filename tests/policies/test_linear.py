@@ -3,13 +3,11 @@
 from copy import deepcopy
 
 import pytest
+import torch
+from torch.nn import functional as F
 
-torch = pytest.importorskip("torch")
-
-from torch.nn import functional as F  # noqa: E402
-
-from openvima.policies.nn import layers as linear  # noqa: E402
-from openvima.policies.nn.layers import Linear  # noqa: E402
+from openvima.policies.nn import layers as linear
+from openvima.policies.nn.layers import Linear
 
 
 @pytest.fixture

@@ -1,10 +1,9 @@
 """The linear layer of training, and its rows."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.policies.nn.layers import (  # noqa: E402
+from openvima.policies.nn.layers import (
     Linear,
     Unpadder,
     round_rows,

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
+from openvima.policies import preset
+from openvima.policies.build import build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.policy_network import PolicyNetwork
+from small_networks import narrow_small
 
 
 def decisive(name: str) -> PolicyNetwork:

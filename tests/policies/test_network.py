@@ -3,16 +3,15 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.nn.actions import from_unit_range, to_unit_range  # noqa: E402
-from openvima.policies.pointer.inputs import yaw_to_bin  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from small_networks import check_mixed_precision, collate_examples, examples_of  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies import preset
+from openvima.policies.build import build_network
+from openvima.policies.nn.actions import from_unit_range, to_unit_range
+from openvima.policies.pointer.inputs import yaw_to_bin
+from openvima.policies.processor import Processor
+from small_networks import check_mixed_precision, collate_examples, examples_of
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):

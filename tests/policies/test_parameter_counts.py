@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-torch = pytest.importorskip("torch")
-
-from openvima.policies import PRESETS, preset  # noqa: E402
-from openvima.policies.build import (  # noqa: E402
+from openvima.policies import PRESETS, preset
+from openvima.policies.build import (
     PARTS,
     Count,
     build_network,
@@ -15,7 +13,7 @@ from openvima.policies.build import (  # noqa: E402
     outline_network,
     policy_size,
 )
-from openvima.policies.presets import PUBLISHED  # noqa: E402
+from openvima.policies.presets import PUBLISHED
 
 # Millions of parameters in the blocks of the published VIMA.
 DECODERS = {"2m": 2.10, "4m": 4.20, "9m": 9.85, "20m": 18.90, "43m": 41.99, "92m": 91.83, "200m": 207.76}

@@ -4,19 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import UnknownPolicyError  # noqa: E402
-from openvima.policies import RandomPolicy, load_policy  # noqa: E402
-from openvima.policies.base import Policy  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.action_head import shift_actions  # noqa: E402
-from openvima.policies.nn.actions import ActionTargets  # noqa: E402
-from openvima.scene import ACTION_SHAPES, WORKSPACE_HIGH, WORKSPACE_LOW  # noqa: E402
+from naive_inputs import NaiveProcessor, batch_histories, batch_prompts
+from openvima.env import TabletopEnv
+from openvima.errors import UnknownPolicyError
+from openvima.policies import RandomPolicy, load_policy
+from openvima.policies.base import Policy
+from openvima.policies.build import build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.action_head import shift_actions
+from openvima.policies.nn.actions import ActionTargets
+from openvima.scene import ACTION_SHAPES, WORKSPACE_HIGH, WORKSPACE_LOW
 
 
 @pytest.fixture(params=["random", "pointer", "bins", "published"])

@@ -3,22 +3,20 @@
 from dataclasses import replace
 
 import pytest
+import torch
+import yaml
 
-torch = pytest.importorskip("torch")
-
-import yaml  # noqa: E402
-
-from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # noqa: E402
-from openvima.policies import PRESETS, preset, register_policy  # noqa: E402
-from openvima.policies.build import (  # noqa: E402
+from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError
+from openvima.policies import PRESETS, preset, register_policy
+from openvima.policies.build import (
     build_network,
     config_from_dict,
     config_to_dict,
 )
-from openvima.policies.nn.action_head import NUM_BINS  # noqa: E402
-from openvima.policies.nn.image_encoders import ConvConfig, VitConfig  # noqa: E402
-from openvima.policies.presets import PUBLISHED, SIZE_NAMES  # noqa: E402
-from openvima.policies.sizes import SIZES, VOCABULARY_SIZE  # noqa: E402
+from openvima.policies.nn.action_head import NUM_BINS
+from openvima.policies.nn.image_encoders import ConvConfig, VitConfig
+from openvima.policies.presets import PUBLISHED, SIZE_NAMES
+from openvima.policies.sizes import SIZES, VOCABULARY_SIZE
 
 
 @pytest.mark.parametrize("name", ["nano", "nano-bins"])

@@ -6,19 +6,18 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import CheckpointError, HubError, MissingExtraError, PolicyError, UnknownPolicyError  # noqa: E402
-from openvima.evaluation.sources import weights_hash  # noqa: E402
-from openvima.policies import RandomPolicy, load_policy, preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.checkpoint import load_checkpoint, load_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.naming import TOKENIZER_FOLDER  # noqa: E402
-from openvima.policies.t5 import T5Tokenizer  # noqa: E402
-from openvima.policies.tokenizer import VOCABULARY_FILE, benchmark_vocabulary  # noqa: E402
-from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
+from openvima.errors import CheckpointError, HubError, MissingExtraError, PolicyError, UnknownPolicyError
+from openvima.evaluation.sources import weights_hash
+from openvima.policies import RandomPolicy, load_policy, preset
+from openvima.policies.build import build_network
+from openvima.policies.checkpoint import load_checkpoint, load_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.naming import TOKENIZER_FOLDER
+from openvima.policies.t5 import T5Tokenizer
+from openvima.policies.tokenizer import VOCABULARY_FILE, benchmark_vocabulary
+from published_policies import small_vima, write_published, write_tokenizer
 
 HUB_ID = "owner/some.policy-1"
 

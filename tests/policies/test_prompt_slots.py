@@ -3,9 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-
-pytest.importorskip("torch")
 
 from openvima.perception.objects import ObjectViews, make_hidden_objects
 from openvima.policies.batch import WORD, PromptBatch

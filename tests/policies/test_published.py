@@ -7,24 +7,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import CheckpointError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.architectures import flamingo, gato, gpt, vima  # noqa: E402
-from openvima.policies.build import (  # noqa: E402
+from openvima.errors import CheckpointError
+from openvima.policies import preset
+from openvima.policies.architectures import flamingo, gato, gpt, vima
+from openvima.policies.build import (
     PolicyConfig,
     build_network,
     outline_network,
 )
-from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig  # noqa: E402
-from openvima.policies.presets import SIZE_NAMES  # noqa: E402
-from openvima.policies.published import config_from_published, from_published, load_published, to_published  # noqa: E402
-from openvima.policies.sizes import Size  # noqa: E402
-from published_policies import with_unused_entries  # noqa: E402
+from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
+from openvima.policies.presets import SIZE_NAMES
+from openvima.policies.published import config_from_published, from_published, load_published, to_published
+from openvima.policies.sizes import Size
+from published_policies import with_unused_entries
 
 ARCHITECTURES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 DECODER_NAMES = {

@@ -3,12 +3,11 @@
 import math
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
-from openvima.policies.nn.object_encoder import (  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies.nn.image_encoders import ConvConfig
+from openvima.policies.nn.object_encoder import (
     ObjectEncoder,
     ObjectEncoderConfig,
     RelativeRotation,

@@ -7,19 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
 pytest.importorskip("transformers")
 
-from naive_inputs import NaiveProcessor  # noqa: E402
-from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError  # noqa: E402
-from openvima.hub import HubName  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.nn.prompt_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
-from openvima.policies.t5 import T5Tokenizer, load_t5, tokenizer_for  # noqa: E402
-from openvima.policies.tokenizer import benchmark_vocabulary  # noqa: E402
-from openvima.scene import PromptImage, RenderedPrompt  # noqa: E402
+from naive_inputs import NaiveProcessor
+from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError
+from openvima.hub import HubName
+from openvima.policies.build import build_network
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.prompt_encoder import RmsNorm, TextEncoderConfig
+from openvima.policies.t5 import T5Tokenizer, load_t5, tokenizer_for
+from openvima.policies.tokenizer import benchmark_vocabulary
+from openvima.scene import PromptImage, RenderedPrompt
 
 MARKER, STOP = 3, 5  # "▁" and ".", as in t5-base
 PIECES = ("▁", "X", ".", "▁the", "▁Put", "▁into", "in", "to", "▁Rot", "ate", "s", "3", "0", "▁degree", ",")

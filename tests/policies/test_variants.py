@@ -4,19 +4,18 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network, config_from_dict, config_to_dict, outline_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.image_encoders import Resampler, ResamplerConfig  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.variants import SWITCHES, image_tokens, with_variant  # noqa: E402
-from openvima.training.config import ModelConfig  # noqa: E402
-from small_networks import collate_examples, examples_of  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies import preset
+from openvima.policies.build import build_network, config_from_dict, config_to_dict, outline_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.image_encoders import Resampler, ResamplerConfig
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.processor import Processor
+from openvima.policies.variants import SWITCHES, image_tokens, with_variant
+from openvima.training.config import ModelConfig
+from small_networks import collate_examples, examples_of
 
 VARIANTS = [
     ("vima-nano", {"conditioning": "prefix"}),

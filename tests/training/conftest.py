@@ -33,7 +33,6 @@ def demonstrations_of_several_steps() -> list[Demonstration]:
 @pytest.fixture
 def settings(data: Path, tmp_path: Path, monkeypatch) -> dict:
     """Arguments of a run of a narrow network over a few steps."""
-    pytest.importorskip("torch")
     from openvima.policies.nn.image_encoders import ConvConfig
 
     def tiny():

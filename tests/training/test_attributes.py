@@ -4,46 +4,45 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.catalog.packs import load_assets  # noqa: E402
-from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.evaluation.prompt_ablations import held_out_phrasings  # noqa: E402
-from openvima.policies import presets  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402
-from openvima.policies.pointer.words import Attributes  # noqa: E402
-from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer, split_words  # noqa: E402
-from openvima.scene import Placement, Pose  # noqa: E402
-from openvima.scene.prompt import PLACEHOLDER  # noqa: E402
-from openvima.tasks import list_tasks, task_spec  # noqa: E402
-from openvima.tasks.prompts import training_paraphrases  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.building import resolve  # noqa: E402
-from openvima.training.pretraining.losses import (  # noqa: E402
+from openvima.catalog.packs import load_assets
+from openvima.catalog.random_pack import RandomAppearanceAssets
+from openvima.errors import ConfigError
+from openvima.evaluation.prompt_ablations import held_out_phrasings
+from openvima.policies import presets
+from openvima.policies.build import build_network
+from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
+from openvima.policies.pointer.words import Attributes
+from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer, split_words
+from openvima.scene import Placement, Pose
+from openvima.scene.prompt import PLACEHOLDER
+from openvima.tasks import list_tasks, task_spec
+from openvima.tasks.prompts import training_paraphrases
+from openvima.training import TrainingConfig, train
+from openvima.training.building import resolve
+from openvima.training.pretraining.losses import (
     _compare_attributes,
     _images,
     attribute_accuracy,
     attribute_loss,
 )
-from openvima.training.pretraining.pairs import (  # noqa: E402
+from openvima.training.pretraining.pairs import (
     AttributeLabeller,
     AttributeLabels,
     Pairs,
     SceneAugmentation,
     render_pairs,
 )
-from openvima.training.pretraining.stage import (  # noqa: E402
+from openvima.training.pretraining.stage import (
     WORDS,
     caption_loss,
     caption_texts,
     crop_parameters,
     sample_captions,
 )
-from openvima.training.recipes import recipe_settings  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
+from openvima.training.recipes import recipe_settings
+from small_networks import narrow_small
 
 AUGMENTATION = SceneAugmentation(0.4, 0.5, second_view=True, grayscale_prob=0.3)
 TOKENIZER = WordTokenizer(Vocabulary().extended(caption_texts()))

@@ -6,14 +6,13 @@ from itertools import islice
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data import Dataset, torch_dataset  # noqa: E402
-from openvima.data.preprocessed import preprocess  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.training.batches import BatchMaker, BatchOrder, ExampleSource, read_batches  # noqa: E402
-from small_networks import source_of_episodes  # noqa: E402
+from openvima.data import Dataset, torch_dataset
+from openvima.data.preprocessed import preprocess
+from openvima.errors import ConfigError
+from openvima.training.batches import BatchMaker, BatchOrder, ExampleSource, read_batches
+from small_networks import source_of_episodes
 
 
 def epoch_of(order: BatchOrder, epoch: int) -> list[np.ndarray]:

@@ -4,33 +4,32 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data import (  # noqa: E402
+from openvima.data import (
     Dataset,
     GenerateConfig,
     generate,
 )
-from openvima.env import EnvConfig, TabletopEnv  # noqa: E402
-from openvima.errors import CheckpointError, UnknownWordWarning  # noqa: E402
-from openvima.evaluation import score  # noqa: E402
-from openvima.evaluation.sources import policy_sources  # noqa: E402
-from openvima.policies import load_policy, preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.naming import TOKENIZER_FOLDER  # noqa: E402
-from openvima.policies.pointer.config import AttributeConfig  # noqa: E402
-from openvima.policies.presets import PRESETS, PUBLISHED  # noqa: E402
-from openvima.policies.sizes import VOCABULARY_SIZE  # noqa: E402
-from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benchmark_vocabulary  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.building import (  # noqa: E402
+from openvima.env import EnvConfig, TabletopEnv
+from openvima.errors import CheckpointError, UnknownWordWarning
+from openvima.evaluation import score
+from openvima.evaluation.sources import policy_sources
+from openvima.policies import load_policy, preset
+from openvima.policies.build import build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.naming import TOKENIZER_FOLDER
+from openvima.policies.pointer.config import AttributeConfig
+from openvima.policies.presets import PRESETS, PUBLISHED
+from openvima.policies.sizes import VOCABULARY_SIZE
+from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benchmark_vocabulary
+from openvima.training import TrainingConfig, train
+from openvima.training.building import (
     build_learner,
     resolve,
     training_texts,
 )
-from small_networks import narrow_small  # noqa: E402
+from small_networks import narrow_small
 
 WORDS = {
     *("rotate", "the", "degrees", ".", "put", "into", "sweep", "without", "exceeding"),

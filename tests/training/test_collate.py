@@ -4,17 +4,16 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
-from openvima.data.preprocessed import number_images, preprocess  # noqa: E402
-from openvima.errors import DatasetError  # noqa: E402
-from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
-from openvima.perception.preprocessing import ImageStack  # noqa: E402
-from openvima.policies.nn.actions import ACTION_PARTS  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from small_networks import collate_examples, examples_of  # noqa: E402
+from naive_inputs import NaiveProcessor, batch_histories, batch_prompts
+from openvima.data.preprocessed import number_images, preprocess
+from openvima.errors import DatasetError
+from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box
+from openvima.perception.preprocessing import ImageStack
+from openvima.policies.nn.actions import ACTION_PARTS
+from openvima.policies.processor import Processor
+from small_networks import collate_examples, examples_of
 
 SETTINGS = {
     "objects": {"layout": "objects"},

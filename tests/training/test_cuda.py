@@ -5,13 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.evaluation import EvaluationConfig, evaluate  # noqa: E402
-from openvima.policies import presets  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from small_networks import train_until  # noqa: E402
+from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.policies import presets
+from openvima.training import TrainingConfig, train
+from small_networks import train_until
 
 pytestmark = [
     pytest.mark.slow,

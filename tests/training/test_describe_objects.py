@@ -5,32 +5,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
-
-from openvima.data import Dataset  # noqa: E402
-from openvima.data.object_cache import open_object_cache  # noqa: E402
-from openvima.data.preprocessed import preprocess  # noqa: E402
-from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.perception.preprocessing import split_prompt  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
-from openvima.scene import ObjectRecord  # noqa: E402
-from openvima.tasks.prompts import describe, description_of, image_descriptions, synonyms  # noqa: E402
-from openvima.training import source as source_module  # noqa: E402
-from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
-from openvima.training.augmentation.prompts import (  # noqa: E402
+from openvima.data import Dataset
+from openvima.data.object_cache import open_object_cache
+from openvima.data.preprocessed import preprocess
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.perception.preprocessing import split_prompt
+from openvima.policies.processor import Processor
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
+from openvima.scene import ObjectRecord
+from openvima.tasks.prompts import describe, description_of, image_descriptions, synonyms
+from openvima.training import source as source_module
+from openvima.training.augmentation.demonstrations import demonstration_augmentation
+from openvima.training.augmentation.prompts import (
     DescribeObjects,
     rename_objects,
     text_of,
     with_descriptions,
     with_synonyms,
 )
-from openvima.training.batches import Example  # noqa: E402
-from openvima.training.building import training_texts  # noqa: E402
-from openvima.training.config import AugmentationConfig  # noqa: E402
-from openvima.training.learner import PolicyCollate  # noqa: E402
-from small_data_sets import rows_of  # noqa: E402
+from openvima.training.batches import Example
+from openvima.training.building import training_texts
+from openvima.training.config import AugmentationConfig
+from openvima.training.learner import PolicyCollate
+from small_data_sets import rows_of
 
 TASKS = (
     "visual_manipulation",

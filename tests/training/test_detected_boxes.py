@@ -5,31 +5,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
+from safetensors.torch import load_file
 
-torch = pytest.importorskip("torch")
-
-from safetensors.torch import load_file  # noqa: E402
-
-from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
-from openvima.data import Dataset  # noqa: E402
-from openvima.data.object_cache import CACHE_VERSION, open_object_cache  # noqa: E402
-from openvima.data.preprocessed import preprocess  # noqa: E402
-from openvima.detector.detection import DetectedObjects, Detections  # noqa: E402
-from openvima.detector.plugins import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.perception.objects import ObjectViews  # noqa: E402
-from openvima.perception.preprocessing import ImageStack  # noqa: E402
-from openvima.policies import load_policy  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
-from openvima.training.augmentation.prompts import motion_prompt  # noqa: E402
-from openvima.training.batches import BatchMaker, Example, ExampleSource  # noqa: E402
-from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.source import alternative_source, split_examples  # noqa: E402
-from plugged_extractors import HOOK, NoisyExtractor  # noqa: E402
-from small_networks import train_until  # noqa: E402
+from naive_inputs import NaiveProcessor, batch_histories, batch_prompts
+from openvima.data import Dataset
+from openvima.data.object_cache import CACHE_VERSION, open_object_cache
+from openvima.data.preprocessed import preprocess
+from openvima.detector.detection import DetectedObjects, Detections
+from openvima.detector.plugins import PluggedExtractor, detected_object_cache, plugged_boxes
+from openvima.errors import ConfigError
+from openvima.perception.objects import ObjectViews
+from openvima.perception.preprocessing import ImageStack
+from openvima.policies import load_policy
+from openvima.policies.processor import Processor
+from openvima.training import TrainingConfig, train
+from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
+from openvima.training.augmentation.prompts import motion_prompt
+from openvima.training.batches import BatchMaker, Example, ExampleSource
+from openvima.training.learner import PolicyCollate
+from openvima.training.source import alternative_source, split_examples
+from plugged_extractors import HOOK, NoisyExtractor
+from small_networks import train_until
 
 
 class Guesses:

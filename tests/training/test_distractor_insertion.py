@@ -4,24 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data.preprocessed import number_images, preprocess  # noqa: E402
-from openvima.data.records import rollout_oracle  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.augmentation.demonstrations import (  # noqa: E402
+from openvima.data.preprocessed import number_images, preprocess
+from openvima.data.records import rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.errors import ConfigError
+from openvima.policies.processor import Processor
+from openvima.training import TrainingConfig, train
+from openvima.training.augmentation.demonstrations import (
     MAX_DISTRACTORS,
     allows_distractors,
     with_distractors,
 )
-from openvima.training.batches import BatchMaker  # noqa: E402
-from openvima.training.learner import PolicyCollate  # noqa: E402
-from small_data_sets import rows_of  # noqa: E402
-from small_networks import rngs_of, source_of_episodes, stack_images  # noqa: E402
+from openvima.training.batches import BatchMaker
+from openvima.training.learner import PolicyCollate
+from small_data_sets import rows_of
+from small_networks import rngs_of, source_of_episodes, stack_images
 
 TASKS = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "same_shape", "rearrange")
 

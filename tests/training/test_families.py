@@ -6,19 +6,17 @@ import shlex
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
+from safetensors.torch import load_file
 
-torch = pytest.importorskip("torch")
-
-from safetensors.torch import load_file  # noqa: E402
-
-from openvima.cli.main import main  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.scene import Action  # noqa: E402
-from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
-from openvima.training.loop import step_seed  # noqa: E402
+from openvima.cli.main import main
+from openvima.env import TabletopEnv
+from openvima.policies import load_policy, presets
+from openvima.policies.build import build_network
+from openvima.scene import Action
+from openvima.training.behaviour_cloning import BehaviourCloning
+from openvima.training.loop import step_seed
 
 STEPS = 3
 

@@ -4,21 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.catalog.packs import load_assets  # noqa: E402
-from openvima.catalog.random_pack import RandomAppearanceAssets, is_random  # noqa: E402
-from openvima.catalog.textures import NEUTRAL_COLOUR  # noqa: E402
-from openvima.perception.objects import observe_prompt_image  # noqa: E402
-from openvima.render.rasteriser import Rasteriser  # noqa: E402
-from openvima.scene import Placement, Pose, Prompt, Scene  # noqa: E402
-from openvima.tasks.novel_words import gray_image  # noqa: E402
-from openvima.training import TrainingConfig, policy, train  # noqa: E402
-from openvima.training.augmentation.scenes import with_random_appearance  # noqa: E402
-from openvima.training.pretraining import losses  # noqa: E402
-from openvima.training.pretraining.losses import find_matches, info_nce, retrieval_accuracy  # noqa: E402
-from openvima.training.pretraining.pairs import (  # noqa: E402
+from openvima.catalog.packs import load_assets
+from openvima.catalog.random_pack import RandomAppearanceAssets, is_random
+from openvima.catalog.textures import NEUTRAL_COLOUR
+from openvima.perception.objects import observe_prompt_image
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import Placement, Pose, Prompt, Scene
+from openvima.tasks.novel_words import gray_image
+from openvima.training import TrainingConfig, policy, train
+from openvima.training.augmentation.scenes import with_random_appearance
+from openvima.training.pretraining import losses
+from openvima.training.pretraining.losses import find_matches, info_nce, retrieval_accuracy
+from openvima.training.pretraining.pairs import (
     Pairs,
     SceneAugmentation,
     pairs_of_scene,

@@ -5,26 +5,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
-torch = pytest.importorskip("torch")
-
-from safetensors.torch import load_file  # noqa: E402
-
-from openvima.cli.main import main  # noqa: E402
-from openvima.data import Demonstration  # noqa: E402
-from openvima.data.preprocessed import preprocess  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.perception.objects import observe, whole_frames  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
-from openvima.training.augmentation.prompts import motion_prompt, motion_text, with_motion_prompt  # noqa: E402
-from openvima.training.batches import Example  # noqa: E402
-from openvima.training.building import build_learner  # noqa: E402
-from openvima.training.config import ModelConfig  # noqa: E402
-from openvima.training.learner import PolicyCollate  # noqa: E402
-from small_networks import rngs_of  # noqa: E402
+from openvima.cli.main import main
+from openvima.data import Demonstration
+from openvima.data.preprocessed import preprocess
+from openvima.errors import ConfigError
+from openvima.perception.objects import observe, whole_frames
+from openvima.policies import preset
+from openvima.policies.processor import Processor
+from openvima.training import TrainingConfig, train
+from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
+from openvima.training.augmentation.prompts import motion_prompt, motion_text, with_motion_prompt
+from openvima.training.batches import Example
+from openvima.training.building import build_learner
+from openvima.training.config import ModelConfig
+from openvima.training.learner import PolicyCollate
+from small_networks import rngs_of
 
 PROCESSORS = {
     name: Processor.of(preset(name).inputs) for name in ("nano", "midas-nano", "gpt-nano")

@@ -7,15 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load_file
 
-torch = pytest.importorskip("torch")
-
-from safetensors.torch import load_file  # noqa: E402
-
-from openvima.errors import Terminated  # noqa: E402
-from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.build import config_to_dict  # noqa: E402
-from openvima.training import TrainingConfig, loop, train  # noqa: E402
+from openvima.errors import Terminated
+from openvima.policies import load_policy, presets
+from openvima.policies.build import config_to_dict
+from openvima.training import TrainingConfig, loop, train
 
 pytestmark = pytest.mark.slow
 

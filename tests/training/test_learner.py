@@ -7,15 +7,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.cli.main import main  # noqa: E402
-from openvima.errors import CheckpointError, ConfigError  # noqa: E402
-from openvima.evaluation import Results  # noqa: E402
-from openvima.evaluation.recording import OnlineEval  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.learner import Learner, make_learner  # noqa: E402
+from openvima.cli.main import main
+from openvima.errors import CheckpointError, ConfigError
+from openvima.evaluation import Results
+from openvima.evaluation.recording import OnlineEval
+from openvima.training import TrainingConfig, train
+from openvima.training.learner import Learner, make_learner
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "custom_learner.py"
 

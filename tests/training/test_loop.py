@@ -5,18 +5,16 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load_file
 
-torch = pytest.importorskip("torch")
-
-from safetensors.torch import load_file  # noqa: E402
-
-from openvima.errors import AssetError, CheckpointError, ConfigError, DatasetError  # noqa: E402
-from openvima.policies import load_policy  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.config import ScheduleConfig  # noqa: E402
-from openvima.training.loop import learning_rate_at, step_generator, step_seed  # noqa: E402
-from openvima.training.run_folder import RunFolder  # noqa: E402
-from small_networks import train_until  # noqa: E402
+from openvima.errors import AssetError, CheckpointError, ConfigError, DatasetError
+from openvima.policies import load_policy
+from openvima.training import TrainingConfig, train
+from openvima.training.config import ScheduleConfig
+from openvima.training.loop import learning_rate_at, step_generator, step_seed
+from openvima.training.run_folder import RunFolder
+from small_networks import train_until
 
 
 def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:

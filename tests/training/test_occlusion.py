@@ -1,12 +1,11 @@
 """Occlusion of the crops of contrastive pretraining."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.training.augmentation.crops import with_occlusion  # noqa: E402
-from openvima.training.loop import step_generator  # noqa: E402
-from openvima.training.pretraining.pairs import NO_AUGMENTATION, SceneAugmentation, render_pairs  # noqa: E402
+from openvima.training.augmentation.crops import with_occlusion
+from openvima.training.loop import step_generator
+from openvima.training.pretraining.pairs import NO_AUGMENTATION, SceneAugmentation, render_pairs
 
 
 @pytest.fixture(scope="module")

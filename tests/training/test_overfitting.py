@@ -5,27 +5,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.batch import Batch  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.action_head import encode_bins  # noqa: E402
-from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range  # noqa: E402
-from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.scene import Action  # noqa: E402
-from openvima.training import TrainingConfig  # noqa: E402
-from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
-from openvima.training.config import AugmentationConfig, LoaderConfig  # noqa: E402
-from openvima.training.learner import PolicyLearner  # noqa: E402
-from openvima.training.parallel import Parallel  # noqa: E402
-from small_networks import (  # noqa: E402
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.policies import preset
+from openvima.policies.batch import Batch
+from openvima.policies.build import build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.action_head import encode_bins
+from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
+from openvima.policies.nn.image_encoders import ConvConfig
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.processor import Processor
+from openvima.scene import Action
+from openvima.training import TrainingConfig
+from openvima.training.behaviour_cloning import BehaviourCloning
+from openvima.training.config import AugmentationConfig, LoaderConfig
+from openvima.training.learner import PolicyLearner
+from openvima.training.parallel import Parallel
+from small_networks import (
     collate_examples,
     examples_of,
     narrow_small,

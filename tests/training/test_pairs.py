@@ -2,22 +2,21 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.catalog.packs import load_assets  # noqa: E402
-from openvima.catalog.partitions import pool  # noqa: E402
-from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
-from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
-from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
-from openvima.tasks import sample_episode  # noqa: E402
-from openvima.training.augmentation.crops import draw_channel_mixing  # noqa: E402
-from openvima.training.augmentation.scenes import ShapeKinds, with_random_appearance  # noqa: E402
-from openvima.training.loop import step_generator  # noqa: E402
-from openvima.training.parallel import Parallel  # noqa: E402
-from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
-from openvima.training.pretraining.losses import contrastive_loss, retrieval_accuracy  # noqa: E402
-from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs  # noqa: E402
+from openvima.catalog.packs import load_assets
+from openvima.catalog.partitions import pool
+from openvima.catalog.random_pack import RandomAppearanceAssets
+from openvima.policies.nn.image_encoders import ConvConfig
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig
+from openvima.tasks import sample_episode
+from openvima.training.augmentation.crops import draw_channel_mixing
+from openvima.training.augmentation.scenes import ShapeKinds, with_random_appearance
+from openvima.training.loop import step_generator
+from openvima.training.parallel import Parallel
+from openvima.training.pretraining import pairs as pairs_module
+from openvima.training.pretraining.losses import contrastive_loss, retrieval_accuracy
+from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
 

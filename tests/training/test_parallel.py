@@ -8,20 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from torch.utils import backend_registration
 
-torch = pytest.importorskip("torch")
-
-from torch.utils import backend_registration  # noqa: E402
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.build import config_to_dict  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.parallel import (  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies import load_policy, presets
+from openvima.policies.build import config_to_dict
+from openvima.training import TrainingConfig, train
+from openvima.training.parallel import (
     join_processes,
     start_peers,
 )
-from plugged_extractors import HOOK  # noqa: E402
+from plugged_extractors import HOOK
 
 pytestmark = pytest.mark.slow
 

@@ -5,23 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
-from openvima.data.preprocessed import preprocess  # noqa: E402
-from openvima.data.records import rollout_oracle  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.tasks.novel_words import NOUNS  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.augmentation.demonstrations import (  # noqa: E402
+from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data.preprocessed import preprocess
+from openvima.data.records import rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.errors import ConfigError
+from openvima.policies.processor import Processor
+from openvima.tasks.novel_words import NOUNS
+from openvima.training import TrainingConfig, train
+from openvima.training.augmentation.demonstrations import (
     DemonstrationAugmentation,
     Randomly,
     drop_unused_objects,
 )
-from openvima.training.augmentation.prompts import (  # noqa: E402
+from openvima.training.augmentation.prompts import (
     UnknownWords,
     paraphrase,
     rename_objects,
@@ -29,12 +28,12 @@ from openvima.training.augmentation.prompts import (  # noqa: E402
     shuffle_sentences,
     with_motion_prompt,
 )
-from openvima.training.batches import Example  # noqa: E402
-from openvima.training.building import training_texts  # noqa: E402
-from openvima.training.config import AugmentationConfig  # noqa: E402
-from openvima.training.learner import PolicyCollate  # noqa: E402
-from small_data_sets import rows_of  # noqa: E402
-from small_networks import rngs_of  # noqa: E402
+from openvima.training.batches import Example
+from openvima.training.building import training_texts
+from openvima.training.config import AugmentationConfig
+from openvima.training.learner import PolicyCollate
+from small_data_sets import rows_of
+from small_networks import rngs_of
 
 NAMED = (
     "visual_manipulation",

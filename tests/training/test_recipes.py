@@ -7,8 +7,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-pytest.importorskip("torch")
-
 from openvima.cli.main import main
 from openvima.errors import ConfigError
 from openvima.training import TrainingConfig

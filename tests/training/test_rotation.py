@@ -5,33 +5,32 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.catalog.packs import load_assets  # noqa: E402
-from openvima.catalog.partitions import pool  # noqa: E402
-from openvima.catalog.random_pack import RandomAppearanceAssets, is_random  # noqa: E402
-from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
-from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
-from openvima.render.rasteriser import Rasteriser  # noqa: E402
-from openvima.scene import Placement, Pose, Scene  # noqa: E402
-from openvima.training.augmentation.crops import (  # noqa: E402
+from openvima.catalog.packs import load_assets
+from openvima.catalog.partitions import pool
+from openvima.catalog.random_pack import RandomAppearanceAssets, is_random
+from openvima.policies.nn.image_encoders import ConvConfig
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import Placement, Pose, Scene
+from openvima.training.augmentation.crops import (
     with_box_jitter,
     with_horizontal_flips,
 )
-from openvima.training.augmentation.scenes import (  # noqa: E402
+from openvima.training.augmentation.scenes import (
     rearrange,
     with_hard_negatives,
 )
-from openvima.training.loop import step_generator  # noqa: E402
-from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
-from openvima.training.pretraining.losses import (  # noqa: E402
+from openvima.training.loop import step_generator
+from openvima.training.pretraining import pairs as pairs_module
+from openvima.training.pretraining.losses import (
     contrastive_loss,
     is_rotation_correct,
     rotation_accuracy,
     rotation_loss,
 )
-from openvima.training.pretraining.pairs import (  # noqa: E402
+from openvima.training.pretraining.pairs import (
     SceneAugmentation,
     pairs_of_scene,
     render_pairs,

@@ -7,17 +7,15 @@ import threading
 
 import pytest
 
-torch = pytest.importorskip("torch")
-
-from openvima.data import Dataset  # noqa: E402
-from openvima.errors import FolderLockedError  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.run_folder import (  # noqa: E402
+from openvima.data import Dataset
+from openvima.errors import FolderLockedError
+from openvima.training import TrainingConfig, train
+from openvima.training.run_folder import (
     RunFolder,
     git_state,
     provenance,
 )
-from worker_jobs import holding  # noqa: E402
+from worker_jobs import holding
 
 
 def test_a_second_run_in_a_folder_is_refused_at_once_and_writes_nothing(settings) -> None:

@@ -5,40 +5,39 @@ from functools import partial
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
-from openvima.data.object_cache import open_object_cache  # noqa: E402
-from openvima.data.subsets import MergeConfig, merge  # noqa: E402
-from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
-from openvima.perception.objects import observe  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.loading import held_out_data  # noqa: E402
-from openvima.policies.nn import decoder  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
-from openvima.tasks.registry import held_out_tasks, list_tasks  # noqa: E402
-from openvima.training import TrainingConfig, source, train  # noqa: E402
-from openvima.training.augmentation.demonstrations import add_false_positives  # noqa: E402
-from openvima.training.augmentation.prompts import with_motion_prompt  # noqa: E402
-from openvima.training.batches import ExampleSource  # noqa: E402
-from openvima.training.building import (  # noqa: E402
+from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data.object_cache import open_object_cache
+from openvima.data.subsets import MergeConfig, merge
+from openvima.errors import ConfigError, DatasetError, PromptError
+from openvima.perception.objects import observe
+from openvima.policies import preset
+from openvima.policies.build import build_network
+from openvima.policies.loading import held_out_data
+from openvima.policies.nn import decoder
+from openvima.policies.processor import Processor
+from openvima.policies.tokenizer import WordTokenizer
+from openvima.tasks.registry import held_out_tasks, list_tasks
+from openvima.training import TrainingConfig, source, train
+from openvima.training.augmentation.demonstrations import add_false_positives
+from openvima.training.augmentation.prompts import with_motion_prompt
+from openvima.training.batches import ExampleSource
+from openvima.training.building import (
     resolve,
     training_texts,
 )
-from openvima.training.config import AugmentationConfig  # noqa: E402
-from openvima.training.policy import scene_tasks  # noqa: E402
-from openvima.training.run_folder import held_out_demonstrations  # noqa: E402
-from openvima.training.source import (  # noqa: E402
+from openvima.training.config import AugmentationConfig
+from openvima.training.policy import scene_tasks
+from openvima.training.run_folder import held_out_demonstrations
+from openvima.training.source import (
     check_scenes,
     check_words,
     make_order,
     open_demonstrations,
     split_examples,
 )
-from small_networks import collate_examples, examples_of, rngs_of  # noqa: E402
+from small_networks import collate_examples, examples_of, rngs_of
 
 OBJECTS, VIEWS = Processor("objects"), Processor("views")
 

@@ -4,20 +4,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
 pytest.importorskip("transformers")
 
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import CheckpointError, ConfigError  # noqa: E402
-from openvima.policies import load_policy, presets, sizes  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig  # noqa: E402
-from openvima.policies.t5 import T5Tokenizer, load_t5  # noqa: E402
-from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.building import build_learner  # noqa: E402
-from published_policies import small_vima, write_tokenizer  # noqa: E402
+from openvima.env import TabletopEnv
+from openvima.errors import CheckpointError, ConfigError
+from openvima.policies import load_policy, presets, sizes
+from openvima.policies.build import build_network
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
+from openvima.policies.t5 import T5Tokenizer, load_t5
+from openvima.training import TrainingConfig, train
+from openvima.training.building import build_learner
+from published_policies import small_vima, write_tokenizer
 
 
 def small_t5_vima():

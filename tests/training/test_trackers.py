@@ -11,12 +11,9 @@ import pytest
 from PIL import Image
 
 from openvima.errors import MissingExtraError
-from openvima.video.encoder import Animation
-
-pytest.importorskip("torch")
-
 from openvima.training.config import TrainingConfig
 from openvima.training.trackers import TensorBoardTracker, WandbTracker, open_trackers
+from openvima.video.encoder import Animation
 
 
 @pytest.fixture

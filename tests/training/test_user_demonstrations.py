@@ -9,9 +9,6 @@ from openvima import compose
 from openvima.data import VerifyConfig, record_demonstration, verify
 from openvima.scene import Action
 from openvima.tasks import sample_episode
-
-pytest.importorskip("torch")
-
 from openvima.training import TrainingConfig, train
 
 

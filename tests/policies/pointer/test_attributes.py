@@ -4,24 +4,23 @@ from copy import deepcopy
 from dataclasses import replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network, policy_size  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.action_head import shift_actions  # noqa: E402
-from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs  # noqa: E402
-from openvima.policies.pointer.model import Pointer  # noqa: E402
-from openvima.policies.pointer.words import Attributes  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
-from openvima.policies.variants import with_attributes  # noqa: E402
-from small_networks import (  # noqa: E402
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.errors import ConfigError
+from openvima.policies import preset
+from openvima.policies.build import build_network, policy_size
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.action_head import shift_actions
+from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
+from openvima.policies.pointer.inputs import HeadInputs
+from openvima.policies.pointer.model import Pointer
+from openvima.policies.pointer.words import Attributes
+from openvima.policies.processor import Processor
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
+from openvima.policies.variants import with_attributes
+from small_networks import (
     check_mixed_precision,
     collate_examples,
     examples_of,

@@ -4,16 +4,15 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.nn.actions import ActionTargets  # noqa: E402
-from openvima.policies.pointer.candidate_head import CandidatePointerHead  # noqa: E402
-from openvima.policies.pointer.candidates import PlaceCandidates  # noqa: E402
-from openvima.policies.pointer.config import CandidateHeadConfig  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, relative_yaw, rotate  # noqa: E402
-from small_networks import object_set, pointer_prompt  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies.nn.actions import ActionTargets
+from openvima.policies.pointer.candidate_head import CandidatePointerHead
+from openvima.policies.pointer.candidates import PlaceCandidates
+from openvima.policies.pointer.config import CandidateHeadConfig
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, relative_yaw, rotate
+from small_networks import object_set, pointer_prompt
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
 NUM_FIRST, NUM_SCENE = 3, 2

@@ -3,15 +3,14 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.policies.batch import PromptBatch  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.pointer.words import coreference  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from small_networks import narrow_small  # noqa: E402
+from openvima.env import TabletopEnv
+from openvima.policies.batch import PromptBatch
+from openvima.policies.build import build_network
+from openvima.policies.pointer.words import coreference
+from openvima.policies.processor import Processor
+from small_networks import narrow_small
 
 WORD = -1
 # This is a wug I . put the wug into the J . the K L

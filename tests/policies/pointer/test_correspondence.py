@@ -3,15 +3,14 @@
 from dataclasses import fields, replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.nn.image_encoders import ConvConfig  # noqa: E402
-from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
-from openvima.policies.pointer.config import CorrespondenceConfig  # noqa: E402
-from openvima.policies.pointer.correspondence import (  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies import preset
+from openvima.policies.nn.image_encoders import ConvConfig
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig
+from openvima.policies.pointer.config import CorrespondenceConfig
+from openvima.policies.pointer.correspondence import (
     Correspondence,
     ObjectFeatures,
     in_earlier_image,

@@ -5,24 +5,23 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.data.preprocessed import preprocess  # noqa: E402
-from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.perception.objects import GROUND_TRUTH, ObjectViews  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import PolicyConfig, build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.action_head import shift_actions  # noqa: E402
-from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet  # noqa: E402
-from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.tokenizer import benchmark_vocabulary  # noqa: E402
-from openvima.training.augmentation.prompts import with_motion_prompt  # noqa: E402
-from small_networks import (  # noqa: E402
+from openvima.data.preprocessed import preprocess
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.perception.objects import GROUND_TRUTH, ObjectViews
+from openvima.policies import preset
+from openvima.policies.build import PolicyConfig, build_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.action_head import shift_actions
+from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet
+from openvima.policies.processor import Processor
+from openvima.policies.tokenizer import benchmark_vocabulary
+from openvima.training.augmentation.prompts import with_motion_prompt
+from small_networks import (
     collate_examples,
     examples_of,
     narrow_small,

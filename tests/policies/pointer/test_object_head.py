@@ -4,16 +4,15 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets  # noqa: E402
-from openvima.policies.pointer.config import ObjectHeadConfig  # noqa: E402
-from openvima.policies.pointer.inputs import HeadInputs, at, carry, relative_yaw, yaw_to_bin  # noqa: E402
-from openvima.policies.pointer.object_head import ObjectPointerHead  # noqa: E402
-from openvima.scene import Action  # noqa: E402
-from small_networks import object_set, pointer_prompt  # noqa: E402
+from openvima.errors import ConfigError
+from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets
+from openvima.policies.pointer.config import ObjectHeadConfig
+from openvima.policies.pointer.inputs import HeadInputs, at, carry, relative_yaw, yaw_to_bin
+from openvima.policies.pointer.object_head import ObjectPointerHead
+from openvima.scene import Action
+from small_networks import object_set, pointer_prompt
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
 
