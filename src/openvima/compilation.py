@@ -17,7 +17,7 @@ from openvima.errors import ConfigError
 from openvima.input_files import cache_dir, temporary_cache_dir
 
 
-def njit(kernel: Callable[..., Any]) -> Callable[..., Any]:  # Any: kernels have signatures of their own
+def njit(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function when it is first called, and keep the result for later processes.
 
     It is kept beside the code, else in the cache, else among the temporary files of the user. Where none of

@@ -215,7 +215,7 @@ def cut(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
-def _shown(value: Any, depth: int) -> str:  # Any: any field
+def _shown(value: Any, depth: int) -> str:
     name = type(value).__name__
     if hasattr(value, "dtype") and hasattr(value, "shape"):  # an array or a tensor
         return f"<{value.dtype} {tuple(value.shape)}>"

@@ -141,7 +141,7 @@ def read_text(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputFileError(f"{file} is no UTF-8 text ({error.reason} at byte {error.start}).") from None
 
 
-def read_yaml(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:  # Any: plain values
+def read_yaml(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
     """Read a YAML file of plain values: mappings with text keys, lists, text, numbers, booleans and null.
 
     Raises:
@@ -157,7 +157,7 @@ def read_yaml(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:  # Any: pl
     return _checked(values, file)
 
 
-def read_json(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:  # Any: plain values
+def read_json(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
     """Read a JSON file of at most `max_bytes`; see `read_yaml`."""
     try:
         values = json.loads(read_text(file, max_bytes=max_bytes))
@@ -233,7 +233,7 @@ class _PlainLoader(yaml.SafeLoader):
 
     _depth = 0
 
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:  # Any: as in yaml
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Compose a node, unless it is an alias or lies too deep."""
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("it holds an alias; write the value itself")
@@ -244,9 +244,7 @@ class _PlainLoader(yaml.SafeLoader):
         self._depth -= 1
         return node
 
-    def construct_mapping(
-        self, node: yaml.MappingNode, deep: bool = False
-    ) -> dict[Any, Any]:  # Any: as in yaml
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping, unless a key is there twice, of which only the last would count."""
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
         if twice := [key for key, count in keys.items() if count > 1]:
@@ -254,7 +252,7 @@ class _PlainLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _checked(values: Any, file: Path) -> Any:  # Any: whatever the file holds
+def _checked(values: Any, file: Path) -> Any:
     """Return the values, if all are plain and of limited size."""
     level = [values]
     for _ in range(_MAX_DEPTH + 1):

@@ -43,7 +43,7 @@ _NOT_STARTED = (
     "the worker processes could not start. They import your script, which must be a file where all that runs "
     'stands below `if __name__ == "__main__":`; workers=1 needs no such process.'
 )
-# In a worker: the shared array of counts. Any: multiprocessing has no public type for it.
+# In a worker: the shared array of counts.
 _counters: Any = None
 
 Counts = Sequence[Sequence[int]]
@@ -55,7 +55,7 @@ Report = Callable[[int, int, str], None]
 class Job(Protocol):
     """A function of one item that calls `count` with the number of things done so far."""
 
-    def __call__(self, item: Any, count: Callable[..., None], /) -> Any:  # Any: up to the caller
+    def __call__(self, item: Any, count: Callable[..., None], /) -> Any:
         """Run the job."""
 
 
@@ -257,14 +257,14 @@ def exit_with_parent(timeout_s: float | None = PARENT_END_S) -> None:
         os._exit(1)
 
 
-def _start_worker(counters: Any) -> None:  # Any: see `_counters`
+def _start_worker(counters: Any) -> None:
     global _counters
     _counters = counters
     counters[-1] = 1
     init_worker()
 
 
-def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:  # Any: see `Job`
+def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:
     first = slot * num_counts
 
     def count(*numbers: int) -> None:
@@ -273,7 +273,7 @@ def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:  # Any: se
     return job(item, count)
 
 
-def _rows(counters: Any, num_counts: int) -> Counts:  # Any: see `_counters`
+def _rows(counters: Any, num_counts: int) -> Counts:
     flat = counters[:-1]
     return [flat[first : first + num_counts] for first in range(0, len(flat), num_counts)]
 
@@ -342,7 +342,7 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
     if address is None and ray.is_initialized():
         yield
         return
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}  # Any: options of `ray.init`
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options |= {
             "address": "local",
@@ -443,7 +443,7 @@ def _lost(ray: ModuleType) -> tuple[type[Exception], ...]:
     return errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError
 
 
-def _stop(ray: ModuleType, references: list[Any]) -> None:  # Any: Ray's references
+def _stop(ray: ModuleType, references: list[Any]) -> None:
     """Cancel jobs and wait for their clean-up."""
     if not references:
         return

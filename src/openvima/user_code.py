@@ -29,7 +29,7 @@ def is_code(source: str) -> bool:
     return _NAME.fullmatch(source) is not None
 
 
-def load_function(source: str, *, what: str) -> Callable[..., Any]:  # Any: it is the user's
+def load_function(source: str, *, what: str) -> Callable[..., Any]:
     """Import the module or file of a function, and return the function.
 
     Args:
@@ -51,7 +51,7 @@ def load_function(source: str, *, what: str) -> Callable[..., Any]:  # Any: it i
     return function
 
 
-def call_function(source: str, *, what: str) -> Any:  # Any: whatever it returns
+def call_function(source: str, *, what: str) -> Any:
     """Call a function without arguments, and return what it returns.
 
     Args:
@@ -199,7 +199,7 @@ def _module_name(path: Path, earlier: ModuleType | None) -> str:
     return f"openvima_user_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
 
 
-def _required_arguments(function: Callable[..., Any]) -> list[str]:  # Any: see `load_function`
+def _required_arguments(function: Callable[..., Any]) -> list[str]:
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # some built-in types have none

@@ -120,7 +120,7 @@ def main(
     return 0
 
 
-def _record_file(file: Path, policy: str, out: Path, **options: Any) -> int:  # Any: options of `play`
+def _record_file(file: Path, policy: str, out: Path, **options: Any) -> int:
     """Play the episode of a file."""
     from openvima.env import load_episode
     from openvima.evaluation import play

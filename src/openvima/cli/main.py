@@ -155,7 +155,7 @@ def _warnings_in_one_line() -> Iterator[None]:
     """Print warnings of unknown words as errors are, without the line of code that gave them."""
     shown = warnings.showwarning
 
-    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:  # Any: file, line
+    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
         if issubclass(category, UnknownWordWarning):
             _fail(f"{category.__name__}: {message}", 0)
         else:

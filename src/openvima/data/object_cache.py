@@ -249,7 +249,7 @@ def _schema(kind: InputKind, about: dict[str, str] | None = None) -> pa.Schema:
     return pa.schema({**lists, **_SCALARS, _CHECKSUM: pa.uint64()}, about)
 
 
-def _read_about(schema: pa.Schema) -> dict[str, Any]:  # Any: the kind is an `InputKind`
+def _read_about(schema: pa.Schema) -> dict[str, Any]:
     """Read version, kind, source and variant of a file, and check its columns."""
     about = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
     if about.get("version") != str(CACHE_VERSION):
@@ -361,7 +361,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     def __iter__(self) -> Iterator[PreprocessedEpisode]:
         return (self[index] for index in range(len(self)))
 
-    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
+    def __reduce__(self) -> tuple[Any, ...]:
         return ObjectCache, (self.dataset, self.kind, self._root, self.variant)
 
     def lengths(self) -> np.ndarray:

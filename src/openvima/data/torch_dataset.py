@@ -63,7 +63,7 @@ class DemonstrationDataset(Dataset):
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __getitem__(self, index: int | slice) -> Any:  # Any: what `transform` returns, or a part of these
+    def __getitem__(self, index: int | slice) -> Any:
         if isinstance(index, slice):
             part = copy(self)
             part._rows = self._rows[index]
@@ -76,7 +76,7 @@ class DemonstrationDataset(Dataset):
         return self.transform(self.demonstrations[row])
 
 
-class DemonstrationTensors(dict[str, Any]):  # Any: tensors, texts and numbers
+class DemonstrationTensors(dict[str, Any]):
     """A demonstration as `tensors_of` returns it, of a type that `DataLoader` collates by `collate`."""
 
 
@@ -105,7 +105,7 @@ def tensors_of(demo: Demonstration) -> DemonstrationTensors:
     return item
 
 
-def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:  # Any: tensors, texts and numbers
+def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:
     """Join B demonstrations to a batch; a plain `DataLoader` does so by itself.
 
     Args:
@@ -163,7 +163,7 @@ def _images(rgb: dict[str, np.ndarray], segm: dict[str, np.ndarray]) -> dict[str
     return {name: torch.from_numpy(np.array(images)) for name, images in named.items()}
 
 
-def send(batch: Any) -> Any:  # Any: whatever the user's training step takes
+def send(batch: Any) -> Any:
     """Return a batch that the main process gets, whether or not there is room in shared memory.
 
     Args:
@@ -202,21 +202,21 @@ class _Inline:
         batch: The batch.
     """
 
-    def __init__(self, batch: Any) -> None:  # Any: see `send`
+    def __init__(self, batch: Any) -> None:
         self._content = pickle.dumps(batch, pickle.HIGHEST_PROTOCOL)
 
-    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
+    def __reduce__(self) -> tuple[Any, ...]:
         return pickle.loads, (self._content,)
 
 
 class _TensorFinder(pickle.Pickler):
     """Finds the tensors in what it writes."""
 
-    def __init__(self, *args: Any, **options: Any) -> None:  # Any: as for `Pickler`
+    def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.found: list[torch.Tensor] = []
 
-    def persistent_id(self, obj: Any) -> Any:  # Any: as in pickle
+    def persistent_id(self, obj: Any) -> Any:
         """Note a tensor, and write nothing of it."""
         if not isinstance(obj, torch.Tensor):
             return None
@@ -228,6 +228,6 @@ class _TensorFinder(pickle.Pickler):
 class _Nowhere(io.RawIOBase):
     """Takes what is written, and keeps nothing."""
 
-    def write(self, content: Any, /) -> int:  # Any: a buffer
+    def write(self, content: Any, /) -> int:
         """Return its length."""
         return len(content)

@@ -341,7 +341,7 @@ class Composition:
         """Move an object to a position and heading, rounded to millimetres and tenths of a degree."""
         return self.changed(handle, position=_rounded(position), yaw_deg=round(float(yaw_deg), _ROUND_DEG))
 
-    def changed(self, handle: str, **fields: Any) -> "Composition":  # Any: fields of `SceneObject`
+    def changed(self, handle: str, **fields: Any) -> "Composition":
         """Change fields of an object.
 
         Raises:
@@ -371,7 +371,7 @@ class Composition:
             self, prompt=prompt, images=used, goals=goals, max_steps=max_steps, end_effector=end_effector
         )
 
-    def with_image(self, slot: str, image: Any) -> "Composition":  # Any: as for `compose`
+    def with_image(self, slot: str, image: Any) -> "Composition":
         """Show an image at a placeholder, which is added at the end of the prompt if it is not there."""
         shown = f"{{{slot}}}"
         prompt = self.prompt if shown in self.prompt else f"{self.prompt} {shown}"
@@ -398,7 +398,7 @@ class Composition:
         return text.strip()[1:-1]
 
 
-def parse_goals(text: str) -> tuple[Any, ...]:  # Any: plain values; `compose` checks them
+def parse_goals(text: str) -> tuple[Any, ...]:
     """Read goals as `Composition.goals_text` writes them.
 
     Raises:

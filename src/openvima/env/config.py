@@ -113,7 +113,7 @@ class EnvConfig:
         return without_published(record)
 
 
-def without_published(record: dict[str, Any]) -> dict[str, Any]:  # Any: JSON
+def without_published(record: dict[str, Any]) -> dict[str, Any]:
     """Return a record without prompts, task options and control that are as published."""
     published = {"prompts": MULTIMODAL, "task_options": "", "control": PRIMITIVES}
     return {name: value for name, value in record.items() if value != published.get(name, ...)}

@@ -176,7 +176,7 @@ def _photo_beside(name: str, folder: Path | None) -> PhotoImage:
     return read_photo(file)
 
 
-def _encode(value: Any, kind: Any) -> Any:  # Any: a part of an episode, annotations, plain values
+def _encode(value: Any, kind: Any) -> Any:
     """Return plain values: records as mappings without fields that have their default."""
     if kind in _KINDS and type(value) not in _KINDS[kind]:
         allowed = ", ".join(known.__name__ for known in _KINDS[kind])
@@ -199,13 +199,13 @@ def _encode(value: Any, kind: Any) -> Any:  # Any: a part of an episode, annotat
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _entry_kinds(kind: Any, count: int) -> Sequence[Any]:  # Any: annotations
+def _entry_kinds(kind: Any, count: int) -> Sequence[Any]:
     """Annotations of a tuple's entries."""
     arguments = typing.get_args(_without_none(kind))
     return [arguments[0]] * count if arguments[-1] is Ellipsis else arguments
 
 
-def _without_none(kind: Any) -> Any:  # Any: annotations
+def _without_none(kind: Any) -> Any:
     """The kind of an optional field."""
     arguments = typing.get_args(kind)
     if type(None) in arguments and len(arguments) == 2:
@@ -213,7 +213,7 @@ def _without_none(kind: Any) -> Any:  # Any: annotations
     return kind
 
 
-def _decode(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, annotations
+def _decode(value: Any, kind: Any, where: str) -> Any:
     """Return the value of an annotation; the inverse of `_encode`, for values that nobody has checked."""
     if kind in _KINDS:
         if not isinstance(value, Mapping) or not isinstance(value.get("type"), str):
@@ -241,7 +241,7 @@ def _decode(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, ann
     return _scalar(value, kind, where)
 
 
-def _record(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, a dataclass, a record
+def _record(value: Any, kind: Any, where: str) -> Any:
     if not isinstance(value, Mapping):
         raise InputFileError(f"{where} is {shown(value)}; it must be a mapping.")
     hints = typing.get_type_hints(kind)
@@ -258,7 +258,7 @@ def _record(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, a d
         raise InputFileError(f"{where}: {error}") from None
 
 
-def _tuple(value: Any, kind: Any, where: str) -> tuple[Any, ...]:  # Any: plain values, annotations
+def _tuple(value: Any, kind: Any, where: str) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple) or len(value) > MAX_ENTRIES:
         raise InputFileError(
             f"{where} is {shown(value)}; it must be a list of at most {MAX_ENTRIES} entries."
@@ -270,7 +270,7 @@ def _tuple(value: Any, kind: Any, where: str) -> tuple[Any, ...]:  # Any: plain 
     return tuple(_decode(entry, entry_kind, f"{where}[{n}]") for n, (entry, entry_kind) in enumerate(pairs))
 
 
-def _scalar(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, annotations
+def _scalar(value: Any, kind: Any, where: str) -> Any:
     if kind is bool and isinstance(value, bool):
         return value
     if kind is int and type(value) is int:
@@ -332,7 +332,7 @@ def _check(episode: Episode) -> None:
         raise InputFileError(f"num_required is {problem.num_required} of {len(problem.goals)} goals.")
 
 
-def _ids_of(record: Any) -> set[int]:  # Any: a goal or constraint
+def _ids_of(record: Any) -> set[int]:
     """Ids of the objects that a goal or constraint names."""
     single = (getattr(record, name, None) for name in ("object_id", "relative_to"))
     return {number for number in (*single, *getattr(record, "object_ids", ())) if number is not None}

@@ -68,7 +68,7 @@ class VideoFrame:
     __repr__ = brief_repr
 
 
-def _arrays(action: Action | ToolCommand) -> Any:  # Any: as `from_arrays` or `from_array` takes it
+def _arrays(action: Action | ToolCommand) -> Any:
     """Return the arrays of an action, whose values its constructor does not check."""
     try:
         return action.to_arrays() if isinstance(action, Action) else action.to_array()
@@ -125,7 +125,7 @@ class PrimitiveRun:
         """Whether the step limit is reached."""
         return self.num_steps >= self.episode.max_steps * steps_per_primitive(self.control)
 
-    def checked(self, action: object) -> Any:  # Any: an action of this control
+    def checked(self, action: object) -> Any:
         """Validate an action.
 
         Raises:
@@ -134,7 +134,7 @@ class PrimitiveRun:
         arrays: Any = _arrays(action) if isinstance(action, Action) else action
         return Action.from_arrays(arrays)
 
-    def step(self, action: Any, *, realtime: bool) -> None:  # Any: as `checked` returns it
+    def step(self, action: Any, *, realtime: bool) -> None:
         """Execute a checked action, and evaluate the goals."""
         self.frames = []
         assert isinstance(self.world, World)

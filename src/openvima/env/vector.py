@@ -7,7 +7,7 @@ Both have Gymnasium's interface, spaces and autoreset modes, and validate calls 
 import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast  # Any: actions, observations and infos are nested dictionaries
+from typing import Any, cast
 
 import gymnasium
 import numpy as np

@@ -55,7 +55,7 @@ class AblatedInput:
     id_map: np.ndarray | None = None
     jitter: BoxJitter | None = None
 
-    def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:  # Any: as the environment's
+    def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the next observation of the episode, with mapped ids and moved boxes."""
         if self.id_map is not None and "segm" in observation:
             observation = {**observation, "segm": renumbered(observation["segm"], self.id_map)}

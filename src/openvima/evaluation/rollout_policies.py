@@ -109,7 +109,7 @@ class PromptedRolloutPolicy:
 
     def __init__(
         self,
-        policy: Any,  # Any: third parties need no base class
+        policy: Any,
         ablation: str = "",
         *,
         name: str = "policy",
@@ -234,7 +234,7 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = Fals
     """
     if batch.source == ORACLE:
         return OracleRolloutPolicy()
-    options: dict[str, Any] = {  # Any: of several kinds
+    options: dict[str, Any] = {
         "device": batch.device,
         "precision": batch.precision,
         "boxes": batch.boxes,
@@ -285,7 +285,7 @@ def load_own_rollout_policy(
     PolicySource(source, source, trust_code).check()
     if source == ORACLE:
         return OracleRolloutPolicy()
-    options: dict[str, Any] = {}  # Any: of several kinds
+    options: dict[str, Any] = {}
     if temperature and PolicyRef.parse(source).kind not in (RANDOM, "remote", "code"):
         require_torch(f"policy {source!r}")
         import torch
@@ -296,17 +296,13 @@ def load_own_rollout_policy(
 
 
 @lru_cache(maxsize=1)
-def _load_policy(
-    source: str, fingerprint: str, **options: Any
-) -> Any:  # Any: see `PromptedRolloutPolicy`; options of several kinds
+def _load_policy(source: str, fingerprint: str, **options: Any) -> Any:
     if PolicyRef.parse(source).kind == "remote":
         _load_policy.cache_clear()  # ends the connection before: a server may let in one client only
     return _build_policy(source, **options)
 
 
-def _build_policy(
-    source: str, *, boxes: str, precision: str = "", **options: Any
-) -> Any:  # Any: as for `_load_policy`
+def _build_policy(source: str, *, boxes: str, precision: str = "", **options: Any) -> Any:
     from openvima.policies import load_policy
 
     if PolicyRef.parse(source).kind == "remote":

@@ -50,7 +50,7 @@ class PreparedEvaluation:
 
     config: EvaluationConfig
     batches: tuple[Batch, ...]
-    policies: dict[str, dict[str, Any]]  # Any: plain values
+    policies: dict[str, dict[str, Any]]
     versions: dict[str, str]
     boxes: str = ""
 

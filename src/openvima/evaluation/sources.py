@@ -99,7 +99,7 @@ class PolicySource:
         elif self.kind == "run" and not self.ref.has_weights:
             raise UnknownPolicyError(unknown_policy(self.source, NAMED_POLICIES))
 
-    def record(self) -> dict[str, Any]:  # Any: plain values
+    def record(self) -> dict[str, Any]:
         """What the policy is.
 
         Returns:
@@ -188,7 +188,7 @@ def weights_hash(source: str | Path) -> str:
     return digest.hexdigest()
 
 
-def object_record(policy: Policy) -> dict[str, Any]:  # Any: plain values
+def object_record(policy: Policy) -> dict[str, Any]:
     """What is known of a policy object: "modalities" of its observations, and "weights_sha256" if it has any.
 
     Raises:

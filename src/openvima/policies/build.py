@@ -27,12 +27,12 @@ PolicyConfig = VimaConfig | GatoConfig | FlamingoConfig | GptConfig | MidasConfi
 ARCHITECTURES: dict[str, type[PolicyConfig]] = {kind.architecture: kind for kind in get_args(PolicyConfig)}
 
 
-def config_to_dict(config: PolicyConfig) -> dict[str, Any]:  # Any: plain YAML values
+def config_to_dict(config: PolicyConfig) -> dict[str, Any]:
     """Convert to nested dictionaries of plain values, the architecture first."""
     return {"architecture": config.architecture, **asdict(config)}
 
 
-def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whatever a file holds
+def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:
     """Inverse of `config_to_dict`.
 
     Raises:

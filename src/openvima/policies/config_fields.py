@@ -33,7 +33,7 @@ def check_limits(config: object, where: str) -> None:
             check_field(hint, value, f"{where}.{name}")
 
 
-def check_field(hint: Any, value: Any, where: str) -> None:  # Any: a type, and whatever a file holds
+def check_field(hint: Any, value: Any, where: str) -> None:
     """Check one value against its annotation; configs inside configs are not checked.
 
     Raises:
@@ -56,7 +56,7 @@ def check_field(hint: Any, value: Any, where: str) -> None:  # Any: a type, and 
         raise ConfigError(f"{where} is {short(value)}; it must be {allowed}.")
 
 
-def _allowed(kind: Any, value: Any, name: str) -> str | None:  # Any: as above
+def _allowed(kind: Any, value: Any, name: str) -> str | None:
     """Return what is allowed instead of a value; None if it is allowed."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if get_origin(kind) is Literal:
@@ -73,7 +73,7 @@ def _allowed(kind: Any, value: Any, name: str) -> str | None:  # Any: as above
     return None
 
 
-def build_config(kind: type, values: Any, where: str) -> Any:  # Any: the dataclass, and what a file holds
+def build_config(kind: type, values: Any, where: str) -> Any:
     """Build a config from nested mappings of its fields.
 
     Args:
@@ -103,7 +103,7 @@ def build_config(kind: type, values: Any, where: str) -> Any:  # Any: the datacl
         raise ConfigError(f"{where}: {error}.") from error
 
 
-def _value(hint: Any, value: Any, where: str) -> Any:  # Any: a type as written in the dataclass
+def _value(hint: Any, value: Any, where: str) -> Any:
     if isinstance(hint, UnionType):
         if value is None and NoneType in get_args(hint):
             return None
@@ -114,7 +114,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:  # Any: a type as written 
     return tuple(value) if isinstance(value, list) else value
 
 
-def _num_shared_fields(kind: Any, value: Any) -> int:  # Any: a type as written in the dataclass
+def _num_shared_fields(kind: Any, value: Any) -> int:
     """Score how well a mapping matches the fields of a dataclass, to resolve unions."""
     if not is_dataclass(kind) or not isinstance(value, Mapping):
         return 0

@@ -283,7 +283,7 @@ class NetworkPolicy(Policy):
         path_or_hub_id: str | Path,
         *,
         tokenizer: Tokenizer | None = None,
-        **options: Any,  # Any: of several kinds
+        **options: Any,
     ) -> "NetworkPolicy":
         """Load a policy from a folder, a file or the Hugging Face Hub.
 

@@ -73,9 +73,7 @@ def held_out_data(folder: str | Path) -> list[str]:
     return [echo(name) for name in found if isinstance(name, str)] if isinstance(found, list) else []
 
 
-def _run_setting(
-    folder: str | Path, name: str, *, section: str = "training"
-) -> tuple[Path, Any]:  # Any: YAML
+def _run_setting(folder: str | Path, name: str, *, section: str = "training") -> tuple[Path, Any]:
     """Return a setting of the run that a folder belongs to, None without any, and the file that holds it."""
     path = Path(folder)
     run = path.absolute().parent
@@ -121,7 +119,7 @@ def policy_of_run(folder: str | Path, code: LearnerCode, *, device: str = "cpu")
     return checked_policy(learner.policy(), f"policy() of {type(learner).__name__} returned")
 
 
-def checked_policy(policy: Any, what: str) -> Policy:  # Any: third parties need no base class
+def checked_policy(policy: Any, what: str) -> Policy:
     """Return an object if it has the methods of a policy.
 
     Args:
@@ -149,7 +147,7 @@ def checked_policy(policy: Any, what: str) -> Policy:  # Any: third parties need
     return policy
 
 
-def parameters_hash(policy: Any) -> str | None:  # Any: see `checked_policy`
+def parameters_hash(policy: Any) -> str | None:
     """SHA-256 of the weights of a policy object, as hexadecimal text; None if it offers none.
 
     A policy offers weights by `weights_hash`, a text or a method that returns one, or by being or having as
@@ -169,7 +167,7 @@ def parameters_hash(policy: Any) -> str | None:  # Any: see `checked_policy`
     torch = sys.modules.get("torch")
     if torch is None:  # then no policy can have a module of it
         return None
-    held: Mapping[str, Any] = {"": policy, **getattr(policy, "__dict__", {})}  # Any: attributes
+    held: Mapping[str, Any] = {"": policy, **getattr(policy, "__dict__", {})}
     modules = {name: value for name, value in sorted(held.items()) if isinstance(value, torch.nn.Module)}
     if "" in modules:
         modules = {"": policy}
@@ -188,7 +186,7 @@ def load_policy(
     *,
     seed: int = 0,
     trust_code: bool = False,
-    **options: Any,  # Any: of several kinds
+    **options: Any,
 ) -> Policy:
     """Load a policy by name, from a folder or file, or from the Hugging Face Hub.
 
@@ -248,6 +246,6 @@ def load_policy(
     return NetworkPolicy.from_pretrained(source, **options)
 
 
-def _check_extractor(source: str, options: Mapping[str, Any]) -> None:  # Any: see `load_policy`
+def _check_extractor(source: str, options: Mapping[str, Any]) -> None:
     if options.get("extractor") is not None:
         raise ConfigError(f"{source} extracts objects itself; leave the detector out.")

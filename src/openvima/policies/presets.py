@@ -28,7 +28,7 @@ PUBLISHED = ("vima", "gato", "flamingo", "gpt", "midas")  # architectures of the
 POLICY_FILES_VARIABLE = "OPENVIMA_POLICY_FILES"
 ENTRY_POINTS = "openvima.policies"
 _NAME = re.compile(r"\w[\w-]{0,99}", re.ASCII)
-_Make = TypeVar("_Make", bound=Callable[[], Any])  # Any: a learner, see `openvima.training`
+_Make = TypeVar("_Make", bound=Callable[[], Any])
 _own: dict[str, str] = {}  # registered name -> MODULE:FUNCTION or FILE.py:FUNCTION
 # Repeats the keys of `sizes.SIZES`, so that listing presets does not import torch; a test compares them.
 SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")

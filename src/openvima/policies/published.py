@@ -192,7 +192,7 @@ class PublishedAdapter:
     rules: tuple[Rule, ...]
     cfg_names: tuple[str, ...]
     decoder: str
-    build: Callable[[Size], Any]  # Any: the config of the architecture
+    build: Callable[[Size], Any]
 
 
 def to_ours(rules: Iterable[Rule], name: str) -> tuple[str, bool] | None:
@@ -380,7 +380,7 @@ def load_published(file: str | Path) -> PolicyNetwork:
 
 
 def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapping[str, object]]:
-    # Any: whatever the file holds
+
     if not isinstance(values, Mapping) or any(
         not isinstance(values.get(name), Mapping) for name in ("state_dict", "cfg")
     ):

@@ -59,7 +59,7 @@ def read_safetensors(file: Path) -> dict[str, torch.Tensor]:
     return tensors
 
 
-def read_archive(file: Path, *, classes: Collection[type] = ()) -> Any:  # Any: whatever the file holds
+def read_archive(file: Path, *, classes: Collection[type] = ()) -> Any:
     """Read an archive of tensors and plain values, as `torch.save` writes it.
 
     Args:
@@ -202,7 +202,7 @@ def _check_pickle(content: bytes, classes: Container[str]) -> None:
         )
 
 
-def _check_sizes(values: Any, num_bytes: int) -> None:  # Any: whatever the file holds
+def _check_sizes(values: Any, num_bytes: int) -> None:
     """Refuse tensors that are larger than their storage, which would grow when they are copied."""
     total, level = 0, [values]
     while level:

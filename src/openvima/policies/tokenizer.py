@@ -264,7 +264,7 @@ def _is_word(word: str) -> bool:
     return not _is_number(word)
 
 
-def _texts(values: Any) -> tuple[str, ...]:  # Any: whatever a file holds
+def _texts(values: Any) -> tuple[str, ...]:
     if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
         raise PromptError("words and texture_words must be lists of text.")
     return tuple(values)

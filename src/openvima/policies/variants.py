@@ -20,7 +20,7 @@ TEXT_ENCODERS = ("small", *T5_SIZES)
 IMAGE_TOKENS = ("objects", "object-perceiver", "image-perceiver", "patches", "image")
 
 
-def with_variant(config: PolicyConfig, switches: Mapping[str, Any]) -> PolicyConfig:  # Any: of several kinds
+def with_variant(config: PolicyConfig, switches: Mapping[str, Any]) -> PolicyConfig:
     """Return the same network with other parts.
 
     Args:

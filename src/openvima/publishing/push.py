@@ -173,7 +173,7 @@ def _of_weights(path: Path, sha256: str) -> Results:
     return replace(results, rows=rows, policies={named[0]: results.policies[named[0]]})
 
 
-def _model_index(name: HubName, scores: Results) -> dict[str, Any]:  # Any: plain values
+def _model_index(name: HubName, scores: Results) -> dict[str, Any]:
     """Level means as the Hub lists them."""
     return {
         "name": name.repo.partition("/")[2],
@@ -243,7 +243,7 @@ def _run_folder(folder: Path) -> Path | None:
     return None
 
 
-def _last_session(run: Path) -> Mapping[str, Any]:  # Any: JSON
+def _last_session(run: Path) -> Mapping[str, Any]:
     try:
         lines = read_text(run / _SESSIONS_FILE, max_bytes=_MAX_LOG_BYTES).splitlines()
         return _mapping(json.loads(lines[-1]))
@@ -251,12 +251,12 @@ def _last_session(run: Path) -> Mapping[str, Any]:  # Any: JSON
         return {}
 
 
-def _mapping(value: object) -> Mapping[str, Any]:  # Any: plain values
+def _mapping(value: object) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _setting(values: Mapping[str, Any], dotted: str) -> Any:  # Any: plain values
-    found: Any = values  # Any: as above
+def _setting(values: Mapping[str, Any], dotted: str) -> Any:
+    found: Any = values
     for name in dotted.split("."):
         found = _mapping(found).get(name)
     return found
@@ -407,7 +407,7 @@ def checked_licence(licence: str) -> str:
     return licence.lower()
 
 
-def front_matter(values: Mapping[str, Any]) -> str:  # Any: plain values
+def front_matter(values: Mapping[str, Any]) -> str:
     """Write the metadata of a card."""
     return f"---\n{yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)}---\n"
 

@@ -130,7 +130,7 @@ _LEAST_GAP = 0.12  # between named values of an axis, as a fraction of its lengt
 _DODGE = 0.16  # between the curves of named values, which are 1 apart
 _CHARACTER_IN = 0.055  # height of a tilted name, for each of its characters
 _MAX_TILTED = 24  # characters of a tilted name
-_STYLE: Any = {  # Any: the type of matplotlib's settings is not public
+_STYLE: Any = {
     "svg.hashsalt": "openvima",  # element names in the file are the same in every run
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -315,7 +315,7 @@ def curve_chart(
 
 def _panel(height_in: float, margins_in: tuple[float, float, float, float]) -> tuple[Any, Any]:
     """Make a figure with one pair of axes; margins are left, bottom, right, top."""
-    from matplotlib import rc_context  # Any above: matplotlib is only imported where something is drawn
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     left, bottom, right, top = margins_in
@@ -332,7 +332,7 @@ def _series(variable: str) -> str:
     return "#04" + f"{sum(ord(c) * 31**i for i, c in enumerate(variable)) % 0xFFFF:04x}"
 
 
-def _themed(figure: Any, name: str, title: str, variables: Iterable[str]) -> str:  # Any: see `_panel`
+def _themed(figure: Any, name: str, title: str, variables: Iterable[str]) -> str:
     """Turn a figure into an `<svg>` element for the page.
 
     Args:

@@ -152,7 +152,7 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
     return " ".join(words)
 
 
-def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain values
+def _policy_word(name: str, what: Mapping[str, Any]) -> str:
     """Name a policy for `--policy`, with a placeholder for the path of its weights."""
     kind = what.get("kind")
     preset = what.get("preset")

@@ -70,7 +70,7 @@ def role(results: Results, policy: str) -> str:
     return _ROLES.get(record.get("kind", "run"), _ROLES["run"]) + _segmentation(record) + left_out + saw
 
 
-def _segmentation(record: Mapping[str, Any]) -> str:  # Any: plain values
+def _segmentation(record: Mapping[str, Any]) -> str:
     """Say whether a policy of others was sent the segmentation, if the results do."""
     metadata = record.get("metadata")
     asked = (metadata if isinstance(metadata, dict) else record).get("modalities")

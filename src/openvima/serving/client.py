@@ -72,7 +72,7 @@ class Connection:
 
         return self._socket.state is State.OPEN
 
-    def ask(self, request: bytes, kind: str) -> dict[str, Any]:  # Any: what was sent
+    def ask(self, request: bytes, kind: str) -> dict[str, Any]:
         """Send a request and wait for its answer.
 
         Args:
@@ -199,7 +199,7 @@ def _opened(url: str, token: str | None, timeout_s: float) -> "Iterator[Socket]"
         yield connection
 
 
-def _map_in(data: bytes) -> dict[str, Any]:  # Any: what was sent
+def _map_in(data: bytes) -> dict[str, Any]:
     message = unpack(data)
     if not isinstance(message, dict):
         raise MessageError(f"a {type(message).__name__} came where a map must be")
@@ -258,7 +258,7 @@ class RemotePolicy(Policy):
         with suppress(Exception):  # at the end of the program parts of it are gone
             self.close()
 
-    def record(self) -> dict[str, Any]:  # Any: plain values
+    def record(self) -> dict[str, Any]:
         """What the policy is, for results: all that the server says about it, apart from its limits."""
         return _without_limits(self.metadata)
 
@@ -282,7 +282,7 @@ class RemotePolicy(Policy):
         connection.ask(request, "reset")
         self._num_episodes = len(prompts)
 
-    def act(self, observations: Sequence[Mapping | None]) -> list[Any]:  # Any: of its control
+    def act(self, observations: Sequence[Mapping | None]) -> list[Any]:
         """Ask the server for the next action of every episode.
 
         Raises:
@@ -350,7 +350,7 @@ def _without_limits(metadata: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in metadata.items() if key != "limits"}
 
 
-def describe(url: str) -> dict[str, Any]:  # Any: plain values
+def describe(url: str) -> dict[str, Any]:
     """Ask a server what it serves; see `RemotePolicy` for the errors."""
     with RemotePolicy(url) as policy:
         return policy.record()

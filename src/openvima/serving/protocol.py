@@ -68,7 +68,7 @@ def pack(message: object) -> bytes:
     return packed
 
 
-def unpack(data: bytes) -> Any:  # Any: whatever was sent
+def unpack(data: bytes) -> Any:
     """Turn bytes into plain values and arrays; the opposite of `pack`.
 
     Args:
@@ -109,7 +109,7 @@ class _ItemCounter:
         self._count(len(values))
         return values
 
-    def map_or_array(self, entries: dict) -> Any:  # Any: a map stays one, an array or number becomes one
+    def map_or_array(self, entries: dict) -> Any:
         self._count(len(entries))
         if _ARRAY in entries:
             return _unpack_array(entries)
@@ -226,7 +226,7 @@ def check_token(token: str | None) -> None:
         raise ConfigError("the token must be of printable ASCII characters without spaces, and not empty.")
 
 
-def encode_prompt(prompt: RenderedPrompt) -> dict[str, Any]:  # Any: plain values and arrays
+def encode_prompt(prompt: RenderedPrompt) -> dict[str, Any]:
     """Turn a prompt into plain values and arrays."""
     return {"text": prompt.text, "images": [_encode_image(image) for image in prompt.images.values()]}
 
@@ -256,7 +256,7 @@ def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
     return RenderedPrompt(text, by_name)
 
 
-def encode_observation(observation: Mapping | None) -> dict[str, Any] | None:  # Any: see `encode_prompt`
+def encode_observation(observation: Mapping | None) -> dict[str, Any] | None:
     """Turn an observation (`rgb`, `segm`, `joints`, `tool`, `ee`) into plain values; None stays None."""
     if observation is None:
         return None
@@ -295,7 +295,7 @@ def decode_observation(
     return fields
 
 
-def encode_action(action: Any, control: str = PRIMITIVES) -> Any:  # Any: see `decode_action`
+def encode_action(action: Any, control: str = PRIMITIVES) -> Any:
     """Turn an action of a policy into arrays; None stays None.
 
     Raises:
@@ -412,7 +412,7 @@ def type_of(message: object) -> str | None:
     return kind if isinstance(kind, str) else None
 
 
-def _encode_image(image: PromptImage) -> dict[str, Any]:  # Any: see `encode_prompt`
+def _encode_image(image: PromptImage) -> dict[str, Any]:
     records = [{key: getattr(record, key) for key in _RECORD_TYPES} for record in image.objects]
     rgb, segm = dict(image.rgb), dict(image.segm)
     return {"name": image.name, "kind": image.kind, "rgb": rgb, "segm": segm, "objects": records}
@@ -440,7 +440,7 @@ def _decode_record(message: object, where: str) -> ObjectRecord:
     return ObjectRecord(**fields)
 
 
-def _check_views(fields: Mapping[str, Any], where: str) -> None:  # Any: what was sent
+def _check_views(fields: Mapping[str, Any], where: str) -> None:
     """Check `rgb` and `segm`: uint8 images of one size a view, with at most `MAX_PIXELS`."""
     sizes: dict[object, tuple[int, ...]] = {}
     for part in (part for part in ("rgb", "segm") if part in fields):
@@ -466,7 +466,7 @@ def _check_views(fields: Mapping[str, Any], where: str) -> None:  # Any: what wa
 
 def _map(
     message: object, where: str, *, required: tuple[str, ...], optional: tuple[str, ...] = ()
-) -> dict[str, Any]:  # Any: what was sent
+) -> dict[str, Any]:
     """Check that something is a map with these entries and no others."""
     fields = _typed(message, dict, where)
     missing = [key for key in required if key not in fields]
@@ -478,7 +478,7 @@ def _map(
     return fields
 
 
-def _typed(value: object, kind: type, where: str) -> Any:  # Any: of type `kind`
+def _typed(value: object, kind: type, where: str) -> Any:
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         names = {dict: "a map", list: "a list", str: "a text", int: "a whole number", np.ndarray: "an array"}
         raise MessageError(f"{where} is {_shown(value)}; it must be {names[kind]}.")

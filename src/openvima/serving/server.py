@@ -120,7 +120,7 @@ class ServerConfig:
         check_prompts(self.prompts)
 
 
-def server_config(**settings: Any) -> ServerConfig:  # Any: of several kinds
+def server_config(**settings: Any) -> ServerConfig:
     """Return the config with these fields.
 
     Raises:
@@ -300,9 +300,9 @@ def serve(
     policy: Policy,
     *,
     port: int = 8000,
-    about: Mapping[str, Any] | None = None,  # Any: plain values
+    about: Mapping[str, Any] | None = None,
     ready: Callable[[str], None] | None = None,
-    **settings: Any,  # Any: of several kinds
+    **settings: Any,
 ) -> None:
     """Serve a policy until Ctrl-C.
 
@@ -332,8 +332,8 @@ def serve_in_thread(
     policy: Policy,
     *,
     port: int = 0,
-    about: Mapping[str, Any] | None = None,  # Any: plain values
-    **settings: Any,  # Any: of several kinds
+    about: Mapping[str, Any] | None = None,
+    **settings: Any,
 ) -> Iterator[str]:
     """Serve a policy in a thread of this process while the block runs.
 
@@ -512,7 +512,7 @@ async def _whole_message(connection: "ServerConnection") -> bytes | str:
     """Receive a message of limited size and number of fragments."""
     from websockets.frames import CloseCode
 
-    parts: list[Any] = []  # Any: all bytes or all texts
+    parts: list[Any] = []
     allowed = float(MAX_FRAGMENTS)
     async for part in connection.recv_streaming():
         parts.append(part)

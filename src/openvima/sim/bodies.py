@@ -61,7 +61,7 @@ class Bodies:
         self._positions = self.data.qpos.reshape(-1, 7)  # views: writing to them moves the bodies
         self._velocities = self.data.qvel.reshape(-1, 6)
 
-    def __getstate__(self) -> dict[str, Any]:  # Any: attributes of all kinds
+    def __getstate__(self) -> dict[str, Any]:
         state = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, state, _STATE)
         rebuilt = ("model", "data", "_positions", "_velocities")

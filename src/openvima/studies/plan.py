@@ -173,7 +173,7 @@ class _Planner:
 
     def _config(self, settings: Settings, data: Path, out: Path, seed: int) -> TrainingConfig:
         scale, inputs = self.inputs.scale, self.inputs
-        merged: dict[str, Any] = recipe_settings(scale.recipe)  # Any: values of settings
+        merged: dict[str, Any] = recipe_settings(scale.recipe)
         for others in (scale.settings, self.study.settings, settings):
             merged = override(merged, others)
         paths = {"data": data, "out": out, "seed": seed, "assets": inputs.assets}
@@ -208,7 +208,7 @@ def _folder_name(label: str) -> str:
     return re.sub(r"[^\w.+-]+", "-", label).strip("-.") or "run"
 
 
-def record_of(study: Study, inputs: StudyInputs, device: str | None) -> dict[str, Any]:  # Any: JSON
+def record_of(study: Study, inputs: StudyInputs, device: str | None) -> dict[str, Any]:
     """Return what identifies the content of a study's folder, the number of seeds apart."""
     return {
         "study": study.name,
@@ -223,7 +223,7 @@ def record_of(study: Study, inputs: StudyInputs, device: str | None) -> dict[str
     }
 
 
-def _plain(value: Any) -> Any:  # Any: JSON
+def _plain(value: Any) -> Any:
     """Return plain JSON values."""
     if hasattr(value, "__dataclass_fields__"):
         return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}

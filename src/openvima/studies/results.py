@@ -141,7 +141,7 @@ def _ablations(results: Sequence[Results]) -> list[str]:
     return [name for name in dict.fromkeys(row.ablation for row in results[0].rows) if name]
 
 
-def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:  # Any: JSON
+def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:
     """Read the costs of the trainings, by label; those that others start from under an empty one."""
     costs: dict[str, list[dict[str, Any]]] = {}
     for training in (*plan.initial, *plan.trainings):
@@ -157,7 +157,7 @@ def study_page(
     inputs: StudyInputs,
     points: Sequence[Point],
     *,
-    costs: Mapping[str, Sequence[Mapping[str, Any]]],  # Any: JSON
+    costs: Mapping[str, Sequence[Mapping[str, Any]]],
     versions: Mapping[str, str],
     command: str,
 ) -> str:
@@ -243,7 +243,7 @@ def _rows(points: Sequence[Point]) -> dict[tuple[str, str], dict[str, Point]]:
     return rows
 
 
-def _mean_costs(costs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:  # Any: JSON
+def _mean_costs(costs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Costs of one run: of a training, on average over its seeds."""
     seconds = [cost["cpu_seconds"] for cost in costs]
     return {**costs[0], "cpu_seconds": sum(seconds) / len(seconds), "total": sum(seconds)}

@@ -59,7 +59,7 @@ class Execution:
         """Whether all work is done in this process."""
         return self.engine == "processes" and self.workers in (None, 1)
 
-    def imap(self, job: Callable[..., Any], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:  # Any: jobs
+    def imap(self, job: Callable[..., Any], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
         """Apply a job to every item."""
         if self.engine == "processes":
             yield from imap_unordered(job, items, self.workers or 1)
@@ -155,7 +155,7 @@ def check_plan(plan: Plan, inputs: StudyInputs) -> None:
             prepare(evaluation.config)
 
 
-def _claim(out: Path, record: dict[str, Any]) -> None:  # Any: JSON
+def _claim(out: Path, record: dict[str, Any]) -> None:
     """Note what the folder holds, or check it.
 
     Raises:

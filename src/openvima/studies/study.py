@@ -50,7 +50,7 @@ class Scale:
 
     name: str
     recipe: str
-    settings: Mapping[str, Any]  # Any: values of any setting
+    settings: Mapping[str, Any]
     tasks: tuple[str, ...]
     new_tasks: tuple[str, ...]
     demonstrations: int
@@ -64,7 +64,7 @@ class Scale:
 
 
 # Contrastive pretraining takes most of a training: it is shorter than in the recipe, and equal for all runs.
-NANO_POINTER: Mapping[str, Any] = MappingProxyType(  # Any: values of any setting
+NANO_POINTER: Mapping[str, Any] = MappingProxyType(
     {"preset": NANO, "pretraining.steps": 150, "pretraining.num_scenes": 1200}
 )
 # Two cores: one training takes minutes.
@@ -107,7 +107,7 @@ def scale_named(name: str) -> Scale:
     return SCALES[name]
 
 
-Settings = Mapping[str, Any]  # of `TrainingConfig`, by dotted name. Any: values of any setting
+Settings = Mapping[str, Any]  # of `TrainingConfig`, by dotted name
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +205,7 @@ class StudyInputs:
 
     def evaluation(
         self, tasks: tuple[str, ...] = (), levels: tuple[str, ...] = (), **values: Any
-    ) -> EvaluationSettings:  # Any: further fields
+    ) -> EvaluationSettings:
         """Return the evaluation of the scale; on its tasks and new ones if none are named."""
         scale = self.scale
         tasks, levels = tasks or (*scale.tasks, *scale.new_tasks), levels or scale.levels

@@ -140,7 +140,7 @@ class ComposePanel:
     def _remove(self) -> None:
         self._use(self._present().removed(self._selected.value), _NONE)
 
-    def _change_selected(self, **fields: Any) -> None:  # Any: fields of `SceneObject`
+    def _change_selected(self, **fields: Any) -> None:
         self._use(self._present().changed(self._selected.value, **fields))
 
     def _move(self, pose: Sequence[float]) -> None:

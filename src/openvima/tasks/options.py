@@ -106,7 +106,7 @@ class TaskOptions:
     def __str__(self) -> str:
         return ",".join(f"{task and task + '.'}{name}={value}" for task, name, value in self.entries)
 
-    def of(self, spec: TaskSpec) -> dict[str, Any]:  # Any: options are of whatever type the task declares
+    def of(self, spec: TaskSpec) -> dict[str, Any]:
         """Return the keyword arguments of one task; an option of this task overrides one of all tasks.
 
         Raises:
@@ -171,7 +171,7 @@ def _parse(text: str) -> TaskOptions:
     return TaskOptions(tuple((task, name, found[task, name]) for task, name in sorted(found)))
 
 
-def _convert(spec: TaskSpec, name: str, value: str) -> Any:  # Any: of the option's type
+def _convert(spec: TaskSpec, name: str, value: str) -> Any:
     """Convert a value to the type that the task declares, or else to that of the default."""
     default = spec.options[name]
     try:
@@ -190,7 +190,7 @@ def _convert(spec: TaskSpec, name: str, value: str) -> Any:  # Any: of the optio
     return tuple(items) if is_list else items[0]
 
 
-def _scalars(declared: Any) -> Iterator[type]:  # Any: a type, or a form such as `int | None`
+def _scalars(declared: Any) -> Iterator[type]:
     """Yield the scalar types within a type."""
     if declared in _SCALARS:
         yield declared

@@ -79,7 +79,7 @@ class TaskSpec:
         return self.oracle_max_steps + EXTRA_STEPS
 
     @property
-    def options(self) -> dict[str, Any]:  # Any: options are of whatever type the task declares
+    def options(self) -> dict[str, Any]:
         """Names and defaults of the task's options."""
         parameters = inspect.signature(self.sample).parameters.values()
         return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}

@@ -133,7 +133,7 @@ def _renumber_scene(scene: Scene, new_of: dict[int, int]) -> Scene:
     return replace(scene, placements=tuple(sorted(placements, key=lambda placement: placement.id)))
 
 
-def _renumber(condition: Any, new_of: dict[int, int]) -> Any:  # Any: a goal gives a goal
+def _renumber(condition: Any, new_of: dict[int, int]) -> Any:
     """Return a goal or constraint for new ids."""
     if hasattr(condition, "renumbered"):
         return condition.renumbered(new_of)

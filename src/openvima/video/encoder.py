@@ -25,7 +25,7 @@ FRAMES_PER_SECOND = 30
 _CRF = "21"  # keeps textures clear at about 100 kB for 5 s
 
 
-def import_av() -> Any:  # Any: PyAV is optional
+def import_av() -> Any:
     """Import PyAV.
 
     Raises:
@@ -34,7 +34,7 @@ def import_av() -> Any:  # Any: PyAV is optional
     return import_extra("av", "videos need PyAV; install it with: pip install 'openvima[report]'")
 
 
-def open_video(path: Path, frames_per_second: int) -> tuple[Any, Any]:  # Any: PyAV is optional
+def open_video(path: Path, frames_per_second: int) -> tuple[Any, Any]:
     """Open an MP4 file for writing, with its index at the front.
 
     Args:
@@ -231,7 +231,7 @@ def png(image: Image.Image) -> bytes:
     return stream.getvalue()
 
 
-def _clip(record: dict[str, Any], folder: Path) -> Clip:  # Any: JSON
+def _clip(record: dict[str, Any], folder: Path) -> Clip:
     prompt = tuple(part if isinstance(part, str) else _bytes(part["png"]) for part in record.pop("prompt"))
     poster = _bytes(record.pop("poster"))
     clip = Clip(**record, prompt=prompt, video=b"", poster=poster)

@@ -85,7 +85,7 @@ class Linear(TrainingLinear):
             self._packed = self._packed_version = None
         return super().train(mode)
 
-    def __getstate__(self) -> dict[str, Any]:  # Any: attributes of all kinds
+    def __getstate__(self) -> dict[str, Any]:
         """Exclude the packed copy from copies and pickles."""
         return {**self.__dict__, "_packed": None, "_packed_version": None}
 
@@ -224,7 +224,7 @@ class MetaInit(TorchFunctionMode):
 
     def __torch_function__(
         self,
-        func: Callable[..., Any],  # Any: whatever torch's functions take and give
+        func: Callable[..., Any],
         types: Sequence[type],
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
@@ -252,7 +252,7 @@ class TensorRecord:
         return map_tensors(self, lambda tensor: tensor[index.to(tensor.device)])
 
 
-def map_tensors(value: Any, function: Callable[[torch.Tensor], torch.Tensor]) -> Any:  # Any: its own kind
+def map_tensors(value: Any, function: Callable[[torch.Tensor], torch.Tensor]) -> Any:
     """Apply a function to all tensors of a record or tuple; values of other kinds stay."""
     if isinstance(value, torch.Tensor):
         return function(value)

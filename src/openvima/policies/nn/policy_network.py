@@ -112,7 +112,7 @@ class PolicyNetwork(nn.Module):
         """Encode crops or frames of shape (..., 3, height, width), uint8, once each; features (..., F)."""
         raise NotImplementedError
 
-    def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> Any:  # Any: the model's own
+    def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> Any:
         """Encode prompts; once per episode.
 
         Args:
@@ -134,7 +134,7 @@ class PolicyNetwork(nn.Module):
         """Let a fresh action head start from the distribution of demonstrated actions, (N, 12)."""
         self.head.fit_prior(actions_NC)
 
-    def init_cache(self, prompt: Any) -> Any:  # Any: the model's own
+    def init_cache(self, prompt: Any) -> Any:
         """Return the state of decoding after the prompt and before the first step."""
         return self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)
 
