@@ -125,7 +125,7 @@ def test_closing_after_a_kill_is_quiet() -> None:
 
 
 def test_a_worker_that_does_not_start_is_reported() -> None:
-    with pytest.raises(WorkerError, match=r"0 \(exit code 3\) could not start: .*__main__"):
+    with pytest.raises(WorkerError, match=r"0 \(exit code 3\).* could not start: .*__main__"):
         build(FailsToStart())
 
 
