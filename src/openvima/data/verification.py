@@ -245,8 +245,9 @@ class _Verifier:
             raise DatasetError(explain_missing(self.folder))
         self._read_manifest_and_index()
         unlisted = "If a run was stopped, repeat its command; otherwise move the file elsewhere."
-        for name in shards if self.manifest is not None else ():
-            if name not in self.manifest["shards"]:
+        listed = shards if self.manifest is None else self.manifest["shards"]
+        for name in shards:
+            if name not in listed:
                 self._add(name, "the manifest does not list it", unlisted)
         for path in sorted(self.folder.glob(".*.tmp")):
             cause = "a process was killed while it wrote this, or is writing it. If not, delete it."
@@ -401,8 +402,8 @@ class _Verifier:
         for name, places in itertools.groupby(sorted(chosen, key=lambda c: c[1:]), key=lambda c: c[1]):
             info = checked[name].info
             assert info is not None  # see above
-            is_recorded = self.config.assets is None or info.assets == "procedural"
-            assets = info.assets if is_recorded else self.config.assets
+            asked = self.config.assets
+            assets = info.assets if asked is None or info.assets == "procedural" else asked
             yield ReplayTask(self.folder / name, info, tuple(row for *_, row in places), assets)
 
     def _check_cache(self, checked: Mapping[str, _Checked]) -> int:

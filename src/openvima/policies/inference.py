@@ -357,7 +357,7 @@ class NetworkPolicy(Policy):
 
     def _step_inputs(
         self, episodes: _Episodes, observations: Sequence[Mapping]
-    ) -> tuple[tuple[Any, ...], tuple[int, ...], dict[bytes, torch.Tensor]]:
+    ) -> tuple[tuple[Any, Any, Any, Any, Any, Any], tuple[int, ...], dict[bytes, torch.Tensor]]:
         """Return the arguments of `decode_step`, and slots and features as in `_Episodes`."""
         batch, stack = self.processor.encode_observations(
             [[observation] for observation in observations], episodes.num_slots
