@@ -1,7 +1,6 @@
-"""Experiments with openvima-small: variants, their differences over seeds, the length of baselines."""
+"""Experiments with openvima-small: variants, their differences over seeds."""
 
 import json
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 
 pytest.importorskip("torch")
 
-import baselines
 from ablations import VARIANTS, Recorded, attribute_table, differences_table, read_rows, settings_of, solved
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import PairCounts, difference_over_seeds
@@ -71,24 +69,3 @@ def test_attributes_are_shown_where_both_were_trained() -> None:
     cells = {line.split(" | ")[0].strip("| "): line.split(" | ")[1:] for line in lines if " | " in line}
     assert [cell.split()[0] for cell in cells["with attributes"]] == ["1", "100.0", "50.0", "75.0", "100.0"]
     assert [cell.split()[0] for cell in cells["without"]] == ["1", "0.0", "50.0", "25.0", "50.0"]
-
-
-def test_a_baseline_is_timed_anew_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    timing = tmp_path / "vima-3m" / "timing"
-    timing.mkdir(parents=True)
-    (timing / "timings_log.jsonl").write_text('{"step": 40, "seconds_since_start": 500.0}\n{"step": 60, "se')
-
-    def timed(*words: str) -> None:
-        if not words[-1].endswith("timing"):
-            raise KeyboardInterrupt
-        timing.mkdir(exist_ok=True)
-        with (timing / "timings_log.jsonl").open("a") as lines:
-            for step in (40, 100):
-                lines.write(json.dumps({"step": step, "seconds_since_start": 10.0 + step}) + "\n")
-
-    monkeypatch.setattr(baselines, "_openvima", timed)
-    words = ["--data", "demos", "--out", str(tmp_path), "--hours", "1", "--only", "vima-3m"]
-    monkeypatch.setattr(sys, "argv", ["baselines.py", *words])
-    with pytest.raises(KeyboardInterrupt):
-        baselines.main()
-    assert (tmp_path / "vima-3m" / "steps.txt").read_text() == "3600\n"
