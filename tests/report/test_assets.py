@@ -42,11 +42,12 @@ def test_failures_are_recorded_first_and_within_a_budget(results, monkeypatch):
 
 def test_the_table_is_printed_before_any_video(tmp_path, monkeypatch, capsys):
     printed = []
-    monkeypatch.setattr(
-        "openvima.report.evaluate_and_report",
-        lambda *_: printed.append(capsys.readouterr().out),
-        raising=False,
-    )
+
+    def record(*_) -> list:
+        printed.append(capsys.readouterr().out)
+        return []
+
+    monkeypatch.setattr(report_videos, "_recorded", record)
     words = "evaluate --policy oracle --tasks rotate --levels L1 --episodes 1 --workers 1 --out"
     assert main([*words.split(), str(tmp_path / "out")]) == 0
     assert "success rates" in printed[0] and "100.0" in printed[0]

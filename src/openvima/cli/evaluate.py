@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,8 +15,9 @@ from openvima.cli.terminal import parse_list, parse_shard_range, parse_sources, 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from openvima.evaluation import Results
+    from openvima.evaluation import EvaluationConfig, Results
     from openvima.evaluation.results import LevelMean
+    from openvima.report import VideoSelection
 
 
 def main(
@@ -125,8 +127,7 @@ def main(
     from openvima.evaluation.results import FILE_NAME
     from openvima.evaluation.runner import evaluate_range
     from openvima.multiprocess import num_cpus
-    from openvima.report import VideoSelection, evaluate_and_report
-    from openvima.report.videos import requested_episodes, require_extra
+    from openvima.report import VideoSelection
 
     if in_context:
         ablations = f"{ablations},{IN_CONTEXT}"
@@ -167,12 +168,38 @@ def main(
             what = "is finished" if (out / FILE_NAME).exists() else "lacks batches of other ranges"
             print(f"{out} {what}.", file=sys.stderr)
             return 0
-    if report:  # what it lacks is named before any episode
-        require_extra()
-        requested_episodes(config, selection)
-    with progress_bar("evaluation") as bar:
-        path = evaluate(config, bar)
-    results = Results.read(path)
+    if report:
+        path = _evaluate_and_report(config, selection, as_json=as_json)
+    else:
+        with progress_bar("evaluation") as bar:
+            path = evaluate(config, bar)
+        _print_scores(Results.read(path), path, as_json=as_json)
+    print(
+        f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if report else ""),
+        file=sys.stderr,
+    )
+    return 0
+
+
+def _evaluate_and_report(config: "EvaluationConfig", videos: "VideoSelection", *, as_json: bool) -> Path:
+    """Evaluate, print the scores, then record videos; evaluation and videos have a bar each."""
+    from openvima.evaluation.results import FILE_NAME
+    from openvima.report import evaluate_and_report
+
+    with ExitStack() as bars:
+        bar = bars.enter_context(progress_bar("evaluation"))
+
+        def on_results(results: "Results") -> None:
+            nonlocal bar
+            bars.close()
+            _print_scores(results, config.out / FILE_NAME, as_json=as_json)
+            bar = bars.enter_context(progress_bar("evaluation"))
+
+        return evaluate_and_report(config, videos, lambda *now: bar(*now), on_results)
+
+
+def _print_scores(results: "Results", path: Path, *, as_json: bool) -> None:
+    """Print results that lie in a file, and on standard error what to know about them."""
     if as_json:
         print(json.dumps(json.loads(path.read_text(encoding="utf-8"))["rows"]))
     else:
@@ -186,18 +213,10 @@ def main(
             )
     if num_near := sum(len(row.near_ties) for row in results.rows):
         print(
-            f"Episodes with two choices of nearly equal score, which another machine may decide otherwise: "
+            "Episodes with two choices of nearly equal score, which another machine may decide otherwise: "
             f"{num_near} (near_ties in {path.name}).",
             file=sys.stderr,
         )
-    if report:  # videos come after the scores; nothing is evaluated again
-        with progress_bar("evaluation") as bar:
-            evaluate_and_report(replace(config, force=False), selection, bar)
-    print(
-        f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if report else ""),
-        file=sys.stderr,
-    )
-    return 0
 
 
 def print_results(results: "Results") -> None:

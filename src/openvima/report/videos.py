@@ -69,7 +69,10 @@ def require_extra() -> None:
 
 
 def evaluate_and_report(
-    config: EvaluationConfig, videos: VideoSelection = DEFAULT_VIDEOS, progress: Progress | None = None
+    config: EvaluationConfig,
+    videos: VideoSelection = DEFAULT_VIDEOS,
+    progress: Progress | None = None,
+    on_results: Callable[[Results], None] | None = None,
 ) -> Path:
     """Evaluate policies, record some of the episodes and write `report.html`: `openvima evaluate`.
 
@@ -77,6 +80,7 @@ def evaluate_and_report(
         config: What to evaluate.
         videos: Which episodes to record.
         progress: As for `evaluate`.
+        on_results: Called with the results before any video is recorded.
 
     Returns:
         `results.json`; `report.html` and the folder `videos` are beside it.
@@ -92,6 +96,8 @@ def evaluate_and_report(
         with folder_lock(config.out):
             path = evaluate_prepared(prepared, progress)
             results = Results.read(path)
+            if on_results is not None:
+                on_results(results)
             episodes = sum(row.episodes for row in results.rows)
             note = None if progress is None else lambda text: progress(episodes, episodes, text)
             write_report(
