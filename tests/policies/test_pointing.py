@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from openvima.errors import ConfigError
-from openvima.policies.nn.action_head import ObservationTokens, pointing_loss
+from openvima.policies.nn.action_head import ObservationTokens, add_pointing, pointing_loss
 from openvima.policies.nn.actions import PLACE_NEAR_M, ActionTargets
 from openvima.policies.presets import preset
 from openvima.training import TrainingConfig
@@ -40,7 +40,9 @@ def _inputs(
 
 def test_it_is_the_cross_entropy_of_the_object_nearest_to_the_demonstrated_position():
     pick, place, observations, targets = _inputs(torch.Generator().manual_seed(0))
-    loss, value = pointing_loss(pick, place, observations, targets)
+    loss = pointing_loss(pick, place, observations, targets)
+    found = (torch.zeros(()), {}, targets.actions_BTC)
+    value = add_pointing(found, 1.0, pick, place, observations, targets)[1]["loss/pointing"]
     total, counted = 0.0, 0
     tokens, points = observations.tokens_BTQD.detach().numpy(), observations.points_BTQ2.numpy()
     for b, t in np.argwhere(targets.steps_BT.numpy()):

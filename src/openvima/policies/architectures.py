@@ -274,7 +274,7 @@ class TokenPolicy(PolicyNetwork):
             mask_BTQ = history.masks_BTVN.any(dim=2) if fused else history.masks_BTVN.flatten(2)
             if self.resampler is not None:
                 tokens_BTQE, mask_BTQ = self.resampler(tokens_BTQE, mask_BTQ), None
-            else:
+            elif self.head.pointing_weight:  # never in acting
                 points_BTQ2 = _points_from_above(history, tokens_BTQE.shape[2])
         else:
             tokens_BTQE = self._frame_tokens(features_BTVNF)

@@ -92,7 +92,7 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
                 f"augmentation.{name} is {getattr(augmentation, name):g}, but preset {config.preset!r} takes "
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
-    if (weight := config.optimizer.pointing_loss_weight) and not _points(sizes):
+    if (weight := config.optimizer.pointing_loss_weight) and not _has_object_tokens(sizes):
         raise ConfigError(
             f"optimizer.pointing_loss_weight is {weight:g}, but preset {config.preset!r} has no token for "
             "each object, or picks among objects by itself; leave it out."
@@ -120,8 +120,8 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
     return config
 
 
-def _points(sizes: PolicyConfig) -> bool:
-    """Whether a policy has a token for each object and a head that decodes positions."""
+def _has_object_tokens(sizes: PolicyConfig) -> bool:
+    """Whether a policy of the papers has a token for each object, which the pointing loss scores."""
     return (
         isinstance(sizes, TokenPolicyConfig) and sizes.resampler is None and sizes.inputs.tokens != "frames"
     )

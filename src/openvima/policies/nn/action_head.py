@@ -43,7 +43,7 @@ class ObservationTokens:
         query_BT: Index of the token from whose output the action is decoded; it may be padding.
         steps_BT: Which steps exist.
         points_BTQ2: Table points of the objects in the top view that tokens stand for, metres; infinite for
-            other tokens. None if no tokens are objects.
+            other tokens. None without a pointing loss.
     """
 
     tokens_BTQD: torch.Tensor
@@ -131,12 +131,8 @@ class ActionHead(nn.Module):
         previous = self._segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
         outputs_BTQD, _ = decode_observations(decoder, cache, observations, previous)
         query_BTD = observations.query(outputs_BTQD)
-        loss, metrics, actions_BTC = self.action_loss(query_BTD, targets)
-        metrics["query_spread"] = spread(query_BTD, targets.steps_BT)
-        if self.pointing_weight:
-            pointing, metrics["loss/pointing"] = pointing_loss(query_BTD, query_BTD, observations, targets)
-            loss = loss + self.pointing_weight * pointing
-        return loss, metrics, actions_BTC
+        found = self.action_loss(query_BTD, targets)
+        return add_pointing(found, self.pointing_weight, query_BTD, query_BTD, observations, targets)
 
     def decode_step(
         self,
@@ -158,10 +154,27 @@ class ActionHead(nn.Module):
         return action_segment(self.actions(self.past_actions(actions_BTC).to(dtype))[:, :, None], exists_BT)
 
 
+def add_pointing(
+    found: ActionLoss,
+    weight: float,
+    pick_BTD: torch.Tensor,
+    place_BTD: torch.Tensor,
+    observations: ObservationTokens,
+    targets: ActionTargets,
+) -> ActionLoss:
+    """Add the spread of the queries to the metrics of an action loss, and with a weight `pointing_loss`."""
+    loss, metrics, actions_BTC = found
+    metrics = {**metrics, "query_spread": spread(pick_BTD, targets.steps_BT)}
+    if weight:
+        pointing = pointing_loss(pick_BTD, place_BTD, observations, targets)
+        loss, metrics["loss/pointing"] = loss + weight * pointing, pointing.detach()
+    return loss, metrics, actions_BTC
+
+
 def pointing_loss(
     pick_BTD: torch.Tensor, place_BTD: torch.Tensor, observations: ObservationTokens, targets: ActionTargets
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the cross-entropy of which objects are picked and placed at, and the same without gradient.
+) -> torch.Tensor:
+    """Return the cross-entropy of which objects are picked and placed at.
 
     Demonstrated picks are random points of an object, which costs bins two nats a coordinate and hides the
     choice of the object in noise; here it is the target itself. The dot product with the first half of each
@@ -174,7 +187,7 @@ def pointing_loss(
         targets: Demonstrated actions; a place counts where an object is near.
     """
     tokens_BTQD, points_BTQ2 = observations.tokens_BTQD, observations.points_BTQ2
-    assert points_BTQ2 is not None  # the settings of a training are checked
+    assert points_BTQ2 is not None  # they are made where the loss has a weight, and settings are checked
     is_object_BTQ = points_BTQ2[..., 0].isfinite() & targets.steps_BT[..., None]
     parts = zip(
         ("pose0_position", "pose1_position"), (pick_BTD, place_BTD), (math.inf, PLACE_NEAR_M), strict=True
@@ -189,7 +202,7 @@ def pointing_loss(
         scores_MQ = scores_BTQ.masked_fill(~is_object_BTQ, -math.inf)[counts_BT]
         losses = F.cross_entropy(scores_MQ, slot_BT[counts_BT], reduction="sum")
         loss = loss + losses / targets.steps_BT.sum().clamp(min=1)
-    return loss, loss.detach()
+    return loss
 
 
 @torch.no_grad()

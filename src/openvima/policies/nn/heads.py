@@ -28,13 +28,12 @@ from openvima.policies.nn.action_head import (
     ObservationTokens,
     action_segment,
     actions_from_bins,
+    add_pointing,
     bin_classifiers,
     bins_loss,
     decode_observations,
     encode_bins,
     fit_bins,
-    pointing_loss,
-    spread,
 )
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
@@ -104,12 +103,9 @@ class AutoregressiveHead(nn.Module):
         pairs = zip(self.classifiers, outputs_BTCD.unbind(2), strict=True)
         logits = [classifier(output) for classifier, output in pairs]
         loss, metrics, bins_BTC = bins_loss(logits, targets)
-        metrics["query_spread"] = spread(query_BT1D.squeeze(2), targets.steps_BT)
-        if self.pointing_weight:
-            pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
-            pointing, metrics["loss/pointing"] = pointing_loss(pick_BTD, place_BTD, observations, targets)
-            loss = loss + self.pointing_weight * pointing
-        return loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        found = loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
+        return add_pointing(found, self.pointing_weight, pick_BTD, place_BTD, observations, targets)
 
     def decode_step(
         self,
