@@ -40,6 +40,26 @@ from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 from openvima.tasks.options import MAX_DISTRACTORS, TaskOptions
 from openvima.tasks.sampling import check_task_options, make_rng, takes_prompts
 
+__all__ = [
+    "ABLATIONS",
+    "DETECTED_BOXES",
+    "EXAMPLE_PROMPTS",
+    "INPUT_ABLATIONS",
+    "IN_CONTEXT",
+    "MORE_ABLATIONS",
+    "NOISY_BOXES",
+    "ORACLE_DEMONSTRATION",
+    "AblatedInput",
+    "InputAblation",
+    "RatedAblation",
+    "ablate",
+    "ablated_environment",
+    "ablation_parts",
+    "applies_to",
+    "canonical_ablation",
+    "scenes_of",
+]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AblatedInput:

@@ -17,6 +17,21 @@ from statistics import NormalDist
 
 from openvima.errors import ConfigError
 
+__all__ = [
+    "Interval",
+    "PairCounts",
+    "SeedMean",
+    "difference_of_means",
+    "difference_over_seeds",
+    "holm",
+    "mcnemar",
+    "mean_difference",
+    "mean_of_rates",
+    "mean_over_seeds",
+    "ratio_of_means",
+    "wilson_interval",
+]
+
 Interval = tuple[float, float]
 Fit = Callable[[float], tuple[float, float]]
 
