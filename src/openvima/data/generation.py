@@ -1,4 +1,4 @@
-"""What a folder already holds of the data set that is asked for, and what does not belong to it."""
+"""Generating demonstrations: what a folder holds already, the rollouts, the finished data set."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Where a LeRobot data set keeps its files, and when it begins a new one.
+"""The files of a LeRobot data set: tables, videos and statistics, and when a new file begins.
 
 Source: the format's documentation (huggingface.co/docs/lerobot/lerobot-dataset-v3) and lerobot 0.4.4.
 """

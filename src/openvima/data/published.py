@@ -1,4 +1,4 @@
-"""Names that differ between the published files and this package, and names that neither knows."""
+"""Import of the published demonstrations: where their episodes lie, names of tasks, the conversion."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Unpickling published files without running their code.
+"""One published episode: unpickling its files without running their code, and what it demonstrates.
 
 A pickle is a program that may call any function. `read_pickle` first checks the opcodes, then runs them with
 a `pickle.Unpickler` that knows a closed list of classes. Each is replaced by an inert stand-in that holds

@@ -1,4 +1,4 @@
-"""Images by index, each stored once."""
+"""Inputs of policies: tables of objects, and stacks that store each of their images once."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

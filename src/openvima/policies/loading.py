@@ -1,4 +1,4 @@
-"""Policies of users' code: a function that makes one, and run folders of learners of their own."""
+"""Loading policies: by name, from a folder or the Hugging Face Hub, and from code of users."""
 
 import hashlib
 import inspect
