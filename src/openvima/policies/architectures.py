@@ -42,6 +42,9 @@ from openvima.policies.sizes import Size, size
 from openvima.render.camera import CAMERAS, unproject
 
 
+_LINEAR_RANGE = 4.0
+
+
 @dataclass(frozen=True, slots=True)
 class TokenPolicyConfig:
     """Sizes of a policy.
@@ -243,6 +246,8 @@ class TokenPolicy(PolicyNetwork):
         self.decoder = build_decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head = build_head(config.head, width, actions)
+        if token_width == width:
+            self._align_attention()
         # Other heads have no bins, and the other decoder no attention to the prompt alone.
         has_bins = isinstance(self.head, BinsHead | AutoregressiveHead)
         self.explains = has_bins and isinstance(self.decoder, Decoder)
@@ -292,6 +297,29 @@ class TokenPolicy(PolicyNetwork):
             mask_BTQ = torch.cat([mask_BTQ, steps_BT[..., None]], dim=2)
             points_BTQ2 = None if points_BTQ2 is None else F.pad(points_BTQ2, (0, 0, 0, 1), value=math.inf)
         return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, steps_BT, points_BTQ2)
+
+    @torch.no_grad()
+    def _align_attention(self) -> None:
+        """Let fresh attention begin where the images of scene and prompt look alike.
+
+        Layers that carry image tokens into the text encoder and into the history start as the identity, and
+        the first half of attention to the prompt compares its two sides by one matrix. Random layers would
+        have to find this agreement before any texture can be told from another; see docs/train_vima.md.
+        """
+        layers = [layer for layer in self.prompt.images if isinstance(layer, nn.Linear)]
+        if layers[0].weight.is_meta:  # weights are loaded later
+            return
+        carriers = [*layers, self.observation_out]
+        if isinstance(self.prompt.out, nn.Linear):
+            carriers.append(self.prompt.out)
+        for layer in carriers:
+            nn.init.eye_(layer.weight)
+            if layer.bias is not None:
+                layer.bias.zero_()
+        # Image tokens are of the order of 1: so far above zero, the ReLUs between the layers are linear.
+        layers[0].bias.fill_(_LINEAR_RANGE)
+        layers[-1].bias.fill_(-_LINEAR_RANGE)
+        self.decoder.align()
 
     def _frame_tokens(self, features: torch.Tensor) -> torch.Tensor:
         """Make tokens of pairs of frames, (..., tokens · N, E): the first token of all pairs first.

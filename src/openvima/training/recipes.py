@@ -32,20 +32,23 @@ _PAPER: Mapping[str, Any] = {
 }
 # MIDAS, Li et al. 2023: learning rates and batch sizes are not published, so they are VIMA's.
 _MIDAS: Mapping[str, Any] = {**_PAPER, "preset": "midas-92m"}
-# The bundled openvima-small; docs/training.md has its history.
-_SMALL: Mapping[str, Any] = {
-    "preset": "small",
-    "pretraining.steps": 4000,
-    "pretraining.num_scenes": 8000,
+_VARIED_PAIRS: Mapping[str, Any] = {
     "pretraining.appearance_randomization_prob": 0.4,
     "pretraining.hard_negative_prob": 0.4,
     "pretraining.box_jitter_px": 1.0,
     "pretraining.grayscale_prob": 0.3,
     "pretraining.occlusion_prob": 0.35,
-    "pretraining.attribute_loss_weight": 0.5,
     "pretraining.grating_prob": 0.4,
     "pretraining.eared_prob": 0.3,
     "pretraining.ring_and_block_prob": 0.3,
+}
+# The bundled openvima-small; docs/training.md has its history.
+_SMALL: Mapping[str, Any] = {
+    "preset": "small",
+    "pretraining.steps": 4000,
+    "pretraining.num_scenes": 8000,
+    **_VARIED_PAIRS,
+    "pretraining.attribute_loss_weight": 0.5,
     "schedule.steps": 3100,
     "loader.batch_size": 128,
     "loader.rerendered_prob": 0.4,
@@ -67,9 +70,9 @@ _SMALL: Mapping[str, Any] = {
 }
 # The architectures of the papers in size nano, on two cores; docs/train_vima.md has what they reach.
 # Post-norm decoders collapse at twice this learning rate.
-_PAPERS: Mapping[str, Any] = {
-    "preset": "vima-nano",
-    "schedule.steps": 11000,
+_PAPERS_FRAMES: Mapping[str, Any] = {
+    "preset": "gato-nano",
+    "schedule.steps": 8000,
     "loader.batch_size": 64,
     "optimizer.learning_rate": 5e-4,
     "optimizer.weight_decay": 0.0,
@@ -77,6 +80,20 @@ _PAPERS: Mapping[str, Any] = {
     "schedule.checkpoint_every": 500,
     "loader.validation_fraction": 0.02,
     "loader.validation_episodes": 500,
+    "runtime.processes": 2,
+}
+# Crops that behaviour cloning alone trains do not tell textures apart, so they are pretrained by contrast.
+_PAPERS: Mapping[str, Any] = {
+    **_PAPERS_FRAMES,
+    "preset": "vima-nano",
+    "pretraining.steps": 1600,
+    "pretraining.num_scenes": 5000,
+    **_VARIED_PAIRS,
+    "optimizer.pointing_loss_weight": 1.0,
+    "loader.rerendered_prob": 0.4,
+    "augmentation.rename_objects_prob": 0.3,
+    "augmentation.shuffle_sentences_prob": 0.3,
+    "augmentation.distractor_prob": 0.3,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
 RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
@@ -114,6 +131,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "loader.num_workers": 2,
         },
         "papers": _PAPERS,
+        "papers-frames": _PAPERS_FRAMES,
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
         "small": _SMALL,
@@ -126,13 +144,16 @@ def default_recipe(preset: str | None) -> str:
 
     Returns:
         "small" for "small", "nano" for the pointer network nano, nano-bins and learners of your own, "papers"
-        for the architectures of the papers in size nano, else "paper".
+        for the architectures of the papers in size nano, or "papers-frames" if they take whole frames, else
+        "paper".
     """
     if preset == "small":
         return preset
     if preset and (preset.startswith("nano") or preset not in PRESETS):
         return "nano"
-    return "papers" if preset and preset.endswith("-nano") else "paper"
+    if preset and preset.endswith("-nano"):
+        return "papers-frames" if preset.startswith(("gato", "flamingo", "gpt")) else "papers"
+    return "paper"
 
 
 def recipe_settings(name: str) -> dict[str, Any]:

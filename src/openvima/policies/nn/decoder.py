@@ -243,6 +243,11 @@ class Decoder(CausalDecoder):
         prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
 
+    def align(self) -> None:
+        """Let fresh attention to the prompt compare queries and keys by one matrix, in every block."""
+        for block in self.cross_blocks:
+            _align(block.query.weight, block.key_value.weight[: self.width])
+
     def _cross_attend(
         self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
     ) -> torch.Tensor:
@@ -266,6 +271,10 @@ class PrefixDecoder(CausalDecoder):
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
         return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP)[1]
+
+    def align(self) -> None:
+        """Let fresh attention compare queries and keys by one matrix, in the first block."""
+        _align(*self.self_blocks[0].query_key_value.weight.split(self.width)[:2])
 
 
 def build_decoder(config: AnyDecoderConfig) -> Decoder | PrefixDecoder:
@@ -363,6 +372,11 @@ class SelfBlock(nn.Module):
         attended = self.norm_attention(x_ND + attended)
         hidden = self.narrow(F.gelu(self.widen(attended)) * self.gate(attended))
         return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
+
+
+def _align(query_DD: torch.Tensor, key_DD: torch.Tensor) -> None:
+    nn.init.orthogonal_(query_DD)
+    key_DD.copy_(query_DD)
 
 
 def position_ids(mask_BL: torch.Tensor) -> torch.Tensor:
