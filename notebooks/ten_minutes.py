@@ -74,7 +74,7 @@ result.outcome
 # %% [markdown]
 # ## Scores
 #
-# `score` plays the episodes of `openvima evaluate`. Ten of them give wide intervals; the protocol has 100
+# `score` plays the episodes of `openvima evaluate`. Ten of them give wide intervals; the protocol has 200
 # for each task and level.
 
 # %%

@@ -17,7 +17,6 @@ from openvima.cli.main import VERBS, main
 
 ROOT = Path(__file__).parents[1]
 PAGES = (*(ROOT / name for name in ("README.md", "CONTRIBUTING.md")), *sorted((ROOT / "docs").glob("*.md")))
-HOME = ROOT / "docs" / "site" / "index.md"  # its links are those of the site, see test_site.py
 FENCE = re.compile(r"^```(\w*).*?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9.-]*")
 OTHER_PROGRAMS = {"git", "pip", "pyright", "pytest", "python", "ray", "ruff", "sbatch", "torchrun"}
@@ -137,7 +136,7 @@ def options() -> dict[tuple[str, ...], frozenset[str]]:
     return found
 
 
-@pytest.mark.parametrize("page", (*PAGES, HOME), ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_command_of_the_page_parses(page: Path, parse: Callable[..., str]) -> None:
     problems = []
     for command in commands(page):

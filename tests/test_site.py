@@ -1,5 +1,6 @@
 """The documentation site: it builds without a warning, no link is dead, every public name has an entry."""
 
+import json
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -8,8 +9,8 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from build_site import Pages, code_page
-from notebook_pages import cells, run
+from build_site import Pages, code_page, site_path
+from notebook_pages import cells, run, write_notebooks
 from openvima.tasks import list_tasks, task_spec
 from reference_pages import public_names
 
@@ -72,7 +73,8 @@ def test_the_site_builds_without_warnings_dead_links_and_missing_names(tmp_path:
         page = (tmp_path / "tasks" / f"{task}.html").read_text(encoding="utf-8")
         assert all(f"images/{task}_{level}.png" in page for level in task_spec(task).levels)
         assert "<td>openvima-small</td>" in page
-    assert {path.stem for path in ROOT.glob("docs/*.md")} <= {path.stem for path in tmp_path.glob("*.html")}
+    for path in ROOT.glob("docs/*.md"):
+        assert (tmp_path / site_path(f"docs/{path.name}")).with_suffix(".html").is_file()
     for notebook in NOTEBOOKS:
         page = (tmp_path / "notebooks" / f"{notebook.stem}.html").read_text(encoding="utf-8")
         assert page.count('class="output"') >= 4, notebook
@@ -117,6 +119,43 @@ def test_a_notebook_has_a_title_and_code(notebook: Path) -> None:
     first, *others = cells(notebook.read_text(encoding="utf-8"))
     assert not first.is_code and first.text.startswith("# ")
     assert any(cell.is_code for cell in others)
+
+
+def source(notebook: dict) -> list[tuple[str, str]]:
+    return [(cell["cell_type"], "".join(cell["source"])) for cell in notebook["cells"]]
+
+
+def outputs(notebook: dict) -> list[tuple[int, str]]:
+    """Return the kinds of outputs, each with the number of its cell."""
+    return [
+        (number, kind)
+        for number, cell in enumerate(notebook["cells"])
+        for output in cell.get("outputs", ())
+        for kind in output.get("data", ["text"])
+    ]
+
+
+@pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda path: path.stem)
+def test_the_notebook_is_that_of_its_script_and_has_pictures(script: Path) -> None:
+    notebook = json.loads(script.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    parts = cells(script.read_text(encoding="utf-8"))
+    expected = [("code" if cell.is_code else "markdown", cell.text) for cell in parts]
+    assert source(notebook) == expected, "run python docs/site/notebook_pages.py"
+    assert "image/png" in {kind for _, kind in outputs(notebook)}
+
+
+def test_notebooks_are_small() -> None:
+    assert sum(path.with_suffix(".ipynb").stat().st_size for path in NOTEBOOKS) <= 1_500_000
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_notebooks(tmp_path: Path) -> None:
+    write_notebooks(tmp_path)
+    for script in NOTEBOOKS:
+        written = json.loads((tmp_path / f"{script.stem}.ipynb").read_text(encoding="utf-8"))
+        kept = json.loads(script.with_suffix(".ipynb").read_text(encoding="utf-8"))
+        assert source(written) == source(kept)
+        assert outputs(written) == outputs(kept)
 
 
 def test_a_cell_shows_what_it_prints_and_returns() -> None:

@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 
 import yaml
@@ -21,7 +20,13 @@ from reference_pages import public_names, reference_pages
 from task_pages import write_task_pages
 
 ROOT = Path(__file__).parents[2]
-NAMED = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+NAMED = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "docs/README.md": "pages.md",
+    "results/README.md": "results/index.md",
+}
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
 NO_RUN = re.compile(r"^(```\w+) .*$", re.MULTILINE)  # a mark for the tests
@@ -32,12 +37,13 @@ def site_path(path: str) -> str:
     """Return where a file or folder of the repository is on the site."""
     if (ROOT / path).is_dir():
         return f"{path}/index.md"
+    if path in NAMED:
+        return NAMED[path]
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
     if path.startswith("notebooks/"):
-        return path.replace(".py", ".md")
-    plain = path.endswith((".md", ".png", ".webp"))
-    return NAMED.get(path, path if plain else f"{path}.md")
+        return f"{path.rpartition('.')[0]}.md"
+    return path if path.endswith((".md", ".png", ".webp")) else f"{path}.md"
 
 
 class Pages:
@@ -102,15 +108,6 @@ def folder_page(folder: Path) -> str:
     return f"# {folder.relative_to(ROOT)}\n\n" + "\n".join(f"- `{name}`" for name in names) + "\n"
 
 
-def results_page(files: Iterable[Path]) -> str:
-    """List recorded results, newest first."""
-    rows = []
-    for file in sorted(files, reverse=True):
-        title = file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
-        rows.append(f"| {file.name[:10]} | [{title}]({file.name}) |")
-    return "\n".join(["# Recorded results", "", "| date | result |", "|---|---|", *rows, ""])
-
-
 def stage(folder: Path, *, execute: bool) -> dict:
     """Write all pages and return the site's settings.
 
@@ -120,13 +117,10 @@ def stage(folder: Path, *, execute: bool) -> dict:
     """
     shutil.rmtree(folder, ignore_errors=True)
     pages = Pages(folder)
-    results = sorted(ROOT.glob("results/*.md"))
-    for file in (*ROOT.glob("docs/*.md"), *ROOT.glob("docs/images/*.png"), *results):
+    for file in (*ROOT.glob("docs/*.md"), *ROOT.glob("docs/images/*.png"), *ROOT.glob("results/*.md")):
         pages.add(file.relative_to(ROOT).as_posix())
     for name in NAMED:
         pages.add(name)
-    pages.write("index.md", (Path(__file__).parent / "index.md").read_text(encoding="utf-8"))
-    pages.write("results/index.md", results_page(results))
     for name, text in reference_pages(public_names()).items():
         pages.write(name, text)
     for notebook in sorted(ROOT.glob("notebooks/*.py")):

@@ -41,19 +41,15 @@ def write_task_pages(folder: Path) -> None:
 
 
 def index_page(specs: Iterable[TaskSpec]) -> str:
-    """List the tasks with their levels."""
-    rows = [f"| [{s.name}]({s.name}.md) | {s.summary} | {', '.join(s.levels)} |" for s in specs]
+    """Show the tasks as a gallery."""
+    cards = [
+        f"- [![Prompt, start and end](images/{spec.name}_{spec.levels[-1]}.png)]({spec.name}.md)\n"
+        f"  **[{spec.name}]({spec.name}.md)** {', '.join(spec.levels)}: {spec.summary}"
+        for spec in specs
+    ]
+    about = "Prompt, start and end of an episode that the oracle solves, at the last level of each task."
     return "\n".join(
-        [
-            "# Tasks",
-            "",
-            "| task | what it asks | levels |",
-            "|---|---|---|",
-            *rows,
-            "",
-            "![Prompt and solved scene of each task](../images/tasks.png)",
-            "",
-        ]
+        ["# Tasks", "", about, "", '<div class="gallery" markdown>', "", *cards, "", "</div>", ""]
     )
 
 

@@ -15,7 +15,7 @@ BLOCK = re.compile(r"^```python(.*?)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = {file.read_text(encoding="utf-8") for file in ROOT.glob("examples/*.py")}
 # Pages whose blocks run in tests of their own, which also check what they give.
 ELSEWHERE = {"format", "midas", "policies", "reinforcement_learning", "studies"}
-PAGES = [ROOT / "README.md", ROOT / "docs/site/index.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BEGINNINGS = {  # page to the example that it begins with
     "compose": "compose_a_scene",
     "explain": "explain_a_decision",
