@@ -12,7 +12,7 @@ from openvima.data import (
     generate,
 )
 from openvima.env import EnvConfig, TabletopEnv
-from openvima.errors import CheckpointError, UnknownWordWarning
+from openvima.errors import CheckpointError, ConfigError, UnknownWordWarning
 from openvima.evaluation import score
 from openvima.evaluation.sources import policy_sources
 from openvima.policies import load_policy, preset
@@ -79,6 +79,12 @@ def test_the_vocabulary_is_that_of_the_prompts_and_is_compared_when_a_run_resume
     vocabulary.extended(["quokka"]).write(stored)
     with pytest.raises(CheckpointError, match="another vocabulary, with"):
         train(config)
+
+
+def test_crops_that_nothing_trains_are_refused(settings) -> None:
+    frozen = {"pretraining.steps": 0, "pretraining.finetune_crop_encoder": False}
+    with pytest.raises(ConfigError, match="finetune_crop_encoder is False, but nothing has trained"):
+        resolve(TrainingConfig.of({**settings, **frozen}))
 
 
 def test_fine_tuning_adds_new_words_to_those_of_the_checkpoint(settings, tmp_path: Path) -> None:

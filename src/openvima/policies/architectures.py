@@ -41,7 +41,6 @@ from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConf
 from openvima.policies.sizes import Size, size
 from openvima.render.camera import CAMERAS, unproject
 
-
 _LINEAR_RANGE = 4.0
 
 

@@ -106,6 +106,15 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
     if config.pretraining.steps is None:
         steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0
         config = replace(config, pretraining=replace(config.pretraining, steps=steps))
+    if (
+        config.pretraining.finetune_crop_encoder is False
+        and not (config.pretraining.steps or config.init_from)
+        and sizes.inputs.tokens != "frames"
+    ):
+        raise ConfigError(
+            "pretraining.finetune_crop_encoder is False, but nothing has trained the crop encoder; set "
+            "pretraining.steps or init_from, or train it with pretraining.finetune_crop_encoder True."
+        )
     attributes, weight = getattr(sizes, "attributes", None), config.pretraining.attribute_loss_weight
     if weight and not attributes:
         raise ConfigError(

@@ -89,6 +89,7 @@ _PAPERS: Mapping[str, Any] = {
     "pretraining.steps": 1600,
     "pretraining.num_scenes": 5000,
     **_VARIED_PAIRS,
+    "pretraining.finetune_crop_encoder": False,  # nor after --init-from
     "optimizer.pointing_loss_weight": 1.0,
     "loader.rerendered_prob": 0.4,
     "augmentation.rename_objects_prob": 0.3,
