@@ -3,9 +3,10 @@
     openvima generate --tasks <the 13 of training> --episodes 4000 --workers 2 --out train
     python experiments/papers/papers.py --data train --out papers --only vima,midas
 
-Each run is one `openvima train` with the recipe `papers` and one `openvima evaluate`; repeating the command
-resumes. NAME.json in --out is its record: options, costs, learning curve, successes by task and level. The
-table of all records there is written to --out/table.md. Runs of equal steps, on the same demonstrations.
+Each run is one `openvima train` with its default recipe (`papers`, or `papers-frames` for policies that take
+whole frames) and one `openvima evaluate`; repeating the command resumes. NAME.json in --out is its record:
+options, costs, learning curve, successes by task and level. The table of all records there is written to
+--out/table.md. Runs of equal steps, on the same demonstrations.
 """
 
 import argparse
@@ -24,25 +25,21 @@ from openvima.policies.naming import find_checkpoint
 from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, read_costs, whole_lines
 
 LEVELS = ("L1", "L2", "L3", "L4")
-RANDOM_APPEARANCE = ("--loader.rerendered-prob", "0.3")
-INVERSE_DYNAMICS = ("--augmentation.inverse-dynamics-prob", "0.3")
+MIXED = ("--preset", "midas-nano", "--augmentation.inverse-dynamics-prob", "0.33")
 # Name of a run to what it is, and its options.
 RUNS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "vima": ("VIMA", ("--preset", "vima-nano", *RANDOM_APPEARANCE)),
-    "vima-1": ("VIMA, second seed", ("--preset", "vima-nano", *RANDOM_APPEARANCE, "--seed", "1")),
-    "vima-plain": ("VIMA, no random appearance", ("--preset", "vima-nano")),
-    "gato": ("VIMA-Gato", ("--preset", "gato-nano", *RANDOM_APPEARANCE)),
-    "flamingo": ("VIMA-Flamingo", ("--preset", "flamingo-nano", *RANDOM_APPEARANCE)),
-    "gpt": ("VIMA-GPT", ("--preset", "gpt-nano", *RANDOM_APPEARANCE)),
-    "midas-plain": ("MIDAS, no inverse dynamics", ("--preset", "midas-nano", *RANDOM_APPEARANCE)),
-    "midas": (
-        "MIDAS, inverse dynamics mixed in",
-        ("--preset", "midas-nano", *RANDOM_APPEARANCE, *INVERSE_DYNAMICS),
+    "vima": ("VIMA", ("--preset", "vima-nano")),
+    "vima-1": ("VIMA, second seed", ("--preset", "vima-nano", "--seed", "1")),
+    "vima-plain": (
+        "VIMA, no random appearance",
+        ("--preset", "vima-nano", "--loader.rerendered-prob", "0"),
     ),
-    "midas-1": (
-        "MIDAS, second seed",
-        ("--preset", "midas-nano", *RANDOM_APPEARANCE, *INVERSE_DYNAMICS, "--seed", "1"),
-    ),
+    "gato": ("VIMA-Gato", ("--preset", "gato-nano")),
+    "flamingo": ("VIMA-Flamingo", ("--preset", "flamingo-nano")),
+    "gpt": ("VIMA-GPT", ("--preset", "gpt-nano")),
+    "midas-plain": ("MIDAS, no inverse dynamics", ("--preset", "midas-nano")),
+    "midas": ("MIDAS, inverse dynamics mixed in", MIXED),
+    "midas-1": ("MIDAS, second seed", (*MIXED, "--seed", "1")),
 }
 
 

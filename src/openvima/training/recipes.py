@@ -74,6 +74,7 @@ _PAPERS_FRAMES: Mapping[str, Any] = {
     "preset": "gato-nano",
     "schedule.steps": 8000,
     "loader.batch_size": 64,
+    "loader.rerendered_prob": 0.4,
     "optimizer.learning_rate": 5e-4,
     "optimizer.weight_decay": 0.0,
     "schedule.warmup_steps": 200,
@@ -91,7 +92,6 @@ _PAPERS: Mapping[str, Any] = {
     **_VARIED_PAIRS,
     "pretraining.finetune_crop_encoder": False,  # nor after --init-from
     "optimizer.pointing_loss_weight": 1.0,
-    "loader.rerendered_prob": 0.4,
     "augmentation.rename_objects_prob": 0.3,
     "augmentation.shuffle_sentences_prob": 0.3,
     "augmentation.distractor_prob": 0.3,
