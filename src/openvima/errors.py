@@ -137,6 +137,23 @@ class ServerError(OpenVimaError, ConnectionError):
     """A policy server cannot be reached, was lost, refuses a request or speaks another protocol."""
 
 
+class AnswerError(OpenVimaError, ValueError):
+    """An answer of a language model holds no action; a policy returns it in place of one.
+
+    Args:
+        kind: What is wrong, for counting.
+        details: What was given instead.
+    """
+
+    def __init__(self, kind: str, details: str) -> None:
+        super().__init__(f"{kind}; {details}.")
+        self.kind = kind
+
+
+class LimitReachedError(OpenVimaError, RuntimeError):
+    """An evaluation has used up its requests or tokens; what is finished was kept."""
+
+
 class MissingExtraError(OpenVimaError, ImportError):
     """An optional dependency is not installed; the message names the extra."""
 

@@ -10,7 +10,8 @@ from openvima.env import TabletopEnv
 from openvima.errors import SceneError
 from openvima.render.raycast import Hit, first_hit
 from openvima.scene import Scene
-from openvima.studio.browser_session import clicked_action, pose_after
+from openvima.scene.action import pose_after
+from openvima.studio.browser_session import clicked_action
 from openvima.tasks import sample_episode
 
 

@@ -5,6 +5,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from openvima.data.chat import ChatView
+from openvima.serving.chat import DEFAULT_OPTIONS, VlmOptions
+
 
 def main(
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None,
@@ -23,6 +26,9 @@ def main(
     boxes: str | None = None,
     trust_code: bool = False,
     explain: bool = False,
+    base_url: str | None = None,
+    view: ChatView = "top",
+    vlm: VlmOptions = DEFAULT_OPTIONS,
 ) -> int:
     """Record one episode: the prompt above, the table and the arm below.
 
@@ -36,7 +42,8 @@ def main(
         level: train, L1, L2, L3 or L4; by default the task's first.
         policy: oracle, openvima-small (bundled), random, untrained, untrained:PRESET (random weights), the
             folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
-            a published file, OWNER/NAME[@REVISION] on the Hub, or a policy server (ws://HOST:PORT).
+            a published file, OWNER/NAME[@REVISION] on the Hub, a policy server (ws://HOST:PORT), or a
+            vision-language model (vlm:MODEL), whose words are drawn beside the video.
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
         compat: Follow the original benchmark also where it is odd.
@@ -54,6 +61,10 @@ def main(
         explain: Draw beside the video what the policy considers at each step: probabilities of objects,
             places and rotations, and attention to the prompt. For openvima-small, nano, nano-bins, small,
             vima-* and flamingo-*.
+        base_url: Address of the OpenAI-compatible server of a model vlm:MODEL, such as
+            http://127.0.0.1:8000/v1; by default that of OPENAI_BASE_URL, else OpenAI's own.
+        view: Camera that it sees, and in whose picture it points; top+front shows both.
+        vlm: How it is asked.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -80,9 +91,11 @@ def main(
     from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_rollout_policy
     from openvima.evaluation.sources import PolicySource
+    from openvima.serving.chat import VlmConfig
     from openvima.tasks.sampling import check_task_options
 
-    PolicySource(policy, policy, trust_code).check()  # before a scene is built
+    source = PolicySource(policy, policy, trust_code)
+    source.check()  # before a scene is built
     if episode is not None:
         return _record_file(
             episode,
@@ -110,7 +123,9 @@ def main(
         device=device,
         boxes=boxes or "",
         trust_code=trust_code,
+        vlm=VlmConfig(base_url, view, vlm),
     )
+    explain = explain or source.kind == "vlm"
     env = env_config.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
     outcome = record_episode(env, load_rollout_policy(batch), seed, out, title=title, explain=explain)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from openvima.cli.terminal import parse_list, parse_shard_range, parse_sources, print_table, progress_bar
+from openvima.data.chat import ChatView
+from openvima.serving.chat import DEFAULT_OPTIONS, VlmOptions
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -50,6 +52,10 @@ def main(
     python: str | None = None,
     device: str = "cpu",
     precision: Literal["float64", "float32", "bfloat16"] | None = None,
+    base_url: str | None = None,
+    view: ChatView = "top",
+    vlm: VlmOptions = DEFAULT_OPTIONS,
+    dry_run: bool = False,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Score policies on tasks and levels, and write results.json and report.html.
@@ -63,8 +69,9 @@ def main(
         policy: One or more of openvima-small (a bundled checkpoint), oracle, random, untrained,
             untrained:PRESET (random weights), folders of training runs, FILE.py:FUNCTION or MODULE:FUNCTION
             that makes a policy of your own, published files, OWNER/NAME[@REVISION] on the Hub, policy servers
-            (ws://HOST:PORT, see `openvima serve`) and LeRobot policies (lerobot:PATH or
-            lerobot:OWNER/NAME[@REVISION], see --python), with commas in between; NAME=FOLDER,
+            (ws://HOST:PORT, see `openvima serve`), LeRobot policies (lerobot:PATH or
+            lerobot:OWNER/NAME[@REVISION], see --python) and vision-language models (vlm:MODEL, see
+            --base-url), with commas in between; NAME=FOLDER,
             NAME=FILE.py:FUNCTION and so on give another name.
         tasks: Names of tasks with commas in between; all; or heldout, the four tasks of L4 that training
             does not see. A level that does not hold a task leaves it out.
@@ -114,20 +121,28 @@ def main(
         device: Where networks compute: cpu, in float64, or cuda, in float32.
         precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
             such episodes are listed as near_ties.
+        base_url: Address of the OpenAI-compatible server of models vlm:MODEL, such as
+            http://127.0.0.1:8000/v1; by default that of OPENAI_BASE_URL, else OpenAI's own. The key is that
+            of OPENAI_API_KEY; see docs/vlms.md.
+        view: Camera that they see, and in whose picture they point; top+front shows both.
+        vlm: How they are asked.
+        dry_run: Write the first message that a model would get as a page, and estimate what the evaluation
+            costs. Nothing is sent.
         as_json: Print the rows as JSON instead of a table.
 
     Returns:
         Exit status.
     """
     from openvima.env import EnvConfig
-    from openvima.errors import ConfigError
+    from openvima.errors import ConfigError, LimitReachedError
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.ablations import IN_CONTEXT
     from openvima.evaluation.config import plan
     from openvima.evaluation.results import FILE_NAME
-    from openvima.evaluation.runner import evaluate_range
+    from openvima.evaluation.runner import evaluate_range, finished_part
     from openvima.multiprocess import num_cpus
     from openvima.report import VideoSelection
+    from openvima.serving.chat import VlmConfig
 
     if in_context:
         ablations = f"{ablations},{IN_CONTEXT}"
@@ -150,7 +165,15 @@ def main(
         address=address,
         trust_code=trust_code,
         python=python,
+        vlm=VlmConfig(base_url, view, vlm),
     )
+    if dry_run:
+        from openvima.evaluation.chat_preview import write_preview
+
+        page, estimate = write_preview(config)
+        print(f"About {estimate}.")
+        print(page)
+        return 0
     if workers is None and engine == "processes" and device == "cpu":
         config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
     selection = VideoSelection(videos, parse_list(record_video))
@@ -168,12 +191,17 @@ def main(
             what = "is finished" if (out / FILE_NAME).exists() else "lacks batches of other ranges"
             print(f"{out} {what}.", file=sys.stderr)
             return 0
-    if report:
-        path = _evaluate_and_report(config, selection, as_json=as_json)
-    else:
-        with progress_bar("evaluation") as bar:
-            path = evaluate(config, bar)
-        _print_scores(Results.read(path), path, as_json=as_json)
+    try:
+        if report:
+            path = _evaluate_and_report(config, selection, as_json=as_json)
+        else:
+            with progress_bar("evaluation") as bar:
+                path = evaluate(config, bar)
+            _print_scores(Results.read(path), path, as_json=as_json)
+    except LimitReachedError:
+        if (finished := finished_part(config)) is not None:
+            print_results(finished)
+        raise
     print(
         f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if report else ""),
         file=sys.stderr,

@@ -11,7 +11,7 @@ import pyarrow as pa
 from openvima.atomic_io import atomic_write
 from openvima.data.shard import DAMAGE_ERRORS
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import ActionError, DatasetError, OracleError, PolicyError
+from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, PolicyError
 from openvima.evaluation.results import Row
 from openvima.evaluation.rollout_policies import Decision, Explainer, Observation, RolloutPolicy
 from openvima.input_files import open_regular
@@ -212,7 +212,7 @@ def _field(metadata: bytes, table: int, number: int) -> int:
 
 
 def _numbers(decision: Decision, control: str) -> list[float]:
-    if decision is None or isinstance(decision, OracleError):
+    if decision is None or isinstance(decision, OracleError | AnswerError):
         return []
     try:
         if control == END_EFFECTOR:

@@ -33,6 +33,7 @@ from openvima.evaluation.sources import PolicySource, policy_sources
 from openvima.input_files import as_path, settle
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene.action import steps_per_primitive
+from openvima.serving.chat import DEFAULT_VLM, VlmConfig
 from openvima.serving.lerobot import lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
 from openvima.tasks.sampling import MAX_SEED, check_task_options, check_text_form, takes_prompts
@@ -84,6 +85,8 @@ class EvaluationConfig:
         trust_code: Run the code that run folders name, as those of learners of your own do.
         python: For policies "lerobot:PATH" or "lerobot:OWNER/NAME": the Python of an environment with LeRobot
             and the plugin `lerobot-env-openvima`, which serves them.
+        vlm: How policies "vlm:MODEL", vision-language models of a chat server, are asked; their answers are
+            kept in `out`.
 
     Raises:
         ConfigError: A number is out of its range, a name is not known, or settings contradict each other.
@@ -107,6 +110,7 @@ class EvaluationConfig:
     address: str | None = None
     trust_code: bool = False
     python: str | None = None
+    vlm: VlmConfig = DEFAULT_VLM
 
     __repr__ = brief_repr
 
@@ -168,7 +172,7 @@ class EvaluationConfig:
         Raises:
             ConfigError: As for `policy_sources`.
         """
-        given = policy_sources(self.policies, trust_code=self.trust_code)
+        given = policy_sources(self.policies, trust_code=self.trust_code, vlm=self.vlm)
         asked = REFERENCE_POLICIES if "all" in self.ablations else self.ablations
         there = {source.source for source in given}
         added = [name for name in REFERENCE_POLICIES if name in asked and name not in there]
@@ -181,7 +185,7 @@ class EvaluationConfig:
         """
         if source.kind in (ORACLE, RANDOM):
             return ()
-        extracts = source.kind in ("code", "remote") or source.learner is not None
+        extracts = source.kind in ("code", "remote", "vlm") or source.learner is not None
         unusable = {DETECTED_BOXES, NOISY_BOXES} if extracts else set()
         if self.boxes is None:
             unusable.add(DETECTED_BOXES)
@@ -220,6 +224,11 @@ class EvaluationConfig:
                     where = stack.enter_context(lerobot_server(where, self.python, device=self.device))
                 policies.append(f"{source.name}={where}")
             yield replace(self, policies=tuple(policies), python=None)
+
+    @property
+    def kept_vlm(self) -> VlmConfig:
+        """How vision-language models are asked, with the folder in which their answers are kept."""
+        return replace(self.vlm, answers=self.out / "answers")
 
     @property
     def asked_ablations(self) -> tuple[str, ...]:
@@ -261,6 +270,7 @@ class Batch:
         precision: As in `EvaluationConfig`; empty for the policy's own.
         boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
         trust_code: As in `EvaluationConfig`.
+        vlm: As in `EvaluationConfig`.
     """
 
     policy: str
@@ -275,6 +285,7 @@ class Batch:
     precision: str = ""
     boxes: str = ""
     trust_code: bool = False
+    vlm: VlmConfig = DEFAULT_VLM
 
     @property
     def seeds(self) -> range:
@@ -288,6 +299,7 @@ class Batch:
             fingerprint: Text that stands for the policy's weights, wherever they lie, and the versions.
         """
         settings = {**asdict(self), "source": "", "trust_code": False}
+        del settings["vlm"]  # the fingerprint stands for it
         content = json.dumps([settings, fingerprint], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:24]
 
@@ -392,6 +404,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             precision=config.precision or "",
             boxes=(config.boxes or "") if DETECTED_BOXES in _names_in(ablation) else "",
             trust_code=config.trust_code,
+            vlm=config.kept_vlm,
         )
         for source, ablation in played
         for task, level in cells(config, ablation)

@@ -6,6 +6,7 @@ from typing import Any
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import (
     ActionError,
+    AnswerError,
     DetectionError,
     OpenVimaError,
     OracleError,
@@ -50,6 +51,8 @@ class EpisodeSlot:
         """Take one step, unless there is no usable action; then the episode has failed."""
         if isinstance(decision, OracleError):
             return self._end(str(decision), NO_ORACLE_ACTION)
+        if isinstance(decision, AnswerError):
+            return self._end(str(decision), decision.kind)
         assert decision is not None  # rollout policies have checked it
         try:
             _, terminated, truncated, info = self.env.advance(decision)

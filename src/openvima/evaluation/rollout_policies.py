@@ -12,6 +12,7 @@ import numpy as np
 from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import (
+    AnswerError,
     OpenVimaError,
     OracleError,
     PolicyError,
@@ -20,6 +21,7 @@ from openvima.errors import (
     echo,
 )
 from openvima.evaluation.ablations import AblatedInput, ablate
+from openvima.evaluation.chat import Said, said_in, shot_turns
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.sources import PolicySource
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, require_torch, torch_threads
@@ -28,13 +30,14 @@ from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene import Action
 from openvima.scene.action import END_EFFECTOR, PRIMITIVES, ToolCommand
 from openvima.scene.explanation import PLACE_KINDS, Explanation
+from openvima.serving.chat import DEFAULT_VLM, SEGMENTATION, ChatClient, VlmConfig, VlmPolicy
 from openvima.serving.client import RemotePolicy
 from openvima.user_code import described
 
 _MAX_SEEDS = 16  # that an error lists
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
 Explainer = Callable[[], Sequence[Explanation | None]]  # see `openvima.policies.Policy`
-Decision = Mapping[str, Any] | Action | np.ndarray | ToolCommand | OracleError | None
+Decision = Mapping[str, Any] | Action | np.ndarray | ToolCommand | OracleError | AnswerError | None
 
 
 class RolloutPolicy(Protocol):
@@ -47,7 +50,8 @@ class RolloutPolicy(Protocol):
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Give the next action of each environment.
 
-        The answer is None where the episode is over, and an error where an oracle has no action.
+        The answer is None where the episode is over, and an error where an oracle has no action, or where the
+        words of a model hold none.
         """
         ...
 
@@ -217,6 +221,29 @@ class PromptedRolloutPolicy:
         return getattr(self._policy, "near_ties", ())
 
 
+class VlmRolloutPolicy(PromptedRolloutPolicy):
+    """A vision-language model; `said` holds its answers in each episode of the batch, by step."""
+
+    _policy: VlmPolicy
+
+    def begin(self, envs: Sequence[TabletopEnv]) -> None:
+        """Put demonstrations of the task before the episodes, if any are asked for."""
+        count = self._policy.client.config.options.shots
+        self._policy.shots = shot_turns(envs[0], count, self._policy.format, self._policy.extractor)
+        self.said: list[Said] = [[] for _ in envs]
+        super().begin(envs)
+
+    def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
+        """Ask the model, and keep what it says."""
+        decisions = super().decide(observations)
+        for env, steps, answer, decision in zip(
+            self._envs, self.said, self._policy.answers, decisions, strict=True
+        ):
+            if answer is not None:
+                steps.append(said_in(env, answer, decision))
+        return decisions
+
+
 def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = False) -> RolloutPolicy:
     """Load the policy of a batch of episodes.
 
@@ -239,11 +266,18 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = Fals
         "precision": batch.precision,
         "boxes": batch.boxes,
         "trust_code": batch.trust_code,
+        "vlm": batch.vlm,
     }
     policy = (
-        _build_policy(batch.source, **options) if own else _load_policy(batch.source, fingerprint, **options)
+        build_policy(batch.source, **options) if own else _load_policy(batch.source, fingerprint, **options)
     )
-    return PromptedRolloutPolicy(policy, batch.ablation, name=batch.policy)
+    return _rollout_policy(policy, batch.ablation, batch.policy)
+
+
+def _rollout_policy(policy: Any, ablation: str, name: str) -> PromptedRolloutPolicy:
+    if isinstance(policy, VlmPolicy):
+        return VlmRolloutPolicy(policy.new_session(), ablation, name=name)
+    return PromptedRolloutPolicy(policy, ablation, name=name)
 
 
 @contextmanager
@@ -251,7 +285,7 @@ def one_thread(batch: Batch) -> Iterator[None]:
     """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
     kind = PolicyRef.parse(batch.source).kind
     without_torch = kind == "code" and importlib.util.find_spec("torch") is None
-    if kind in (ORACLE, RANDOM, "remote") or without_torch:  # no network here
+    if kind in (ORACLE, RANDOM, "remote", "vlm") or without_torch:  # no network here
         yield
         return
     require_torch(f"policy {batch.policy!r}")
@@ -286,27 +320,35 @@ def load_own_rollout_policy(
     if source == ORACLE:
         return OracleRolloutPolicy()
     options: dict[str, Any] = {}
-    if temperature and PolicyRef.parse(source).kind not in (RANDOM, "remote", "code"):
+    if temperature and PolicyRef.parse(source).kind not in (RANDOM, "remote", "code", "vlm"):
         require_torch(f"policy {source!r}")
         import torch
 
         options = {"temperature": temperature, "generator": torch.Generator().manual_seed(seed)}
-    policy = _build_policy(source, device=device, boxes=boxes, trust_code=trust_code, **options)
-    return PromptedRolloutPolicy(policy, name=source)
+    policy = build_policy(source, device=device, boxes=boxes, trust_code=trust_code, **options)
+    return _rollout_policy(policy, "", source)
 
 
 @lru_cache(maxsize=1)
 def _load_policy(source: str, fingerprint: str, **options: Any) -> Any:
     if PolicyRef.parse(source).kind == "remote":
         _load_policy.cache_clear()  # ends the connection before: a server may let in one client only
-    return _build_policy(source, **options)
+    return build_policy(source, **options)
 
 
-def _build_policy(source: str, *, boxes: str, precision: str = "", **options: Any) -> Any:
+def build_policy(
+    source: str, *, boxes: str, precision: str = "", vlm: VlmConfig = DEFAULT_VLM, **options: Any
+) -> Any:
+    """Load a policy anew, with the options of a `Batch`; the errors are those of `load_rollout_policy`."""
     from openvima.policies import load_policy
 
-    if PolicyRef.parse(source).kind == "remote":
+    ref = PolicyRef.parse(source)
+    if ref.kind == "remote":
         return RemotePolicy(source)
+    if ref.kind == "vlm":
+        detects = vlm.options.boxes not in ("", SEGMENTATION)
+        extractor = plugged_extractor(vlm.options.boxes) if detects else None
+        return VlmPolicy(ChatClient(ref.model, vlm), extractor)
     if precision:
         import torch
 

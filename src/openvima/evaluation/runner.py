@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,22 +19,32 @@ from openvima.env.config import EnvConfig
 from openvima.errors import ConfigError, PolicyError, differences, echo
 from openvima.evaluation.ablations import NOISY_BOXES
 from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
+from openvima.evaluation.chat import Said, summarise, write_answers
 from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, versions
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy, one_thread
+from openvima.evaluation.rollout_policies import (
+    PromptedRolloutPolicy,
+    VlmRolloutPolicy,
+    build_policy,
+    load_rollout_policy,
+    one_thread,
+)
 from openvima.evaluation.sources import object_record
 from openvima.input_files import names_of
 from openvima.multiprocess import imap_unordered
 from openvima.policies.base import Policy, require_torch
 from openvima.policies.loading import load_policy
+from openvima.policies.naming import PolicyRef
 from openvima.scene.action import PRIMITIVES
+from openvima.serving.chat import VlmPolicy
 from openvima.user_code import is_code, source_hash
 from openvima.video.encoder import FOLDER
 
 Report = Callable[[int, int, str], None]
 LOG_NAME = "evaluation_log.json"
 _PARTS = "parts"
+_ANSWERS = "answers"  # in the record of a policy: what is known once it was played
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +72,11 @@ class PreparedEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Rollouts:
-    """The episodes of a batch: how each ended, and its valid actions."""
+    """The episodes of a batch: how each ended, its valid actions, and what a language model said in it."""
 
     outcomes: tuple[EpisodeOutcome, ...]
     actions: tuple[Steps, ...]
+    said: tuple[Said, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,11 +196,41 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
             for episode in zip(batch.seeds, played[batch].actions, strict=True)
         )
         digest = write_actions(config.out, episodes, control=config.env_config.control)
-        results = Results(rows, prepared.record(), prepared.versions, prepared.policies, digest)
+        policies, median_s = _answered(prepared, played)
+        results = Results(rows, prepared.record(), prepared.versions, policies, digest)
         results.write(path)
-        _write_log(config, results, time.perf_counter() - started)
+        _write_log(config, results, time.perf_counter() - started, median_s)
     shutil.rmtree(config.out / _PARTS, ignore_errors=True)
     return path
+
+
+def finished_part(config: EvaluationConfig) -> Results | None:
+    """Return the results of the tasks and levels whose episodes are all finished; None without any."""
+    prepared = prepare(config)
+    kept = {job.batch: _kept(job, config.out) for job in _jobs(prepared)}
+    cells = [(batch.policy, batch.ablation, batch.task, batch.level) for batch in kept]
+    open_cells = {cell for cell, played in zip(cells, kept.values(), strict=True) if played is None}
+    whole = [batch for batch, cell in zip(kept, cells, strict=True) if cell not in open_cells]
+    outcomes = {batch: played.outcomes for batch, played in kept.items() if played is not None}
+    rows = rows_of(whole, outcomes)
+    return Results(rows, prepared.record(), prepared.versions, prepared.policies) if rows else None
+
+
+def _answered(
+    prepared: PreparedEvaluation, played: Mapping[Batch, Rollouts]
+) -> tuple[dict[str, dict[str, Any]], float | None]:
+    """Write what models said; return the records of the policies with its summary, and a median time."""
+    policies, steps = dict(prepared.policies), []
+    episodes: dict[str, list[tuple[EpisodeOutcome, Said]]] = {}
+    for batch in prepared.batches:
+        rollouts = played[batch]
+        where = {"policy": batch.policy, "task": batch.task, "level": batch.level, "ablation": batch.ablation}
+        for outcome, said in zip(rollouts.outcomes, rollouts.said, strict=False):  # of others nothing is said
+            episodes.setdefault(batch.policy, []).append((outcome, said))
+            steps += [where | {"seed": outcome.seed, "step": n} | step for n, step in enumerate(said)]
+    for name, of_policy in episodes.items():
+        policies[name] = {**policies[name], _ANSWERS: summarise(of_policy)}
+    return policies, write_answers(prepared.config.out, steps)
 
 
 def _check_weights(config: EvaluationConfig) -> None:
@@ -208,7 +250,11 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     if not path.exists() or prepared.config.force:
         return None
     earlier = Results.read(path)
-    old = earlier.config | {"policies": earlier.policies, "versions": earlier.versions}
+    policies = {
+        name: {key: value for key, value in what.items() if key != _ANSWERS}
+        for name, what in earlier.policies.items()
+    }
+    old = earlier.config | {"policies": policies, "versions": earlier.versions}
     new = prepared.record() | {"policies": prepared.policies, "versions": prepared.versions}
     differing = differences(old, new)
     if not differing:
@@ -258,6 +304,12 @@ def _jobs(prepared: PreparedEvaluation) -> list[Job]:
 
 def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Rollouts]]:
     """Run batches on the configured engine and yield them as they finish."""
+    chats = [job for job in jobs if PolicyRef.parse(job.batch.source).kind == "vlm"]
+    if chats:
+        yield from _play_chats(chats, config.vlm.options.concurrency)
+        jobs = [job for job in jobs if job not in chats]
+        if not jobs:
+            return
     if config.engine == "processes":
         yield from imap_unordered(play_batch, jobs, config.workers or 1)
         return
@@ -267,6 +319,46 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Ro
     workers = config.workers or (1 if config.address is None else None)
     for job, played in ray_imap_unordered(play_batch, list(sent), workers, address=config.address):
         yield sent[job], played
+
+
+def _play_chats(jobs: Sequence[Job], num_threads: int) -> Iterator[tuple[Job, Rollouts]]:
+    """Play the episodes of vision-language models in threads of this process: they wait for a server.
+
+    Episodes of all batches overlap, so that the end of one leaves no request unused. Where it is stopped, the
+    answers that are on their way are waited for, and kept.
+    """
+    policies = {}
+    for job in jobs:
+        if job.batch.source not in policies:
+            policies[job.batch.source] = build_policy(
+                job.batch.source, boxes=job.batch.boxes, vlm=job.batch.vlm
+            )
+    with ThreadPoolExecutor(num_threads) as pool:
+        playing = [
+            (
+                job,
+                [pool.submit(_play_chat, job, policies[job.batch.source], seed) for seed in job.batch.seeds],
+            )
+            for job in jobs
+        ]
+        try:
+            for job, episodes in playing:
+                outcomes, actions, said = zip(*(episode.result() for episode in episodes), strict=True)
+                yield job, Rollouts(outcomes, actions, said)
+        except BaseException:
+            for policy in policies.values():
+                policy.client.is_stopped = True
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _play_chat(job: Job, policy: VlmPolicy, seed: int) -> tuple[EpisodeOutcome, Steps, Said]:
+    batch = job.batch
+    chat = VlmRolloutPolicy(policy.new_session(), batch.ablation, name=batch.policy)
+    recorder = ActionRecorder(chat)
+    env = batch.env_config.make(batch.task, batch.level, domain="eval")
+    (outcome,) = play([env], [seed], recorder, may_fail=job.may_fail)
+    return outcome, recorder.steps[0], chat.said[0]
 
 
 def play_batch(job: Job, count: Callable[[int], None]) -> Rollouts:
@@ -288,13 +380,20 @@ def _kept(job: Job, folder: Path) -> Rollouts | None:
         record = json.loads(job.part(folder).read_text(encoding="utf-8"))
         outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
         actions = tuple(record["actions"])
+        said = tuple(record["said"])
         whole = [len(steps) for steps in actions] == [outcome.steps for outcome in outcomes]
     except (OSError, ValueError, TypeError, LookupError):
         return None
-    return Rollouts(outcomes, actions) if whole and [o.seed for o in outcomes] == [*job.batch.seeds] else None
+    return (
+        Rollouts(outcomes, actions, said)
+        if whole and [o.seed for o in outcomes] == [*job.batch.seeds]
+        else None
+    )
 
 
-def _write_log(config: EvaluationConfig, results: Results, seconds: float) -> None:
+def _write_log(
+    config: EvaluationConfig, results: Results, seconds: float, median_answer_s: float | None
+) -> None:
     """Write what depends on the machine and the time, apart from the results."""
     episodes = sum(row.episodes for row in results.rows)
     record = {
@@ -303,6 +402,7 @@ def _write_log(config: EvaluationConfig, results: Results, seconds: float) -> No
         "engine": config.engine,
         "workers": config.workers,
         "policies": {source.name: source.source for source in config.sources},
+        **({} if median_answer_s is None else {"median_answer_s": median_answer_s}),
     }
     atomic_write_file(config.out / LOG_NAME, json.dumps(record, indent=1) + "\n")
 

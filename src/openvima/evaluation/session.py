@@ -15,6 +15,7 @@ from openvima.env.episode_file import load_episode
 from openvima.env.tabletop import TabletopEnv, VideoFrame
 from openvima.errors import (
     ActionError,
+    AnswerError,
     ConfigError,
     EpisodeError,
     OpenVimaError,
@@ -255,7 +256,7 @@ class EpisodeSession:
                 self._policy.begin([self.env])
                 self._begun = True
             (self._decision,) = self._policy.decide([self._slot.observation])
-            if isinstance(self._decision, OracleError):
+            if isinstance(self._decision, OracleError | AnswerError):
                 return Proposal(error=self._decision)
             assert self._decision is not None  # rollout policies have checked it
             given = self._decision
@@ -421,7 +422,8 @@ def _run(session: EpisodeSession, recorder: EpisodeRecorder | None = None) -> Ep
     """Step to the end, and raise what the policy raises."""
     while session.outcome is None:
         error = session.propose().error
-        if error is not None and not isinstance(error, ActionError | OracleError):  # these end the episode
+        ends = isinstance(error, ActionError | AnswerError | OracleError)  # the episode
+        if error is not None and not ends:
             raise error
         if session.step() is not None and recorder is not None:
             recorder.record_step(session.env)

@@ -30,13 +30,14 @@ from openvima.policies.naming import (
     hub_commit,
     unknown_policy,
 )
+from openvima.serving.chat import DEFAULT_VLM, VlmConfig, require_extra
 from openvima.serving.client import describe
 from openvima.serving.lerobot import SERVER_MODULE, lerobot_name
 from openvima.serving.protocol import DEFAULT_MODALITIES, check_address
 from openvima.user_code import load_function, source_hash, without_folder
 
 NAMED_POLICIES = (ORACLE, RANDOM, UNTRAINED)
-TRAINED_KINDS = ("run", "code", "remote")  # see `PolicySource.kind`
+TRAINED_KINDS = ("run", "code", "remote", "vlm")  # see `PolicySource.kind`
 _WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
 
@@ -49,11 +50,13 @@ class PolicySource:
         source: "oracle", "random", "untrained", "untrained:PRESET", the name of a bundled checkpoint,
             what else `load_policy` takes, or the address of a policy server.
         trust_code: Whether to run the code that a run folder names.
+        vlm: How a vision-language model is asked.
     """
 
     name: str
     source: str
     trust_code: bool = False
+    vlm: VlmConfig = DEFAULT_VLM
 
     @property
     def ref(self) -> PolicyRef:
@@ -62,7 +65,7 @@ class PolicySource:
 
     @property
     def kind(self) -> str:
-        """Its kind in the results: oracle, random, untrained, remote, lerobot, code or run.
+        """Its kind in the results: oracle, random, untrained, remote, lerobot, vlm, code or run.
 
         "code" is a function that makes a policy; "run" is all else.
         """
@@ -88,7 +91,9 @@ class PolicySource:
                 f"{echo(self.source)} runs in LeRobot's own environment: name its Python with `openvima "
                 f"evaluate --python`, or run PYTHON -m {SERVER_MODULE} PATH_OR_ID and give its address, ws://…."
             )
-        if self.kind == "remote":
+        if self.kind == "vlm":
+            require_extra()
+        elif self.kind == "remote":
             check_address(self.source)
         elif self.kind == "code":
             load_function(self.source, what="policy")
@@ -103,7 +108,8 @@ class PolicySource:
         """What the policy is.
 
         Returns:
-            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights,
+            Plain values, "kind" first: for a remote policy what it says; for a vision-language model its name
+            and how it is asked; for a run "sha256" of its weights,
             "hub" with repository and commit if it is from there, and, as its settings declare,
             "excluded_tasks" of its training and "held_out_data", the demonstrations among its data that are
             held out for evaluation;
@@ -118,6 +124,8 @@ class PolicySource:
             ServerError: No policy server answers at the address.
         """
         self.check()
+        if self.kind == "vlm":
+            return {"kind": "vlm", **self.vlm.record(self.ref.model)}
         if self.kind == "remote":
             return {"kind": "remote", "metadata": describe(self.source)}
         if self.kind == "code":
@@ -140,12 +148,15 @@ class PolicySource:
         return {"held_out_data": found} if found else {}
 
 
-def policy_sources(policies: Sequence[str], *, trust_code: bool = False) -> tuple[PolicySource, ...]:
+def policy_sources(
+    policies: Sequence[str], *, trust_code: bool = False, vlm: VlmConfig = DEFAULT_VLM
+) -> tuple[PolicySource, ...]:
     """Read policies as given on the command line.
 
     Args:
         policies: Sources, or NAME=SOURCE; an existing path is a source, whatever it contains.
         trust_code: As in `PolicySource`.
+        vlm: As in `PolicySource`.
 
     Raises:
         ConfigError: Two policies have the same name, a name is not fit for file names, or an address without
@@ -158,7 +169,7 @@ def policy_sources(policies: Sequence[str], *, trust_code: bool = False) -> tupl
         name, equals, source = ("", "", given) if whole else given.partition("=")
         if not equals:
             name, source = _default_name(given), given
-        sources.append(PolicySource(name, source, trust_code))
+        sources.append(PolicySource(name, source, trust_code, vlm))
     if unfinished := [source.name for source in sources if not source.source]:
         raise ConfigError(f"policy {unfinished[0]!r} has no folder; name it as {unfinished[0]}=PATH.")
     names = [source.name for source in sources]

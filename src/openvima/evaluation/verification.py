@@ -9,6 +9,7 @@ import numpy as np
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import recorded_assets
+from openvima.data.chat import UNREADABLE
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, DatasetError, OpenVimaError, echo
 from openvima.evaluation.ablations import ablated_environment
@@ -31,7 +32,7 @@ from openvima.multiprocess import imap_unordered
 VERIFICATION_NAME = "verification.json"
 _SIMULATOR = ("environments", "mujoco")  # versions that decide what an action does
 # No action was executed; which one was given, or what was raised, is not recorded.
-_ENDED_EARLY = (BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR)
+_ENDED_EARLY = (BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR, UNREADABLE)
 _BATCH = 16  # episodes of one job
 
 
@@ -254,7 +255,7 @@ def replay_episodes(job: _Replay, count: Callable[[int], None]) -> list[str]:
 
 def _difference(given: EpisodeOutcome, own: EpisodeOutcome) -> str:
     """Name what differs between a recorded and a replayed outcome."""
-    if own.kind == NO_ORACLE_ACTION and given.kind in _ENDED_EARLY:
+    if own.kind == NO_ORACLE_ACTION and given.kind.startswith(_ENDED_EARLY):
         own = replace(own, kind=given.kind, reason=given.reason)
     own = replace(own, near_ties=given.near_ties)
     names = [field.name for field in fields(own) if getattr(own, field.name) != getattr(given, field.name)]

@@ -31,9 +31,10 @@ MODEL_CARD = "MODEL_CARD.md"
 
 ORACLE, RANDOM, UNTRAINED = "oracle", "random", "untrained"
 LEROBOT = "lerobot:"  # begins the names of LeRobot policies
+VLM = "vlm:"  # begins the names of models of a chat server
 SERVER_SCHEMES = ("ws://", "wss://")
 Kind = Literal[
-    "oracle", "random", "untrained", "remote", "lerobot", "code", "bundled", "path", "hub", "unknown"
+    "oracle", "random", "untrained", "remote", "lerobot", "vlm", "code", "bundled", "path", "hub", "unknown"
 ]
 
 _TRAINED = Path(__file__).parent / "trained"
@@ -113,6 +114,7 @@ class PolicyRef:
     | untrained | "untrained", or "untrained:PRESET" |
     | remote | "ws://HOST:PORT" or "wss://…", in evaluations |
     | lerobot | "lerobot:PATH" or "lerobot:OWNER/NAME", in evaluations |
+    | vlm | "vlm:MODEL", in evaluations |
     | code | "FILE.py:FUNCTION" or "MODULE:FUNCTION" |
     | bundled | name of a bundled checkpoint |
     | path | an existing run folder, checkpoint folder or published .ckpt file |
@@ -139,6 +141,18 @@ class PolicyRef:
         return self.kind in ("bundled", "path", "hub")
 
     @property
+    def model(self) -> str:
+        """Name of a vision-language model on its server.
+
+        Raises:
+            PolicyError: It is empty.
+        """
+        name = self.text.removeprefix(VLM)
+        if not name:
+            raise PolicyError("vlm: lacks the name of a model; write vlm:MODEL, with its name on the server.")
+        return name
+
+    @property
     def preset(self) -> str:
         """The preset whose fresh weights an untrained policy has.
 
@@ -155,6 +169,8 @@ def _kind(text: str) -> Kind:
         return text
     if text.startswith(LEROBOT):
         return "lerobot"
+    if text.startswith(VLM):
+        return "vlm"
     if text.startswith(SERVER_SCHEMES):
         return "remote"
     if text.partition(":")[0] == UNTRAINED:
@@ -182,7 +198,7 @@ def unknown_policy(name: str, others: Sequence[str]) -> str:
     hint = (
         f"Allowed: {', '.join(named)}, {presets} that `openvima policies` lists, the folder of a training "
         "run, a published .ckpt file, owner/name or owner/name@revision on the Hugging Face Hub, "
-        "FILE.py:FUNCTION, MODULE:FUNCTION, or in evaluations ws://HOST:PORT or lerobot:PATH."
+        "FILE.py:FUNCTION, MODULE:FUNCTION, or in evaluations ws://HOST:PORT, lerobot:PATH or vlm:MODEL."
     )
     return unknown_name("policy", name, (*named, *PRESETS), hint)
 

@@ -12,7 +12,7 @@ from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
 from openvima.input_files import as_path, names_of
-from openvima.policies.naming import UNTRAINED
+from openvima.policies.naming import UNTRAINED, VLM
 from openvima.report import figures, published, tables, text
 from openvima.report.ablations import ablated_policies, rate_figures
 from openvima.report.curves import read_run_charts
@@ -23,7 +23,7 @@ from openvima.video.encoder import Clip
 
 _FUNCTIONS = (  # that the templates in `html/templates/report/` call
     *(text.percent, text.exact, text.points, text.points_span, text.probability, text.span, text.counted),
-    *(text.listed, text.role, text.finding, text.ablation_name, text.ablation_descriptions),
+    *(text.answers, text.listed, text.role, text.finding, text.ablation_name, text.ablation_descriptions),
     *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
     *(published.published_rate, published.published_coverage, published.published_rows),
     *(published.leading_models, figures.rate_figure_html, figures.table_html, text.plain_reason),
@@ -39,6 +39,9 @@ _OPTIONS = {  # settings that a command names where they are not these
     "precision": "",
 }
 _PLACES = {"run": "RUN", "remote": "ws://HOST:PORT"}
+_VLM_OPTIONS = {"view": "view"} | {
+    name: f"vlm.{name}" for name in ("points", "enlarge", "boxes", "shots", "temperature")
+}
 
 
 def write_report(
@@ -147,15 +150,32 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
         *(["--compat"] if config.get("compat") else []),
         *(["--trust-code"] if any("code" in what for what in results.policies.values()) else []),
         *([f"--ablations {shlex.quote(','.join(config['ablations']))}"] if config.get("ablations") else []),
+        *[word for what in list(filter(_is_vlm, results.policies.values()))[:1] for word in _vlm_words(what)],
         "--out DIR",
     ]
     return " ".join(words)
+
+
+def _is_vlm(what: Mapping[str, Any]) -> bool:
+    return what.get("kind") == "vlm"
+
+
+def _vlm_words(what: Mapping[str, Any]) -> list[str]:
+    """Name the settings of a vision-language model; the address of its server is not in results."""
+    words = [
+        f"--{option} {shlex.quote(str(what[name]))}"
+        for name, option in _VLM_OPTIONS.items()
+        if what.get(name)
+    ]
+    return ["--base-url URL", *words, *([] if what.get("schema", True) else ["--vlm.no-schema"])]
 
 
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:
     """Name a policy for `--policy`, with a placeholder for the path of its weights."""
     kind = what.get("kind")
     preset = what.get("preset")
+    if _is_vlm(what):
+        return f"{name}={VLM}{what.get('model', 'MODEL')}"
     named = f"{UNTRAINED}:{preset}" if preset else what.get("bundled") or what.get("source")
     source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
     return name if name == source else f"{name}={source}"

@@ -33,6 +33,7 @@ _ROLES = {
     "untrained": "A network with random weights.",
     "run": "Trained policy: observes the prompt and two camera images.",
     "code": "Policy of the user's own code: observes the prompt and two camera images.",
+    "vlm": "Vision-language model, asked over the chat protocol: sees the prompt and the table.",
     "remote": "Policy behind a server: observes the prompt and two camera images.",
 }
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
@@ -77,6 +78,24 @@ def _segmentation(record: Mapping[str, Any]) -> str:
     if not isinstance(asked, list):
         return ""
     return " The segmentation was sent to it." if "segm" in asked else " It got no segmentation."
+
+
+def answers(results: Results, policy: str) -> str:
+    """Say what the answers of a vision-language model cost and what was wrong with them; empty for others."""
+    found = results.policies.get(policy, {}).get("answers")
+    if not isinstance(found, dict):
+        return ""
+    costs = (
+        f"{found['requests']:,} requests, {found['tokens_in']:,} tokens in and {found['tokens_out']:,} out, "
+        f"answered by {', '.join(map(str, found['models']))}."
+    )
+    groups = [
+        f"{group['kind']}"
+        + (f" (median {group['median']:g} {group['unit']})" if "unit" in group else "")
+        + f" {group['episodes']}"
+        for group in found["mistakes"]
+    ]
+    return costs + (f" First mistake of the failed episodes: {', '.join(groups)}." if groups else "")
 
 
 def series_colours(results: Results) -> dict[str, str]:

@@ -16,7 +16,7 @@ from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
 from openvima.multiprocess import imap_unordered
-from openvima.policies.naming import BUNDLED, ORACLE
+from openvima.policies.naming import BUNDLED, ORACLE, PolicyRef
 from openvima.report.curves import METRICS_FILE
 from openvima.report.page import default_command, write_report
 from openvima.report.text import Confirmation
@@ -206,7 +206,10 @@ def record_clip(job: Job, count: Callable[[int], None]) -> Clip:
     with tempfile.TemporaryDirectory() as folder, one_thread(batch):
         path = Path(folder, "video.mp4")
         policy = load_rollout_policy(batch, job.fingerprint)
-        outcome = record_episode(env, policy, batch.first_seed, path, with_prompt=False, may_fail=True)
+        speaks = PolicyRef.parse(batch.source).kind == "vlm"  # then its words are beside the table
+        outcome = record_episode(
+            env, policy, batch.first_seed, path, with_prompt=False, explain=speaks, may_fail=True
+        )
         video = path.read_bytes()
     count(1)
     return Clip(
@@ -247,5 +250,6 @@ def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: 
         device=config.device,
         precision=config.precision or "",
         trust_code=config.trust_code,
+        vlm=config.kept_vlm,
     )
     return Job(batch, str(results.policies.get(source.name)))

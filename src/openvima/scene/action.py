@@ -11,6 +11,7 @@ from openvima.scene.scene import (
     IDENTITY,
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
+    Pose,
     Quaternion,
     normalised,
     yaw_quaternion,
@@ -107,6 +108,18 @@ class Action:
     def yaw1_rad(self) -> float:
         """Tool heading at pose1, in radians; a zero quaternion counts as no rotation."""
         return _tool_yaw(self.pose1_rotation)
+
+
+def pose_after(pose: Pose, action: Action) -> Pose:
+    """Return where a pick-and-place action would put an object, at the height that it has.
+
+    Args:
+        pose: Pose of the object.
+        action: The action, which picks it.
+    """
+    turn_rad = math.remainder(action.yaw1_rad - action.yaw0_rad, 2 * math.pi)
+    picked_from_object = Pose.planar(*action.pose0_position).inverse() @ pose
+    return Pose.planar(*action.pose1_position, turn_rad) @ picked_from_object
 
 
 def is_valid_batch(actions: Mapping[str, object], count: int) -> bool:

@@ -64,6 +64,7 @@ class Explanation:
         yaw_probabilities: How probable each was, given object and place, shape (R,).
         bins: Component of the action, such as "pose0_position.x", to the probabilities of its bins. With an
             autoregressive head they are given the components before.
+        words: What the policy said, if it has a language model.
     """
 
     action: Mapping[str, np.ndarray]
@@ -74,6 +75,7 @@ class Explanation:
     yaw_rad: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     yaw_probabilities: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     bins: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    words: str = ""
 
     def distinct_places(self) -> list[PlaceProbability]:
         """Join candidates at one place under the most probable one's kind, the most probable first."""

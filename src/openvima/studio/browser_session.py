@@ -1,7 +1,6 @@
 """What one browser sees and does: the table in 3D, the episode in view, and a thread that works on it."""
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
@@ -60,18 +59,6 @@ def clicked_action(scene: Scene, first: Hit, second: Hit, *, turn_rad: float = 0
     if scene[first.object_id].fixed:
         raise SceneError(f"{scene.describe(first.object_id)} is fixed to the table; click another object.")
     return Action.planar(start, end, turn_rad)
-
-
-def pose_after(pose: Pose, action: Action) -> Pose:
-    """Return where a pick-and-place action would put an object, at the height that it has.
-
-    Args:
-        pose: Pose of the object.
-        action: The action, which picks it.
-    """
-    turn_rad = math.remainder(action.yaw1_rad - action.yaw0_rad, 2 * math.pi)
-    picked_from_object = Pose.planar(*action.pose0_position).inverse() @ pose
-    return Pose.planar(*action.pose1_position, turn_rad) @ picked_from_object
 
 
 def _planar(hit: Hit) -> Point:

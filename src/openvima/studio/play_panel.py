@@ -9,14 +9,15 @@ import viser
 from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.data.user_demonstrations import check_recordable, record_demonstration
-from openvima.errors import DatasetError
+from openvima.errors import DatasetError, echo
 from openvima.evaluation.session import EpisodeSession, first_difference
 from openvima.policies.naming import BUNDLED, SMALL
 from openvima.render.rasteriser import Rasteriser, front_above_top
 from openvima.render.raycast import TABLE, Hit
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, Pose
+from openvima.scene.action import pose_after
 from openvima.scene.explanation import Explanation
-from openvima.studio.browser_session import YOU, BrowserSession, Table, clicked_action, hit_of, pose_after
+from openvima.studio.browser_session import YOU, BrowserSession, Table, clicked_action, hit_of
 from openvima.tasks import list_tasks, sample_episode, task_spec
 from openvima.tasks.sampling import MAX_SEED
 from openvima.video.explanation import (
@@ -326,7 +327,9 @@ class WhyPanel:
             if proposal.action is not None:
                 self._add_arrow(table, "action", proposal.action)
             if proposal.explanation is not None:
-                if proposal.explanation.bins:
+                if proposal.explanation.words:
+                    lines.append(f"{name} said:\n\n> {_quoted(proposal.explanation.words)}")
+                elif proposal.explanation.bins:
                     self._add_heat_maps(table, proposal.explanation)
                 else:
                     self._explain(table, run, proposal.explanation)
@@ -419,3 +422,8 @@ class WhyPanel:
         for table, run in self.session.runs():
             self._add_arrow(table, "difference", run.steps[index].action, PICK)
         return f"The **first difference** is step {index + 1}: the orange arrows."
+
+
+def _quoted(words: str) -> str:
+    """Show what a model said as it is, without letting it write Markdown."""
+    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>()#+!|" else letter for letter in echo(words, 2000))

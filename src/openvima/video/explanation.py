@@ -4,12 +4,14 @@ Orange stands for the pick, blue for the place. The prompt's shading is drawn by
 """
 
 import math
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
 
 from openvima.catalog.geometry import Assets
+from openvima.errors import echo
 from openvima.render import TOP, channels_last, project
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene
@@ -25,6 +27,7 @@ HEAT_COLOURS = {"pose0": PICK, "pose1": PLACE}
 LEAST_SHOWN = 0.01  # probability below which a label would say 0 or 1 %
 _LEAST_FULL_BAR = 0.1  # a distribution without a higher peak does not fill its histogram
 _HOT = 0.02  # probability of a cell of the heat map that is drawn in full colour
+_NUM_LINES, _LINE_CHARACTERS = 8, 62  # of words, in a panel
 _KINDS = {
     "first step": "as at the start",
     "prompt": "as in the prompt",
@@ -55,6 +58,10 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
     if explanation is None:
         draw.text((12, HEIGHT - 96), "before the first decision", font=font(15), fill=MUTED, anchor="lm")
         return np.asarray(canvas)
+    if explanation.words:
+        _draw_action(draw, explanation)
+        _draw_words(draw, explanation)
+        return np.asarray(canvas)
     places = explanation.distinct_places()
     for place in reversed(places):
         _draw_place(draw, place)
@@ -76,6 +83,23 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
         if len(explanation.yaw_rad):
             _draw_rotation(draw, explanation, top + 88)
     return np.asarray(canvas)
+
+
+def _draw_words(draw: ImageDraw.ImageDraw, explanation: Explanation) -> None:
+    """Draw the points of an answer over the table, and below it the words, of long ones the end."""
+    for pose, colour in HEAT_COLOURS.items():
+        x, y = _pixel(explanation.action[f"{pose}_position"])
+        for radius, ring in ((8, PAPER), (6, colour)):
+            draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=ring, width=3)
+    lines = [
+        line
+        for paragraph in explanation.words.splitlines()
+        for line in textwrap.wrap(echo(paragraph, len(paragraph)), _LINE_CHARACTERS)
+    ]
+    cut = ["…", *lines[1 - _NUM_LINES :]] if len(lines) > _NUM_LINES else lines
+    for number, line in enumerate(cut):
+        y = TOP.height * ENLARGE + 14 + 19 * number
+        draw.text((12, y), line, font=font(14), fill=INK, anchor="lm")
 
 
 def attention_rows(explanation: Explanation) -> list[tuple[Colour, np.ndarray]]:

@@ -55,7 +55,7 @@ def thumbnail(image: PromptImage, height: int = 72) -> Image.Image:
     """
     pixels = np.ascontiguousarray(channels_last(image.rgb["front"]))
     if image.kind == "object":
-        pixels = _cut_to_object(pixels, image.segm["front"])
+        pixels = cut_to_object(pixels, image.segm["front"])
     rows, columns = pixels.shape[:2]
     width = max(1, round(columns * height / rows))
     # enlarged without smoothing first, so that textures keep their edges
@@ -179,8 +179,13 @@ def _wrap(pieces: list[_Piece], width: int) -> list[list[_Piece]]:
     return [line for line in lines if line] or [[_Piece("", 0, 1, 0)]]
 
 
-def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
-    """Crop the image of an object to the object with a margin, never narrower than it is high."""
+def cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
+    """Crop the image of an object to the object with a margin, never narrower than it is high.
+
+    Args:
+        pixels: Shape (H, W, 3), uint8.
+        segm: Object ids, shape (H, W), uint8.
+    """
     shown = (segm != BACKGROUND_ID) & (pixels != 255).any(axis=2)
     if not shown.any():
         return pixels

@@ -1,0 +1,171 @@
+"""What evaluations of vision-language models need besides: demonstrations before the task, and mistakes.
+
+What a model said in each step is in `answers.jsonl`; counts and groups of mistakes are in the results.
+"""
+
+import json
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from openvima.atomic_io import atomic_write_file
+from openvima.data.chat import UNREADABLE, ChatFormat, Turn, demo_turns
+from openvima.data.records import rollout_oracle
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import AnswerError, OracleError
+from openvima.evaluation.results import EpisodeOutcome
+from openvima.perception.objects import ObjectExtractor
+from openvima.render.labels import CELL_M, LABEL_SHAPE, label_raster
+from openvima.scene import WORKSPACE_LOW, Action, AtPose
+from openvima.scene.action import pose_after
+from openvima.scene.goal import object_of, oracle_move
+from openvima.serving.chat import Answer
+from openvima.tasks import task_spec
+
+ANSWERS_NAME = "answers.jsonl"
+Said = list[dict[str, Any]]  # what a model said in each step of an episode, as plain JSON values
+_SHOT_LEVEL = "train"
+_OTHER, _NOTHING = "picked another object", "picked nothing"
+_PLACE, _ROTATION = "place off", "rotation off"
+_UNITS = {_PLACE: "cm", _ROTATION: "degrees"}
+
+
+def shot_turns(
+    env: TabletopEnv, count: int, form: ChatFormat, extractor: ObjectExtractor | None = None
+) -> tuple[Turn, ...]:
+    """Return demonstrations of an environment's task, of domain train, as conversations one after another.
+
+    Args:
+        env: The environment that they come before.
+        count: How many; a task that is held out for L4 gets none.
+        form: How they are written.
+        extractor: Finds the objects whose boxes are listed.
+    """
+    if not count or _SHOT_LEVEL not in task_spec(env.task).levels:
+        return ()
+    options = tuple(sorted(env.task_options.items()))
+    return _shot_turns(env.task, env.assets, env.compat, env.prompts, options, count, form, extractor)
+
+
+@lru_cache(maxsize=32)
+def _shot_turns(
+    task: str,
+    assets: Any,
+    compat: bool,
+    prompts: str,
+    options: Iterable[tuple[str, Any]],
+    count: int,
+    form: ChatFormat,
+    extractor: ObjectExtractor | None,
+) -> tuple[Turn, ...]:
+    env = TabletopEnv(
+        task,
+        level=_SHOT_LEVEL,
+        domain="train",
+        assets=assets,
+        compat=compat,
+        prompts=prompts,
+        **dict(options),
+    )
+    turns: list[Turn] = []
+    seed = 0
+    while count:
+        try:
+            demo = rollout_oracle(env, seed)
+        except OracleError:
+            demo = None
+        seed += 1
+        if demo is not None and demo.outcome.success:
+            count -= 1
+            turns += demo_turns(demo, form, extractor)
+    return tuple(turns)
+
+
+def said_in(env: TabletopEnv, answer: Answer, decision: Any) -> dict[str, Any]:
+    """Describe an answer before it is carried out: who said what, what it cost, and what is wrong with it."""
+    record: dict[str, Any] = asdict(answer)
+    if isinstance(decision, AnswerError):
+        return {**record, "mistake": {"kind": UNREADABLE}}
+    return {**record, "mistake": mistake_in(env, Action.from_arrays(decision))}
+
+
+def mistake_in(env: TabletopEnv, action: Action) -> dict[str, Any] | None:
+    """Say what is wrong with a pick and place, by the goals that can be met next; None: nothing is known.
+
+    Args:
+        env: The environment before the action.
+        action: The action.
+
+    Returns:
+        Its kind, and by how much in cm or degrees.
+    """
+    problem, progress, scene = env.episode.problem, env.progress, env.scene
+    if scene.end_effector != "suction" or not progress.open_goals:
+        return None
+    stage = problem.stage_of(progress.open_goals[0])
+    open_goals = [problem.goals[index] for index in progress.open_goals if index in stage]
+    goals = [goal for goal in problem.prerequisites if not goal.is_met(scene)] or open_goals
+    x, y = action.pose0_position
+    cell = (int((y - WORKSPACE_LOW[1]) / CELL_M), int((x - WORKSPACE_LOW[0]) / CELL_M))
+    row, column = (min(place, size - 1) for place, size in zip(cell, LABEL_SHAPE, strict=True))
+    picked = int(label_raster(scene, env.assets)[row, column])
+    if picked not in {object_of(goal) for goal in goals}:
+        return {"kind": _OTHER if picked else _NOTHING}
+    moves = [oracle_move(goal, scene) for goal in goals if object_of(goal) == picked]
+    placed = scene.with_poses({picked: pose_after(scene[picked].pose, action)})
+    for move in moves:
+        if not isinstance(move, AtPose) or move.is_met(placed):
+            return None
+        distance_m, angle_rad = move.distance(placed)
+        if distance_m >= move.tolerance.position_m:
+            return {"kind": _PLACE, "by": round(100 * distance_m, 1)}
+        return {"kind": _ROTATION, "by": round(math.degrees(angle_rad), 1)}
+    return None
+
+
+def summarise(episodes: Sequence[tuple[EpisodeOutcome, Said]]) -> dict[str, Any]:
+    """Count what the answers of a model cost, and group the failures by their first mistake.
+
+    Args:
+        episodes: How each ended, and what was said in it.
+
+    Returns:
+        Plain JSON values. Equal requests are one: the second answer came from disk.
+    """
+    answers = {said["request"]: said for _, steps in episodes for said in steps}.values()
+    groups: dict[str, list[float]] = {}
+    for outcome, steps in episodes:
+        if not outcome.success:
+            found = (said["mistake"] for said in steps if said["mistake"])
+            mistake = next(found, {"kind": "another reason"})
+            groups.setdefault(mistake["kind"], []).append(mistake.get("by", 0.0))
+    return {
+        "requests": len(answers),
+        "tokens_in": sum(said["tokens_in"] for said in answers),
+        "tokens_out": sum(said["tokens_out"] for said in answers),
+        "models": sorted({said["model"] for said in answers}),
+        "left_out": sorted({name for said in answers for name in said["left_out"]}),
+        "mistakes": [
+            {"kind": kind, "episodes": len(found)}
+            | ({"median": statistics.median(found), "unit": _UNITS[kind]} if kind in _UNITS else {})
+            for kind, found in sorted(groups.items(), key=lambda group: (-len(group[1]), group[0]))
+        ],
+    }
+
+
+def write_answers(folder: Path, steps: Iterable[Mapping[str, Any]]) -> float | None:
+    """Write what was said, a line a step, without times; return the median time of an answer in seconds."""
+    records = list(steps)
+    seconds = [record["seconds"] for record in records]
+    lines = [
+        json.dumps({name: value for name, value in record.items() if name != "seconds"}, ensure_ascii=False)
+        for record in records
+    ]
+    if not lines:
+        return None
+    atomic_write_file(folder / ANSWERS_NAME, "\n".join(lines) + "\n")
+    return statistics.median(seconds)

@@ -1,0 +1,424 @@
+"""Vision-language models as policies: the client of a chat server, and the policy that asks it.
+
+Any server of the OpenAI-compatible protocol will do. Answers are kept on disk by a hash of the request.
+"""
+
+import hashlib
+import json
+import os
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from openvima.atomic_io import atomic_write_file
+from openvima.data.chat import (
+    DEFAULT_ENLARGE,
+    POINTS,
+    ChatFormat,
+    ChatView,
+    Points,
+    Turn,
+    content_of,
+    family_of,
+    wording_hash,
+)
+from openvima.errors import AnswerError, ConfigError, LimitReachedError, PolicyError, ServerError, echo
+from openvima.imports import import_extra
+from openvima.perception.objects import GROUND_TRUTH, ObjectExtractor
+from openvima.policies.base import Policy
+from openvima.scene import END_EFFECTORS, RenderedPrompt
+from openvima.scene.explanation import Explanation
+
+KEY_VARIABLE, URL_VARIABLE = "OPENAI_API_KEY", "OPENAI_BASE_URL"
+SEGMENTATION = "segmentation"
+_MOST_CHARACTERS = 20_000  # of an answer that are kept: its last ones
+_RETRIES = 12  # with pauses of up to 8 s, or what the server asks for: a minute and more
+_TIMEOUT_S, _CONNECT_S = 600.0, 10.0
+_OPTIONAL = ("response_format", "temperature")  # that servers may refuse, in the order of leaving them out
+
+
+@dataclass(frozen=True, slots=True)
+class VlmOptions:
+    """How a vision-language model is asked.
+
+    Args:
+        points: How it writes points: largest number (1000, 1, or pixels) and order, such as 1000-xy.
+            Default: by the family of its name, such as 1000-yx for Gemini.
+        enlarge: Whole factor on images, without smoothing.
+        boxes: List boxes of the objects in the text: segmentation; detector, the bundled one, or what else
+            --boxes takes.
+        shots: Number of demonstrations of the same task, of domain train, before it; tasks that are held out
+            for L4 get none.
+        schema: Ask for JSON by a schema where the server takes one; without, models may think aloud before.
+        temperature: Of sampling, where the server takes one; a negative one leaves it to the server.
+        concurrency: Requests at a time.
+        max_requests: End with the finished part of the table after so many requests; 0: no limit.
+        max_tokens: The same for tokens, in and out; 0: no limit.
+
+    Raises:
+        ConfigError: A value is out of its range.
+    """
+
+    points: Points | None = None
+    enlarge: int = DEFAULT_ENLARGE
+    boxes: str = ""
+    shots: int = 0
+    schema: bool = True
+    temperature: float = 0.0
+    concurrency: int = 16
+    max_requests: int = 0
+    max_tokens: int = 0
+
+    def __post_init__(self) -> None:
+        ChatFormat(self.points or POINTS[0], enlarge=self.enlarge)
+        for name, least in (("shots", 0), ("concurrency", 1), ("max_requests", 0), ("max_tokens", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"vlm.{name} is {getattr(self, name)}; it must be at least {least}.")
+
+
+DEFAULT_OPTIONS = VlmOptions()
+
+
+@dataclass(frozen=True, slots=True)
+class VlmConfig:
+    """A chat server, and how its models are asked.
+
+    Args:
+        base_url: Address of the API, such as "http://127.0.0.1:8000/v1"; None: that of OPENAI_BASE_URL, else
+            OpenAI's own.
+        view: As in `ChatFormat`.
+        options: Further settings.
+        answers: Folder in which answers are kept; None keeps none.
+
+    Raises:
+        ConfigError: The view or the address cannot be.
+    """
+
+    base_url: str | None = None
+    view: ChatView = "top"
+    options: VlmOptions = DEFAULT_OPTIONS
+    answers: Path | None = None
+
+    def __post_init__(self) -> None:
+        ChatFormat(view=self.view)
+        if self.base_url is not None and not self.base_url.startswith(("http://", "https://")):
+            raise ConfigError(
+                f"base_url is {echo(self.base_url)!r}; give one such as http://127.0.0.1:8000/v1."
+            )
+
+    @property
+    def server(self) -> str:
+        """Host and port of the server, without what else an address may hold, such as a password."""
+        url = urlsplit(self.base_url or os.environ.get(URL_VARIABLE) or "https://api.openai.com/v1")
+        return f"{url.hostname}:{url.port}" if url.port else str(url.hostname)
+
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """What observations hold: the segmentation only where it gives the boxes."""
+        return ("rgb", "segm") if self.options.boxes == SEGMENTATION else ("rgb",)
+
+    def format_of(self, model: str) -> ChatFormat:
+        """Return how a model is shown views and writes points."""
+        points = self.options.points or family_of(model).points
+        return ChatFormat(points, self.view, self.options.enlarge)
+
+    def record(self, model: str) -> dict[str, Any]:
+        """Return what the answers of a model depend on, as plain JSON values."""
+        options = asdict(self.options)
+        for name in ("concurrency", "max_requests", "max_tokens", "points", "enlarge"):
+            del options[name]
+        return {
+            "model": model,
+            "server": self.server,
+            **asdict(self.format_of(model)),
+            **options,
+            "modalities": list(self.modalities),
+            "wording": wording_hash(),
+        }
+
+
+DEFAULT_VLM = VlmConfig()
+
+
+def require_extra() -> Any:
+    """Import the client's package.
+
+    Raises:
+        MissingExtraError: It is not installed.
+    """
+    return import_extra(
+        "openai", "policies vlm:MODEL need openai; install it with: pip install 'openvima[vlm]'"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a model said.
+
+    Args:
+        request: Hash of the request.
+        text: Its words, reasoning first; of long ones the end.
+        model: Its name as the server gives it.
+        tokens_in: Tokens of the request, as the server counts them.
+        tokens_out: Tokens of the answer.
+        seconds: Until it was there.
+        left_out: Settings that the server did not take.
+    """
+
+    request: str
+    text: str
+    model: str
+    tokens_in: int
+    tokens_out: int
+    seconds: float
+    left_out: tuple[str, ...] = ()
+
+
+class ChatClient:
+    """Asks a model of a chat server, from several threads; answers that are on disk are not asked for again.
+
+    Args:
+        model: Name of the model.
+        config: The server, and how it is asked.
+
+    Raises:
+        MissingExtraError: The package `openai` is not installed.
+    """
+
+    def __init__(self, model: str, config: VlmConfig) -> None:
+        self._openai = require_extra()
+        self.model, self.config = model, config
+        self.num_requests, self.num_tokens = 0, 0  # of this client, not of answers that were on disk
+        self._key = os.environ.get(KEY_VARIABLE, "")
+        self._client = self._openai.OpenAI(
+            base_url=config.base_url, api_key=self._key or "none", timeout=_TIMEOUT_S, max_retries=_RETRIES
+        )
+        self._lock = threading.Lock()
+        self.is_stopped = False  # set to ask nothing more
+        self._is_reached = False
+        self._left_out: tuple[str, ...] = ()
+
+    def ask(self, turns: Sequence[Turn], schema: Mapping[str, Any]) -> Answer:
+        """Ask for the next message of a conversation.
+
+        Args:
+            turns: The conversation.
+            schema: JSON schema of the answer.
+
+        Raises:
+            ServerError: The server is away, or refuses the key, the model or the images.
+            LimitReachedError: The limit of requests or tokens is reached.
+        """
+        body = self._body(turns, schema)
+        content = json.dumps([self.config.server, body], sort_keys=True)
+        request = hashlib.sha256(content.encode()).hexdigest()[:32]
+        folder = self.config.answers
+        path = None if folder is None else folder / request[:2] / f"{request}.json"
+        if path is not None and path.is_file():
+            record = json.loads(path.read_text(encoding="utf-8"))
+            return Answer(**{**record, "left_out": tuple(record["left_out"])})
+        self._reserve()
+        answer = self._asked(body, request)
+        with self._lock:
+            self.num_tokens += answer.tokens_in + answer.tokens_out
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            atomic_write_file(path, json.dumps(asdict(answer)) + "\n")
+        return answer
+
+    def _body(self, turns: Sequence[Turn], schema: Mapping[str, Any]) -> dict[str, Any]:
+        options = self.config.options
+        body: dict[str, Any] = {"model": self.model, "messages": content_of(turns)}
+        if options.temperature >= 0:
+            body["temperature"] = options.temperature
+        if options.schema:
+            named = {"name": "action", "strict": True, "schema": schema}
+            body["response_format"] = {"type": "json_schema", "json_schema": named}
+        return body
+
+    def _reserve(self) -> None:
+        """Count a request, if there may be one more."""
+        options = self.config.options
+        with self._lock:
+            if self.is_stopped:
+                raise LimitReachedError("nothing more is asked.")
+            if not self._is_reached:
+                self._reach()
+            for name, used in (("max_requests", self.num_requests), ("max_tokens", self.num_tokens)):
+                if 0 < getattr(options, name) <= used:
+                    raise LimitReachedError(
+                        f"{self.num_requests:,} requests and {self.num_tokens:,} tokens are used; the limit "
+                        f"is vlm.{name} {getattr(options, name):,}. The same command goes on where this "
+                        "ended, and counts anew."
+                    )
+            self.num_requests += 1
+
+    def _reach(self) -> None:
+        """Look whether there is a server that takes the key, before it is waited for patiently."""
+        openai = self._openai
+        try:
+            self._client.with_options(max_retries=0, timeout=_CONNECT_S).models.list()
+        except openai.APIConnectionError as error:
+            raise ServerError(
+                f"no chat server answers at {self.config.server} ({self._shown(error.__cause__ or error)}); "
+                f"start it, or give another --base-url (or {URL_VARIABLE})."
+            ) from None
+        except (openai.AuthenticationError, openai.PermissionDeniedError) as error:
+            raise self._refusal(error) from None
+        except openai.APIError:  # not every server lists its models
+            pass
+        self._is_reached = True
+
+    def _asked(self, body: Mapping[str, Any], request: str) -> Answer:
+        """Ask the server; where it refuses a request, ask without the settings that it may not know."""
+        openai, refusal = self._openai, None
+        optional = [name for name in _OPTIONAL if name in body and name not in self._left_out]
+        for count in range(len(optional) + 1):
+            left_out = (*self._left_out, *optional[:count])
+            sent = {name: value for name, value in body.items() if name not in left_out}
+            started = time.perf_counter()
+            try:
+                said = self._client.chat.completions.create(**sent)
+            except (openai.BadRequestError, openai.UnprocessableEntityError) as error:
+                refusal = refusal or error
+                continue
+            except openai.APIStatusError as error:
+                raise self._refusal(error) from None
+            except openai.APIError as error:
+                raise ServerError(
+                    f"the chat server at {self.config.server} was lost ({self._shown(error)}); the same "
+                    "command goes on where this ended."
+                ) from None
+            except ValueError as error:  # such as HTML instead of JSON, which is an answer without an action
+                said = str(error)
+            self._left_out = left_out
+            return self._answer(said, request, time.perf_counter() - started, left_out)
+        assert refusal is not None  # it was refused each time
+        raise self._refusal(refusal, body)
+
+    def _answer(self, said: Any, request: str, seconds: float, left_out: tuple[str, ...]) -> Answer:
+        """Take out of a response what counts; servers differ in what they leave out."""
+        choices, usage = getattr(said, "choices", None), getattr(said, "usage", None)
+        message = getattr(choices[0], "message", None) if isinstance(choices, list) and choices else None
+        words = [getattr(message, name, None) for name in ("reasoning", "reasoning_content", "content")]
+        text = "\n".join(word for word in words if isinstance(word, str) and word)
+        if self._key:
+            text = text.replace(self._key, "…")
+        counts = (getattr(usage, name, None) for name in ("prompt_tokens", "completion_tokens"))
+        tokens_in, tokens_out = (count if isinstance(count, int) and count > 0 else 0 for count in counts)
+        name = echo(str(getattr(said, "model", None) or self.model))
+        return Answer(
+            request, text[-_MOST_CHARACTERS:], name, tokens_in, tokens_out, round(seconds, 3), left_out
+        )
+
+    def _refusal(self, error: Any, body: Mapping[str, Any] | None = None) -> ServerError:
+        """Compose the error for a request that the server refused."""
+        status = error.status_code
+        hint = {
+            401: f"the key is that of the environment variable {KEY_VARIABLE}",
+            403: f"the key is that of the environment variable {KEY_VARIABLE}",
+            404: f"is {echo(self.model)!r} a model of it, and --base-url complete, such as http://HOST:PORT/v1?",
+            429: "it is busy, or what was paid for is used up; the same command goes on where this ended",
+        }.get(status, "")
+        if body is not None or status == 413:
+            images = str(body).count("'image_url':") if body else "the"
+            enlarge = self.config.options.enlarge
+            hint = f"can the model see, and take {images} images, the view {enlarge} times enlarged?"
+        said = self._shown(error)
+        return ServerError(f"{self.config.server} refuses the request (HTTP {status}: {said}); {hint}.")
+
+    def _shown(self, error: object) -> str:
+        text = str(error).strip(". ") or type(error).__name__
+        return echo(text.replace(self._key, "…") if self._key else text)
+
+
+@dataclass(slots=True)
+class _Chat:
+    """One episode: its prompt, the conversation so far, and the last answer."""
+
+    prompt: RenderedPrompt
+    turns: list[Turn]
+    answer: Answer | None = None
+    action: dict[str, np.ndarray] | None = None
+
+
+class VlmPolicy(Policy):
+    """A vision-language model that is asked for each action.
+
+    What it said is in `answers`, one for each episode, after `act`. Where an answer holds no action, `act`
+    gives an `AnswerError` in its place, which ends the episode.
+
+    Args:
+        client: The model's.
+        extractor: Finds the objects whose boxes are listed, unless the segmentation does; None lists none.
+
+    Example: `VlmPolicy(ChatClient("qwen3-vl", VlmConfig("http://127.0.0.1:8000/v1")))`
+    """
+
+    def __init__(self, client: ChatClient, extractor: ObjectExtractor | None = None) -> None:
+        self.client = client
+        self.modalities = client.config.modalities
+        self.extractor = GROUND_TRUTH if "segm" in self.modalities else extractor
+        self.format = client.config.format_of(client.model)
+        self.shots: tuple[Turn, ...] = ()  # conversations that come before those of the episodes
+        self._chats: list[_Chat] = []
+
+    def new_session(self) -> "VlmPolicy":
+        """Return a policy with the same client and its own episodes."""
+        return VlmPolicy(self.client, self.extractor)
+
+    @property
+    def answers(self) -> list[Answer | None]:
+        """The last answer in each episode."""
+        return [chat.answer for chat in self._chats]
+
+    def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
+        """Start a batch of episodes; nothing is asked yet."""
+        self._chats = [_Chat(prompt, []) for prompt in prompts]
+
+    def act(self, observations: Sequence[Mapping | None]) -> list[Any]:
+        """Ask for the next action of every episode, of several at a time.
+
+        Raises:
+            PolicyError: `reset` was not called, or with another number of prompts.
+            ServerError, LimitReachedError: As for `ChatClient.ask`.
+        """
+        if len(observations) != len(self._chats):
+            raise PolicyError(f"got {len(observations)} observations for {len(self._chats)} prompts.")
+        if len(observations) == 1:  # in the thread of an evaluation
+            return [self._act(self._chats[0], observations[0])]
+        with ThreadPoolExecutor(self.client.config.options.concurrency) as pool:
+            return list(pool.map(self._act, self._chats, observations))
+
+    def explain(self) -> list[Explanation | None]:
+        """Return the last action and words of each episode."""
+        return [
+            Explanation(chat.action, (), {}, words=chat.answer.text) if chat.action and chat.answer else None
+            for chat in self._chats
+        ]
+
+    def _act(self, chat: _Chat, observation: Mapping | None) -> dict[str, np.ndarray] | AnswerError | None:
+        chat.answer = chat.action = None
+        if observation is None:
+            return None
+        tool = END_EFFECTORS[int(observation["ee"])]
+        if chat.turns:
+            chat.turns.append(self.format.next_turn(observation, self.extractor))
+        else:
+            chat.turns.append(self.format.first_turn(chat.prompt, observation, self.extractor))
+        chat.answer = self.client.ask([*self.shots, *chat.turns], self.format.schema(tool))
+        try:
+            action = self.format.read_answer(chat.answer.text, tool)
+        except AnswerError as error:
+            return error
+        # What the model thought is not sent back: it costs tokens, and no model was trained on it.
+        chat.turns.append(Turn("assistant", (self.format.answer(action, tool),)))
+        chat.action = action.to_arrays()
+        return chat.action
