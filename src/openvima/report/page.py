@@ -167,7 +167,7 @@ def _vlm_words(what: Mapping[str, Any]) -> list[str]:
         for name, option in _VLM_OPTIONS.items()
         if what.get(name)
     ]
-    return ["--base-url URL", *words, *([] if what.get("schema", True) else ["--vlm.no-schema"])]
+    return ["--base-url URL", *words, *(["--vlm.free-text"] if what.get("free_text") else [])]
 
 
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:

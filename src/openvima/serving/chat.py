@@ -56,7 +56,7 @@ class VlmOptions:
             --boxes takes.
         shots: Number of demonstrations of the same task, of domain train, before it; tasks that are held out
             for L4 get none.
-        schema: Ask for JSON by a schema where the server takes one; without, models may think aloud before.
+        free_text: Ask for no JSON by a schema, so that models may think aloud before.
         temperature: Of sampling, where the server takes one; a negative one leaves it to the server.
         concurrency: Requests at a time.
         max_requests: End with the finished part of the table after so many requests; 0: no limit.
@@ -70,7 +70,7 @@ class VlmOptions:
     enlarge: int = DEFAULT_ENLARGE
     boxes: str = ""
     shots: int = 0
-    schema: bool = True
+    free_text: bool = False
     temperature: float = 0.0
     concurrency: int = 16
     max_requests: int = 0
@@ -238,7 +238,7 @@ class ChatClient:
         body: dict[str, Any] = {"model": self.model, "messages": content_of(turns)}
         if options.temperature >= 0:
             body["temperature"] = options.temperature
-        if options.schema:
+        if not options.free_text:
             named = {"name": "action", "strict": True, "schema": schema}
             body["response_format"] = {"type": "json_schema", "json_schema": named}
         return body
