@@ -1,7 +1,10 @@
 """Every exception of the package: a message says what was given, what is allowed and what to do."""
 
 import difflib
-from collections.abc import Collection, Iterable, Mapping
+import re
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -159,9 +162,61 @@ class MissingExtraError(OpenVimaError, ImportError):
 
 
 class UnknownWordWarning(UserWarning):
-    """A prompt has words that the policy never saw in training."""
+    """Prompts have words that the policy never saw in training.
+
+    Args:
+        words: The words, each with a known one to suggest, or an empty text.
+        are_all: Whether further unknown words would be named.
+    """
+
+    def __init__(self, words: Mapping[str, str], are_all: bool = True) -> None:
+        shown = echo(", ".join(map(repr, words)), _MAX_WORDS)
+        known = ", ".join(repr(word) for word in list(filter(None, words.values()))[:_MAX_SUGGESTIONS])
+        hint = f" Did you mean {known}?" if known else ""
+        last = "" if are_all else " Further unknown words are not named."
+        super().__init__(
+            f"prompts have words that the policy never saw in training: {shown}.{hint} Use other words, or "
+            f"train it on prompts with these.{last}"
+        )
+        self.words, self.are_all = dict(words), are_all
+
+    def __reduce__(self) -> tuple[type, tuple[dict[str, str], bool]]:
+        return type(self), (self.words, self.are_all)
 
 
+@contextmanager
+def unknown_words() -> Iterator[list[UnknownWordWarning]]:
+    """Give the warnings of unknown words inside the block as a list, instead of showing them."""
+    shown, found = warnings.showwarning, []
+
+    def collect(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        if isinstance(message, UnknownWordWarning):
+            found.append(message)
+        else:
+            shown(message, category, *place)
+
+    warnings.showwarning = collect
+    try:
+        yield found
+    finally:
+        warnings.showwarning = shown
+
+
+@contextmanager
+def one_word_warning() -> Iterator[None]:
+    """Warn of all unknown words inside the block once, at its end."""
+    found: list[UnknownWordWarning] = []
+    try:
+        with unknown_words() as found:
+            yield
+    finally:
+        if found:
+            words = {word: near for warning in found for word, near in warning.words.items()}
+            warnings.warn(UnknownWordWarning(words, all(w.are_all for w in found)), stacklevel=3)
+
+
+_MAX_WORDS = 1000  # characters of unknown words in a warning
+_MAX_SUGGESTIONS = 3
 MAX_ECHO = 200  # characters of what others sent that an error repeats
 
 
@@ -188,7 +243,7 @@ def differences(there: Mapping[str, object], here: Mapping[str, object]) -> list
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") -> str:
-    """Compose the message for an unknown name, with the nearest known one as a suggestion.
+    """Compose the message for an unknown name, with a known one that has it, or is near, as a suggestion.
 
     Args:
         kind: Kind of thing, such as "task".
@@ -199,8 +254,10 @@ def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") 
     Returns:
         One line for an `UnknownNameError`.
     """
-    known = list(known)
-    near = difflib.get_close_matches(str(name)[:MAX_ECHO], known, n=1)
+    known, given = list(known), str(name)[:MAX_ECHO]
+    # "vima" suggests "vima-nano", the first preset that has this word, and not the most similar one.
+    holding = [entry for entry in known if given.lower() in re.split(r"[\W_]+", entry.lower())]
+    near = holding or difflib.get_close_matches(given, known, n=1)
     suggestion = f" Did you mean {near[0]!r}?" if near else ""
     if not hint and len(known) <= 20:
         hint = f"Allowed: {', '.join(known)}."

@@ -12,6 +12,7 @@ import signal
 import socket
 import threading
 import time
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -22,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
 
-from openvima.errors import ConfigError, WorkerError
+from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, unknown_words
 from openvima.imports import import_extra
 
 POLL_S = 0.2
@@ -122,7 +123,9 @@ def imap_with_progress(
             while pending:
                 done, _ = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
                 for future in done:
-                    yield pending.pop(future), future.result()
+                    result, found = future.result()
+                    _warn(found)
+                    yield pending.pop(future), result
                 watch(_rows(counters, num_counts))
         except BrokenProcessPool:
             raise WorkerError(_KILLED if counters[-1] else _NOT_STARTED) from None
@@ -264,13 +267,21 @@ def _start_worker(counters: Any) -> None:
     init_worker()
 
 
-def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:
+def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> tuple[Any, list[UnknownWordWarning]]:
+    """Run a job in a worker; return its result, and the unknown words to warn of where all come together."""
     first = slot * num_counts
 
     def count(*numbers: int) -> None:
         _counters[first : first + num_counts] = numbers
 
-    return job(item, count)
+    with unknown_words() as found:
+        return job(item, count), found
+
+
+def _warn(found: Sequence[UnknownWordWarning]) -> None:
+    """Warn in this process of what a worker found."""
+    for warning in found:
+        warnings.warn(warning, stacklevel=3)
 
 
 def _rows(counters: Any, num_counts: int) -> Counts:
@@ -408,7 +419,7 @@ def _run_all(
             for reference in done:
                 slot = running.pop(reference)
                 try:
-                    result, numbers = ray.get(reference)
+                    result, numbers, found = ray.get(reference)
                 except _lost(ray):
                     deaths[slot] += 1
                     if deaths[slot] > RETRIES:
@@ -416,6 +427,7 @@ def _run_all(
                     waiting.appendleft(slot)
                     continue
                 counts[slot] = numbers or counts[slot]
+                _warn(found)
                 yield items[slot], result
             for slot, numbers in ray.get(progress.read.remote()).items():
                 if slot in running.values():
@@ -477,8 +489,10 @@ class _ProgressActor:
         return self._counts
 
 
-def _run_counted(job: Job, item: Any, slot: int, progress: Any) -> tuple[Any, tuple[int, ...]]:
-    """Run a job in a worker; return its result and its last counts."""
+def _run_counted(
+    job: Job, item: Any, slot: int, progress: Any
+) -> tuple[Any, tuple[int, ...], list[UnknownWordWarning]]:
+    """Run a job in a worker; return its result, its last counts and its unknown words."""
     last: tuple[int, ...] = ()
     next_s = 0.0
 
@@ -489,4 +503,5 @@ def _run_counted(job: Job, item: Any, slot: int, progress: Any) -> tuple[Any, tu
             next_s = time.monotonic() + COUNT_INTERVAL_S
             progress.write.remote(slot, numbers)
 
-    return job(item, count), last
+    with unknown_words() as found:
+        return job(item, count), last, found

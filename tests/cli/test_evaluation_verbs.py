@@ -155,7 +155,7 @@ def test_jobs_of_an_array_share_an_evaluation(tmp_path, capsys):
     assert capsys.readouterr().out == "0\toracle\trotate\tL1\t0\t1\n1\toracle\trotate\tL2\t0\t1\n"
     assert not (tmp_path / "scores").exists()
     assert main([*words, "--shard-range", "1:1"]) == 2
-    assert "shard_range is '1:1'; it must be a:b" in capsys.readouterr().err
+    assert "--shard-range is '1:1'; it must be a:b" in capsys.readouterr().err
     assert main([*words, "--shard-range", "1:2"]) == 0
     assert "lacks batches of other ranges" in capsys.readouterr().err
     assert main([*words, "--shard-range", "0:1"]) == 0

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from openvima import user_code
 from openvima.cli.main import main
-from openvima.errors import ConfigError, PolicyError
+from openvima.errors import ConfigError, PolicyError, UnknownWordWarning
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.evaluation.config import Batch
 from openvima.evaluation.runner import Job
@@ -192,3 +193,36 @@ def test_ray_workers_load_the_same_code(file):
     config = EvaluationConfig((f"mine={file}:make",), **CELLS, batch=1, out=Path("one"))
     one = evaluate(config).read_bytes()
     assert evaluate(replace(config, workers=2, engine="ray", out=Path("ray"))).read_bytes() == one
+
+
+READER = """
+from openvima.policies import RandomPolicy
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
+
+class Reader(RandomPolicy):
+    tokenizer = WordTokenizer(Vocabulary(("rotate", "the", "degrees", ".")))
+
+    def reset(self, prompts):
+        super().reset(prompts)
+        for prompt in prompts:
+            self.tokenizer.encode(prompt.text.replace("{", "").replace("}", ""))
+"""
+
+
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+def test_words_that_are_unknown_in_several_tasks_are_one_line(workers, file, capsys) -> None:
+    Path("reader.py").write_text(READER)
+    words = ["--tasks", "rotate,visual_manipulation", "--levels", "L1", "--episodes", "2", "--no-report"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["evaluate", "--policy", "reader.py:Reader", *words, "--workers", workers]) == 0
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if "UnknownWordWarning" in line)
+    assert "'degree" not in line and "'into'" in line and "'put'" in line
+
+
+def test_scores_of_several_tasks_warn_of_unknown_words_once(file) -> None:
+    Path("reader.py").write_text(READER)
+    tasks = ("rotate", "visual_manipulation")
+    with pytest.warns(UnknownWordWarning) as caught:
+        score({"reader": load_policy("reader.py:Reader")}, **CELLS | {"tasks": tasks})
+    assert len(caught) == 1 and "'put'" in str(caught[0].message)

@@ -4,13 +4,20 @@ import json
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from openvima.cli.terminal import parse_list, parse_shard_range, parse_sources, print_table, progress_bar
+from openvima.cli.terminal import (
+    parse_list,
+    parse_shard_range,
+    parse_sources,
+    print_left_out,
+    print_table,
+    progress_bar,
+)
 from openvima.data.chat import ChatView
 from openvima.serving.chat import DEFAULT_OPTIONS, VlmOptions
 
@@ -22,6 +29,128 @@ if TYPE_CHECKING:
     from openvima.report import VideoSelection
 
 
+@dataclass(frozen=True, slots=True)
+class EnvironmentOptions:
+    """Tasks, prompts and control.
+
+    Args:
+        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
+            or FILE.py:FUNCTION, which registers assets of your own.
+        compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
+        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
+            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
+        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
+            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
+            all that have the option.
+        control: primitives; or end_effector, where an action moves the tool for 0.1 s, for policies of that
+            control and the oracle. Scores of the two are never joined.
+    """
+
+    assets: str = "procedural"
+    compat: bool = False
+    prompts: str = "multimodal"
+    task_options: str = ""
+    control: Literal["primitives", "end_effector"] = "primitives"
+
+
+@dataclass(frozen=True, slots=True)
+class AblationOptions:
+    """Input ablations.
+
+    Args:
+        ablations: Input ablations to evaluate besides, comma-separated. "all" stands for no_prompt,
+            other_prompt_images, scrambled_words, shuffled_objects, random, oracle, and with --boxes
+            detected_boxes. Others: held_out_phrasings, swapped_attribute, shuffled_prompt_objects,
+            masked_words:0.2, swapped_words:0.2, gibberish_words, noisy_boxes:3, text_prompts,
+            paraphrased_prompts, num_distractors:2 (the numbers are examples), in_context, and
+            oracle_demonstration. "+" joins several to one. docs/evaluation.md describes each.
+        in_context: In-context evaluation: also prompt with an example, "Follow this motion: …". For twist,
+            follow_motion and follow_order, of policies trained without these tasks.
+        boxes: Detector of detected_boxes, which it implies: "detector" for the bundled one,
+            detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION or
+            FILE.py:FUNCTION, which makes an ObjectExtractor.
+    """
+
+    ablations: str = ""
+    in_context: bool = False
+    boxes: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingOptions:
+    """Report and videos.
+
+    Args:
+        videos: Solved episodes to record, and failures, of each trained policy, task and level; failures
+            first, at most 40 times as many in all, after the table is printed. 0 records none.
+        record_video: Further episodes to record, of every policy, comma-separated: TASK/SEED or
+            TASK/LEVEL/SEED.
+        report: Whether to record videos and write report.html.
+    """
+
+    videos: int = 1
+    record_video: str = ""
+    report: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkOptions:
+    """Where and how networks compute.
+
+    Args:
+        batch: Episodes that are run together, with batched inference.
+        device: Where networks compute: cpu, in float64, or cuda, in float32.
+        precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
+            such episodes are listed as near_ties.
+        python: The Python of LeRobot's own environment, which LeRobot policies run in; see docs/lerobot.md.
+        trust_code: Run the code that run folders name, as those of learners of your own do. Code named on the
+            command line needs no such trust.
+    """
+
+    batch: int = 40
+    device: str = "cpu"
+    precision: Literal["float64", "float32", "bfloat16"] | None = None
+    python: str | None = None
+    trust_code: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class JobOptions:
+    """Clusters and job arrays.
+
+    Args:
+        engine: processes of this machine, or ray.
+        address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
+        shard_range: Play only these of the batches that --list-shards numbers, as a:b without b itself; for
+            job arrays with one --out. The last job writes results.json and the report.
+        list_shards: Print the batches, one a line: number, policy, task, level, first seed, episodes. Play
+            nothing.
+    """
+
+    engine: Literal["processes", "ray"] = "processes"
+    address: str | None = None
+    shard_range: str | None = None
+    list_shards: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ChatOptions:
+    """Servers of vision-language models.
+
+    Args:
+        base_url: Address of the OpenAI-compatible server of models vlm:MODEL, such as
+            http://127.0.0.1:8000/v1; by default that of OPENAI_BASE_URL, else OpenAI's own. The key is that
+            of OPENAI_API_KEY; see docs/vlms.md.
+        view: Camera that they see, and in whose picture they point; top+front shows both.
+        dry_run: Write the first message that a model would get as a page, and estimate what the evaluation
+            costs. Nothing is sent.
+    """
+
+    base_url: str | None = None
+    view: ChatView = "top"
+    dry_run: bool = False
+
+
 def main(
     *,
     policy: str,
@@ -31,32 +160,15 @@ def main(
     seed: int = 0,
     workers: int | None = None,
     out: Path = Path("evaluation"),
-    assets: str = "procedural",
-    compat: bool = False,
-    prompts: str = "multimodal",
-    task_options: str = "",
-    control: Literal["primitives", "end_effector"] = "primitives",
-    ablations: str = "",
-    in_context: bool = False,
-    boxes: str | None = None,
-    batch: int = 40,
-    shard_range: str | None = None,
-    list_shards: bool = False,
-    engine: Literal["processes", "ray"] = "processes",
-    address: str | None = None,
-    videos: int = 1,
-    record_video: str = "",
-    report: bool = True,
     force: bool = False,
-    trust_code: bool = False,
-    python: str | None = None,
-    device: str = "cpu",
-    precision: Literal["float64", "float32", "bfloat16"] | None = None,
-    base_url: str | None = None,
-    view: ChatView = "top",
-    vlm: VlmOptions = DEFAULT_OPTIONS,
-    dry_run: bool = False,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = EnvironmentOptions(),
+    ablation: tyro.conf.OmitArgPrefixes[AblationOptions] = AblationOptions(),
+    recording: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions(),
+    network: tyro.conf.OmitArgPrefixes[NetworkOptions] = NetworkOptions(),
+    jobs: tyro.conf.OmitArgPrefixes[JobOptions] = JobOptions(),
+    chat: tyro.conf.OmitArgPrefixes[ChatOptions] = ChatOptions(),
+    vlm: VlmOptions = DEFAULT_OPTIONS,
 ) -> int:
     """Score policies on tasks and levels, and write results.json and report.html.
 
@@ -81,54 +193,15 @@ def main(
         workers: Processes; by default one for each CPU, fewer for less than two batches each, and one with
             --device cuda. With --address, all CPUs of the Ray cluster.
         out: Folder to write to.
-        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
-            or FILE.py:FUNCTION, which registers assets of your own.
-        compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
-        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
-            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
-        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
-            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
-            all that have the option.
-        control: primitives; or end_effector, where an action moves the tool for 0.1 s, for policies of that
-            control and the oracle. Scores of the two are never joined.
-        ablations: Input ablations to evaluate besides, comma-separated. "all" stands for no_prompt,
-            other_prompt_images, scrambled_words, shuffled_objects, random, oracle, and with --boxes
-            detected_boxes. Others: held_out_phrasings, swapped_attribute, shuffled_prompt_objects,
-            masked_words:0.2, swapped_words:0.2, gibberish_words, noisy_boxes:3, text_prompts,
-            paraphrased_prompts, num_distractors:2 (the numbers are examples), in_context, and
-            oracle_demonstration. "+" joins several to one. docs/evaluation.md describes each.
-        boxes: Detector of detected_boxes, which it implies: "detector" for the bundled one,
-            detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION or
-            FILE.py:FUNCTION, which makes an ObjectExtractor.
-        in_context: In-context evaluation: also prompt with an example, "Follow this motion: …". For twist,
-            follow_motion and follow_order, of policies trained without these tasks.
-        batch: Episodes that are run together, with batched inference.
-        shard_range: Play only these of the batches that --list-shards numbers, as a:b without b itself; for
-            job arrays with one --out. The last job writes results.json and the report.
-        list_shards: Print the batches, one a line: number, policy, task, level, first seed, episodes. Play
-            nothing.
-        engine: processes of this machine, or ray.
-        address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
-        videos: Solved episodes to record, and failures, of each trained policy, task and level; failures
-            first, at most 40 times as many in all, after the table is printed. 0 records none.
-        record_video: Further episodes to record, of every policy, comma-separated: TASK/SEED or
-            TASK/LEVEL/SEED.
-        report: Whether to record videos and write report.html.
         force: Overwrite the results of another evaluation in that folder.
-        trust_code: Run the code that run folders name, as those of learners of your own do. Code named on the
-            command line needs no such trust.
-        python: The Python of LeRobot's own environment, which LeRobot policies run in; see docs/lerobot.md.
-        device: Where networks compute: cpu, in float64, or cuda, in float32.
-        precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
-            such episodes are listed as near_ties.
-        base_url: Address of the OpenAI-compatible server of models vlm:MODEL, such as
-            http://127.0.0.1:8000/v1; by default that of OPENAI_BASE_URL, else OpenAI's own. The key is that
-            of OPENAI_API_KEY; see docs/vlms.md.
-        view: Camera that they see, and in whose picture they point; top+front shows both.
-        vlm: How they are asked.
-        dry_run: Write the first message that a model would get as a page, and estimate what the evaluation
-            costs. Nothing is sent.
         as_json: Print the rows as JSON instead of a table.
+        environment: Tasks, prompts and control.
+        ablation: Input ablations.
+        recording: Report and videos.
+        network: Where and how networks compute.
+        jobs: Clusters and job arrays.
+        chat: Servers of vision-language models.
+        vlm: How these models are asked.
 
     Returns:
         Exit status.
@@ -144,8 +217,7 @@ def main(
     from openvima.report import VideoSelection
     from openvima.serving.chat import VlmConfig
 
-    if in_context:
-        ablations = f"{ablations},{IN_CONTEXT}"
+    ablations = parse_list(ablation.ablations) + (IN_CONTEXT,) * ablation.in_context
     config = EvaluationConfig(
         policies=parse_sources(policy),
         tasks=parse_list(tasks),
@@ -154,37 +226,38 @@ def main(
         seed=seed,
         workers=workers,
         out=out,
-        env_config=EnvConfig(assets, compat, prompts, task_options, control),
-        batch=batch,
+        env_config=EnvConfig(**asdict(environment)),
+        batch=network.batch,
         force=force,
-        device=device,
-        precision=precision,
-        ablations=_with_boxes(parse_list(ablations), boxes),
-        boxes=boxes,
-        engine=engine,
-        address=address,
-        trust_code=trust_code,
-        python=python,
-        vlm=VlmConfig(base_url, view, vlm),
+        device=network.device,
+        precision=network.precision,
+        ablations=_with_boxes(ablations, ablation.boxes),
+        boxes=ablation.boxes,
+        engine=jobs.engine,
+        address=jobs.address,
+        trust_code=network.trust_code,
+        python=network.python,
+        vlm=VlmConfig(chat.base_url, chat.view, vlm),
     )
-    if dry_run:
+    if chat.dry_run:
         from openvima.evaluation.chat_preview import write_preview
 
         page, estimate = write_preview(config)
         print(f"About {estimate}.")
         print(page)
         return 0
-    if workers is None and engine == "processes" and device == "cpu":
+    if workers is None and jobs.engine == "processes" and network.device == "cpu":
         config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
-    selection = VideoSelection(videos, parse_list(record_video))
-    if record_video and not report:
+    print_left_out(config.tasks, environment.prompts)
+    selection = VideoSelection(recording.videos, parse_list(recording.record_video))
+    if recording.record_video and not recording.report:
         raise ConfigError("--record-video needs the report; drop --no-report.")
-    if list_shards:
+    if jobs.list_shards:
         for number, shard in enumerate(plan(config)):
             names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)
             print(number, *names, shard.first_seed, shard.episodes, sep="\t")
         return 0
-    if (shards := parse_shard_range(shard_range)) is not None:
+    if (shards := parse_shard_range(jobs.shard_range)) is not None:
         with progress_bar("evaluation") as bar:
             is_last = evaluate_range(config, shards, bar)
         if not is_last:
@@ -192,7 +265,7 @@ def main(
             print(f"{out} {what}.", file=sys.stderr)
             return 0
     try:
-        if report:
+        if recording.report:
             path = _evaluate_and_report(config, selection, as_json=as_json)
         else:
             with progress_bar("evaluation") as bar:
@@ -203,7 +276,7 @@ def main(
             print_results(finished)
         raise
     print(
-        f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if report else ""),
+        f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if recording.report else ""),
         file=sys.stderr,
     )
     return 0

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from openvima.cli.terminal import generation_table, parse_list, parse_shard_range
+from openvima.cli.terminal import generation_table, parse_list, parse_shard_range, print_left_out
 
 
 def main(
@@ -91,6 +91,7 @@ def main(
         shard_range=parse_shard_range(shard_range),
         force=force,
     )
+    print_left_out(config.tasks, prompts)
     if list_shards:
         for number, block in enumerate(plan(config)):
             print(f"{number}\t{block.path.name}\t{block.episodes}")

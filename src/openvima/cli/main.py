@@ -6,14 +6,21 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE, NO_SPACE
 from openvima.cli.terminal import accept_any_text
-from openvima.errors import OpenVimaError, Terminated, UnknownWordWarning, echo, unknown_name
+from openvima.errors import (
+    OpenVimaError,
+    Terminated,
+    UnknownWordWarning,
+    echo,
+    one_word_warning,
+    unknown_name,
+)
 from openvima.imports import address_space_remedy, lacks_memory, require_address_space
 from openvima.input_files import expand_home
 
@@ -53,6 +60,7 @@ _INTERRUPTED = {
     "serve": "the policy is no longer served; goodbye.",
     "studio": "the studio is closed; goodbye.",
 }
+_SCORING = ("evaluate", "study", "quickstart")  # verbs that play many episodes
 # Least address space of the verbs that simulate or train, in 2**20 bytes.
 _LEAST_MB = dict.fromkeys(
     ("demo", "generate", "train", "detector", "evaluate", "study", "quickstart", "studio"), 1000
@@ -88,7 +96,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if words[0] not in VERBS:
         return _fail(unknown_name("verb", words[0], VERBS), 2)
-    with _warnings_in_one_line(), _failed_threads_in_one_line():
+    one_warning = one_word_warning() if words[0] in _SCORING else nullcontext()
+    with _warnings_in_one_line(), one_warning, _failed_threads_in_one_line():
         return _run(words[0], words[1:])
 
 
@@ -99,7 +108,7 @@ def _run(verb: str, rest: list[str]) -> int:
         if verb in _LEAST_MB and not set(_HELP) & set(rest):
             require_address_space(_LEAST_MB[verb])
         rest = [expand_home(word) for word in rest]
-        module = importlib.import_module(f"openvima.cli.{verb.replace('-', '_')}")
+        module = importlib.import_module(_module(verb))
         commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
         if commands is not None:
             names_none = not rest or (rest[0].startswith("-") and rest[0] not in _HELP)
@@ -125,6 +134,10 @@ def _run(verb: str, rest: list[str]) -> int:
         return _fail(message, status)
 
 
+def _module(verb: str) -> str:
+    return f"openvima.cli.{verb.replace('-', '_')}"
+
+
 def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, int]:
     """Return the line that reports an exception, and the exit status; raise it if it is a bug."""
     name, out = type(error).__name__, _out(rest)
@@ -132,7 +145,10 @@ def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, i
         remedy = address_space_remedy() or _MEMORY_REMEDIES.get(verb, "close other programs")
         return f"out of memory while working on {out}; {remedy}. Complete files were kept.", 1
     if isinstance(error, OpenVimaError):
-        return f"{name}: {error}", 2 if isinstance(error, ValueError | KeyError | ImportError) else 1
+        from openvima.cli.options import name_options
+
+        message = name_options(str(error), _setting_names(verb, rest))
+        return f"{name}: {message}", 2 if isinstance(error, ValueError | KeyError | ImportError) else 1
     if not isinstance(error, OSError):
         raise error
     reason = error.strerror or name
@@ -141,6 +157,18 @@ def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, i
     if error.filename is None:
         return f"{name}: {error}", 1
     return f"cannot use {error.filename}: {reason}. Give a path that can be read and written.", 2
+
+
+def _setting_names(verb: str, rest: Sequence[str]) -> list[str]:
+    """Return the names of what the command takes, as errors of the package have them."""
+    from openvima.cli.options import setting_names
+
+    if verb == "train":
+        from openvima.training import TrainingConfig
+
+        return setting_names(TrainingConfig)
+    module = importlib.import_module(_module(verb))
+    return setting_names(module.COMMANDS[rest[0]] if hasattr(module, "COMMANDS") else module.main)
 
 
 def _out(words: Sequence[str]) -> str:

@@ -11,7 +11,7 @@ import re
 import sys
 import time
 import unicodedata
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -322,6 +322,15 @@ def table_console() -> "Console":
 
     console = Console(highlight=False)
     return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=PIPE_WIDTH)
+
+
+def print_left_out(tasks: Sequence[str], prompts: str) -> None:
+    """Say on stderr which of all tasks a run leaves out, since their prompts have no text form."""
+    from openvima.tasks.registry import list_tasks
+    from openvima.tasks.sampling import takes_prompts
+
+    if "all" in tasks and (left_out := [task for task in list_tasks() if not takes_prompts(task, prompts)]):
+        print(f"Left out, since their prompts have no text form: {', '.join(left_out)}.", file=sys.stderr)
 
 
 def print_table(table: "Table", console: "Console | None" = None, *, num_heads: int = 1) -> None:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from openvima.cli.options import name_options, parse_config, setting_names
 from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 
@@ -34,10 +35,32 @@ pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
 --trust-code lets the file name code that is run, such as a learner or detector of your own.
+--help shows the options that most runs set, --help-all all of them.
 
 Several GPUs or processes: --runtime.processes 8. Several machines: torchrun --nnodes 2 --nproc-per-node 8
 -m openvima train --data demos --out run ...
 """
+
+
+# Settings that --help shows.
+COMMON = (
+    "data",
+    "out",
+    "preset",
+    "init_from",
+    "t5",
+    "force",
+    "seed",
+    "schedule.steps",
+    "schedule.checkpoint_every",
+    "loader.batch_size",
+    "optimizer.learning_rate",
+    "optimizer.grad_accum_steps",
+    "pretraining.steps",
+    "rollout.every",
+    "runtime.device",
+    "runtime.processes",
+)
 
 
 def run(words: Sequence[str]) -> int:
@@ -74,6 +97,7 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
     first.add_argument("--recipe")
     first.add_argument("--config", type=Path)
     first.add_argument("--trust-code", action="store_true")
+    first.add_argument("--help-all", action="store_true")
     chosen, rest = first.parse_known_args(list(words))
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name, option in {"preset": "", "init_from": "", "steps": "schedule.", "epochs": "schedule."}.items():
@@ -92,12 +116,13 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
     default = TrainingConfig.of({"data": Path(), "out": Path(), **settings})
     for name in {"data", "out"} - settings.keys():
         object.__setattr__(default, name, tyro.MISSING)  # required, but a config checks that it is a path
-    return tyro.cli(
+    return parse_config(
         TrainingConfig,
+        [*rest, "--help"] if chosen.help_all else rest,
+        default=default,
         prog="openvima train",
         description=DESCRIPTION,
-        args=rest,
-        default=default,
+        shown=None if chosen.help_all else COMMON,
     )
 
 
@@ -133,8 +158,10 @@ class _Lines(logging.Handler):
     """Writes to what stderr is now: above the progress bar, while one is shown."""
 
     def emit(self, record: logging.LogRecord) -> None:
+        from openvima.training import TrainingConfig
+
         prefix = "openvima: warning: " if record.levelno >= logging.WARNING else ""
-        print(prefix + record.getMessage(), file=sys.stderr)
+        print(prefix + name_options(record.getMessage(), setting_names(TrainingConfig)), file=sys.stderr)
 
 
 def _num_processes(config: "TrainingConfig") -> int:

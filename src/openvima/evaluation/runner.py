@@ -16,7 +16,7 @@ from openvima.atomic_io import FINISH_S, Part, atomic_write_file, folder_lock, p
 from openvima.catalog.packs import load_assets
 from openvima.detector.plugins import plugged_boxes
 from openvima.env.config import EnvConfig
-from openvima.errors import ConfigError, PolicyError, differences, echo
+from openvima.errors import ConfigError, PolicyError, differences, echo, one_word_warning
 from openvima.evaluation.ablations import NOISY_BOXES
 from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
 from openvima.evaluation.chat import Said, summarise, write_answers
@@ -475,17 +475,18 @@ def score(
     batches = plan(config)
     outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}
     begun: set[str] = set()
-    for batch in batches:
-        envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
-        given = policies.get(batch.policy)
-        rollout_policy = (
-            load_rollout_policy(batch)
-            if given is None
-            else PromptedRolloutPolicy(given, batch.ablation, name=batch.policy)
-        )
-        may_fail = batch.policy in begun  # a policy that fails from the start is an error, no result
-        outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy, may_fail=may_fail))
-        begun.add(batch.policy)
+    with one_word_warning():
+        for batch in batches:
+            envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+            given = policies.get(batch.policy)
+            rollout_policy = (
+                load_rollout_policy(batch)
+                if given is None
+                else PromptedRolloutPolicy(given, batch.ablation, name=batch.policy)
+            )
+            may_fail = batch.policy in begun  # a policy that fails from the start is an error, no result
+            outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy, may_fail=may_fail))
+            begun.add(batch.policy)
     kinds = {
         source.name: {"kind": "object", **object_record(policies[source.name])}
         if source.name in policies

@@ -34,7 +34,6 @@ MAX_WORD_LENGTH = 64  # characters
 _FIRST_NUMBER_ID = 2
 _FIRST_WORD_ID = _FIRST_NUMBER_ID + LARGEST_NUMBER + 1
 _MAX_FILE_BYTES = 2**22
-_MAX_SHOWN = 100  # characters of unknown words in a warning
 _MAX_WARNED = 256  # words that a policy warns of; a server's clients may send any number
 _PIECE = re.compile(rf"{UNKNOWN}|[^\W\d_]+(?:-[^\W\d_]+)*|[0-9]+|\S")
 
@@ -227,15 +226,8 @@ class WordTokenizer:
             return
         self._warned.update(new)
         near = [word for word in difflib.get_close_matches(new[0], self._ids) if _is_one_edit(new[0], word)]
-        shown = echo(", ".join(map(repr, new)), _MAX_SHOWN)
-        last = " Further unknown words are not named." if len(self._warned) == _MAX_WARNED else ""
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        warnings.warn(
-            f"the prompt has words that the policy never saw in training: {shown}.{hint} Use other words, or "
-            f"train it on prompts with these.{last}",
-            UnknownWordWarning,
-            stacklevel=2,
-        )
+        words = dict.fromkeys(new, "") | {new[0]: near[0] if near else ""}
+        warnings.warn(UnknownWordWarning(words, len(self._warned) < _MAX_WARNED), stacklevel=2)
 
 
 def _is_one_edit(one: str, other: str) -> bool:

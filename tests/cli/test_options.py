@@ -1,0 +1,85 @@
+"""Options that are settings: what help shows of them, and their names in errors."""
+
+import re
+
+import pytest
+
+from openvima.cli.main import main
+from openvima.cli.options import name_options
+from openvima.cli.train import COMMON
+
+
+def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 0
+    return capsys.readouterr().out
+
+
+def options_of(shown: str) -> set[str]:
+    return set(re.findall(r"^ {2}(--\w[\w.-]+)", shown, re.MULTILINE))
+
+
+def test_help_of_training_shows_what_most_runs_set_and_help_all_the_rest(capsys) -> None:
+    common = options_of(help_of(capsys, "train", "--help"))
+    assert common == {"--" + name.replace("_", "-") for name in COMMON} and len(common) <= 16
+    every = options_of(help_of(capsys, "train", "--help-all"))
+    assert common < every and "--augmentation.synonym-prob" in every - common
+
+
+def test_help_of_training_tells_the_defaults_of_the_recipe(capsys) -> None:
+    shown = help_of(capsys, "train", "--preset", "vima-nano", "--help")
+    assert re.search(r"--schedule\.steps INT [^-]*\(default:\s*8000\)", shown)
+
+
+def test_help_of_evaluation_is_grouped(capsys) -> None:
+    shown = help_of(capsys, "evaluate", "--help")
+    first, *groups = re.split(r"^ [a-z]+ options *$", shown, flags=re.MULTILINE)
+    assert options_of(first) >= {"--policy", "--tasks", "--out"} and len(options_of(first)) < 10
+    assert len(groups) == 5 and any("--ablations" in group and "--boxes" in group for group in groups)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("train --loader.batch-size 0", "--loader.batch-size is 0; it must be at least 1."),
+        ("train --seed -1", "--seed is -1; it must be between"),
+        ("train --preset vima-2m", "set --t5 to the folder .* or set --model.text-encoder to 'small'"),
+        ("train --t5 folder", "leave --t5 out, or set --model.text-encoder to a T5"),
+        ("train --loader.detected-prob 0.5", "--loader.detected-prob is 0.5, .* with --loader.boxes"),
+        ("train --preset vima", "Did you mean 'vima-nano'?"),
+        ("train --preset GPT", "Did you mean 'gpt-nano'?"),
+        ("train --preset vima-200", "Did you mean 'vima-200m'?"),
+        ("evaluate --policy vima", "Did you mean 'openvima-vima'?"),
+        ("evaluate --policy random --shard-range 3", "--shard-range is '3'"),
+        ("evaluate --policy random --videos -1", "--videos is -1"),
+        ("evaluate --policy random --tasks rotate --task-options x", "task option 'x' is not"),
+        ("generate --tasks rotate --workers 0 --episodes 1", "--workers is 0"),
+        ("detector train --loader.batch-size 3", "--loader.batch-size is 3; it must be even"),
+    ],
+)
+def test_errors_name_the_options_that_users_type(words, message, tmp_path, capsys) -> None:
+    given = words.split()
+    paths = ["--out", str(tmp_path / "out")] + ["--data", str(tmp_path)] * ("train" in given)
+    assert main([*given, *paths]) == 2
+    shown = capsys.readouterr().err
+    assert shown.count("\n") == 1 and re.search(message, shown), shown
+
+
+def test_what_users_gave_and_python_keep_their_names() -> None:
+    settings = ["data", "t5", "object_cache", "loader.batch_size"]
+    message = (
+        "there is no folder 'object_cache' in runs/object_cache, with data as t5-base has: f(object_cache=1)."
+    )
+    assert name_options(message, settings) == message
+    assert name_options("lower loader.batch_size.", settings) == "lower --loader.batch-size."
+
+
+@pytest.mark.parametrize("verb", ["evaluate --policy oracle --levels L1", "generate --out demos"])
+def test_tasks_without_a_text_form_are_named_where_all_tasks_leave_them_out(verb, capsys) -> None:
+    words = [*verb.split(), "--episodes", "1", "--list-shards", "--tasks"]
+    assert main([*words, "all", "--prompts", "text"]) == 0
+    played, said = capsys.readouterr()
+    assert "no text form: follow_order, rearrange, " in said and "rearrange" not in played
+    assert main([*words, "all"]) == main([*words, "rotate", "--prompts", "text"]) == 0
+    assert not capsys.readouterr().err
