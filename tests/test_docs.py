@@ -127,7 +127,7 @@ def options() -> dict[tuple[str, ...], frozenset[str]]:
         for path in [(verb, name) for name in objects] or [(verb,)]:
             output = io.StringIO()
             with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
-                main([*path, "--help"])
+                main([*path, "--help-all" if verb == "train" else "--help"])
             plain = re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue())
             found[path] = frozenset(
                 re.findall(r"(?:^|│ |  )(?:-\w, )?(--[a-z][a-z0-9.-]*)", plain, re.MULTILINE)

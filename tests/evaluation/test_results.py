@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from openvima.atomic_io import atomic_write_file
+from openvima.cli.evaluate import _print_scores
 from openvima.errors import DatasetError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row, failure_kind
 from openvima.evaluation.statistics import wilson_interval
@@ -45,6 +46,28 @@ def test_rows_under_ablations_stand_beside_the_plain_ones(results):
     assert means["mine", "L1", "no_prompt"] == pytest.approx(0.8)
     assert means["mine", "L1", ""] == pytest.approx(0.75)
     assert json.loads(both.to_json())["rows"][-1]["ablation"] == "no_prompt"
+
+
+def test_tasks_that_are_mostly_solved_without_a_prompt_are_named(results, tmp_path, capsys):
+    solved, lost = EpisodeOutcome(0, True, 1), EpisodeOutcome(0, False, 1)
+
+    def row(task, outcomes, ablation="no_prompt"):
+        return Row("mine", task, "L1", 1, tuple(replace(o, seed=k) for k, o in enumerate(outcomes)), ablation)
+
+    rows = (
+        row("put_between", [solved] * 19 + [lost]),
+        row("rotate", [solved] * 5 + [lost] * 15),
+        row("twist", [solved]),  # too few episodes to say so
+        row("follow_order", [solved] * 20, "scrambled_words"),
+    )
+    found = Results(rows, results.config, results.versions, results.policies)
+    found.write(tmp_path / "results.json")
+    _print_scores(found, tmp_path / "results.json", as_json=False)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == (
+        "Warning: prompts are hardly needed: without one mine solves put_between, L1, in 19 of 20 episodes."
+    )
+    assert not results.unneeded_prompts()
 
 
 def test_results_of_before_there_were_ablations_are_read(results, tmp_path):

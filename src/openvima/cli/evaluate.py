@@ -307,6 +307,8 @@ def _print_scores(results: "Results", path: Path, *, as_json: bool) -> None:
         print_results(results)
     for ended in (*results.invalid_actions(), *results.policy_errors()):
         print(f"Warning: {ended}", file=sys.stderr)
+    if unneeded := results.unneeded_prompts():
+        print(f"Warning: {unneeded}", file=sys.stderr)
     for name, what in results.policies.items():
         if seen := what.get("held_out_data"):
             print(

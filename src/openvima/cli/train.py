@@ -35,7 +35,7 @@ pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
 --trust-code lets the file name code that is run, such as a learner or detector of your own.
---help shows the options that most runs set, --help-all all of them.
+--help-all shows all options, and --help those that most runs set.
 
 Several GPUs or processes: --runtime.processes 8. Several machines: torchrun --nnodes 2 --nproc-per-node 8
 -m openvima train --data demos --out run ...

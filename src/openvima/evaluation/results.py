@@ -25,6 +25,7 @@ FILE_NAME = "results.json"
 _MAX_BYTES = 1 << 28  # a million episodes
 BAD_ACTION = "invalid action"  # kind of failure
 POLICY_ERROR = "the policy raised an error"  # another
+NO_PROMPT = "no_prompt"  # an ablation
 _LISTS = ("tasks", "levels", "ablations")  # of names, in the configuration
 _TEXTS = ("kind", "sha256", "weights_sha256", "preset", "bundled", "source")  # on a policy
 # What replaying the actions cannot prove.
@@ -240,6 +241,15 @@ class Results:
     def policy_errors(self) -> list[EarlyEnds]:
         """Count exceptions of policies in `reset` and `act`, for the policies that have any."""
         return self._ended_by(POLICY_ERROR, "an error of the policy")
+
+    def unneeded_prompts(self) -> str:
+        """Say which tasks a policy mostly solves without a prompt; empty if there is none."""
+        solved = [
+            f"{row.policy} solves {row.task}, {row.level}, in {row.successes} of {row.episodes} episodes"
+            for row in self.rows
+            if row.ablation == NO_PROMPT and row.interval[0] > 0.5
+        ]
+        return f"prompts are hardly needed: without one {', '.join(solved)}." if solved else ""
 
     def _ended_by(self, kind: str, cause: str) -> list[EarlyEnds]:
         found = []
