@@ -163,11 +163,11 @@ def _setting_names(verb: str, rest: Sequence[str]) -> list[str]:
     """Return the names of what the command takes, as errors of the package have them."""
     from openvima.cli.options import setting_names
 
-    if verb == "train":
-        from openvima.training import TrainingConfig
+    module = importlib.import_module(_module(verb))
+    if hasattr(module, "run"):  # `train`
+        from openvima.training.config import TrainingConfig
 
         return setting_names(TrainingConfig)
-    module = importlib.import_module(_module(verb))
     return setting_names(module.COMMANDS[rest[0]] if hasattr(module, "COMMANDS") else module.main)
 
 
