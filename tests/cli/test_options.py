@@ -36,7 +36,7 @@ def test_help_of_evaluation_is_grouped(capsys) -> None:
     shown = help_of(capsys, "evaluate", "--help")
     first, *groups = re.split(r"^ [a-z]+ options *$", shown, flags=re.MULTILINE)
     assert options_of(first) >= {"--policy", "--tasks", "--out"} and len(options_of(first)) < 10
-    assert len(groups) == 5 and any("--ablations" in group and "--boxes" in group for group in groups)
+    assert len(groups) == 7 and any("--ablations" in group and "--boxes" in group for group in groups)
 
 
 @pytest.mark.parametrize(
