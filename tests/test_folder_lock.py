@@ -1,26 +1,14 @@
 """A folder has one writer at a time, or one for each of its parts, and a killed writer locks nobody out."""
 
-import json
 import multiprocessing
-import os
 import subprocess
 import sys
-import threading
-from pathlib import Path
 
 import pytest
 
-from openvima import atomic_io as module
 from openvima.atomic_io import LOCK_NAME, folder_lock
-from openvima.errors import FolderLockedError, StorageError
+from openvima.errors import FolderLockedError
 from worker_jobs import holding
-
-
-def write_owner(folder: Path, host: str, process: int, **changes: object) -> Path:
-    entry = {"host": host, "process": process, "command": "openvima train", "since": 0.0, "part": [0, 9]}
-    file = folder / f"{LOCK_NAME}.{host}.{process}"
-    file.write_text(json.dumps(entry | changes))
-    return file
 
 
 def test_nothing_of_a_lock_stays(tmp_path) -> None:
@@ -34,7 +22,7 @@ def test_nothing_of_a_lock_stays(tmp_path) -> None:
 
 def test_a_second_writer_is_refused_by_name_until_the_first_ends(tmp_path) -> None:
     with holding(tmp_path) as process:
-        with pytest.raises(FolderLockedError, match=rf"written to by process {process.pid} on .* 0 min") as e:
+        with pytest.raises(FolderLockedError, match=f"written to by process {process.pid}") as e:
             folder_lock(tmp_path).__enter__()
         assert "\n" not in str(e.value)
         assert process.stdin is not None
@@ -88,85 +76,11 @@ def test_a_forked_child_neither_keeps_nor_releases_the_lock(tmp_path) -> None:
     child.join()
 
 
-def test_an_owner_on_another_host_counts_as_long_as_it_touches_its_file(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(module, "HEARTBEAT_S", 0.2)  # on a busy machine a thread may wait for 0.1 s
-    file, stop = write_owner(tmp_path, "elsewhere", 7), threading.Event()
-
-    def beat() -> None:
-        while not stop.wait(0.005):
-            os.utime(file)
-
-    thread = threading.Thread(target=beat)
-    thread.start()
-    try:
-        with pytest.raises(FolderLockedError, match="process 7 on elsewhere"):
-            folder_lock(tmp_path).__enter__()
-    finally:
-        stop.set()
-        thread.join()
-    with folder_lock(tmp_path):
-        assert not file.exists()
-
-
-@pytest.mark.parametrize("runs", [True, False])
-def test_without_record_locks_the_process_decides(tmp_path, monkeypatch, runs: bool) -> None:
-    monkeypatch.setattr(module, "fcntl", None)
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    write_owner(tmp_path, module._host(), os.getppid() if runs else gone.pid)
-    if runs:
-        with pytest.raises(FolderLockedError, match=f"process {os.getppid()}"):
-            folder_lock(tmp_path).__enter__()
-        return
-    with folder_lock(tmp_path):
-        pass
-    assert not list(tmp_path.iterdir())
-
-
-OWNER = '{"host": "elsewhere", "process": 1, "command": "x", "since": 0.0, "part": [0, 9]}'
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "",
-        "[]",
-        "{",
-        '{"host": 1}',
-        "x" * 10_000,
-        "[" * 4000,
-        OWNER.replace('"elsewhere"', "[1]"),
-        OWNER.replace("1,", "1e999,"),
-        OWNER.replace("0.0", "NaN"),
-        OWNER.replace("0.0", "1e999"),
-        OWNER.replace("[0, 9]", "[]"),
-        OWNER.replace("[0, 9]", "[1e999, 9]"),
-    ],
-)
-def test_whatever_an_owner_s_file_holds_locks_nobody_out(tmp_path, content: str) -> None:
-    (tmp_path / f"{LOCK_NAME}.elsewhere.1").write_text(content)
-    with folder_lock(tmp_path):
-        pass
-
-
-def test_names_in_the_message_hold_no_control_characters(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(module, "fcntl", None)
-    command = "train\x1b[2J\n" + "x" * 500
-    write_owner(tmp_path, module._host(), os.getppid(), command=command)
-    with pytest.raises(FolderLockedError) as found:
+def test_a_link_as_lock_file_is_not_followed(tmp_path) -> None:
+    (tmp_path / LOCK_NAME).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="symbolic links"):
         folder_lock(tmp_path).__enter__()
-    assert str(found.value).isprintable()
-    assert len(str(found.value)) < 500
-
-
-def test_a_link_folder_or_pipe_as_lock_file_is_refused(tmp_path) -> None:
-    target = tmp_path / "elsewhere"
-    for name, make in (("a", lambda p: p.symlink_to(target)), ("b", Path.mkdir), ("c", os.mkfifo)):
-        (tmp_path / name).mkdir()
-        make(tmp_path / name / LOCK_NAME)
-        with pytest.raises(StorageError, match="no regular file"):
-            folder_lock(tmp_path / name).__enter__()
-    assert not target.exists()
+    assert not (tmp_path / "elsewhere").exists()
 
 
 def test_one_of_many_processes_gets_in_at_a_time(tmp_path) -> None:
