@@ -305,9 +305,9 @@ def test_extending_copies_what_is_there_and_gives_the_same_bytes(
         played.append(seed)
         return attempt(env, seed)
 
-    def counting_summarise(path, known=None):
+    def counting_summarise(path):
         read.append(path.name)
-        return summarise(path, known)
+        return summarise(path)
 
     generate(config(tmp_path / "out", episodes=5, **settings))
     monkeypatch.setattr(generation, "attempt", counting_attempt)

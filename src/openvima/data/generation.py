@@ -12,7 +12,6 @@ from openvima.data.manifest import (
     FAILED_FOLDER,
     MANIFEST_NAME,
     ShardSummary,
-    check_failed,
     clear,
     finish_folder,
     is_finished,
@@ -63,7 +62,6 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
         ShardError: A shard is damaged.
     """
-    check_failed(config.out)
     _check_origin(config.out)
     wanted = {block.path.name: block for block in blocks}
     for path in sorted(config.out.glob("*.arrow")):

@@ -47,22 +47,8 @@ INDEX_SCHEMA = pa.schema(
         pa.field("crc32", pa.uint32(), nullable=False),  # of these bytes
     ]
 )
-# What a manifest must hold, with the type of each; and what it must hold of each shard.
-ORIGIN_TYPES: dict[str, type] = {"command": str, "config": dict, "versions": dict, "licence": str}
-_TYPES: dict[str, type] = {
-    **ORIGIN_TYPES,
-    "content_hash": str,
-    **dict.fromkeys(("counts", "tasks", "index", "shards"), dict),
-}
-_SHARD_KEYS: dict[str, type] = {
-    **dict.fromkeys(("episodes", "steps", "bytes", "head_bytes", "tail_bytes", "frame_crc32"), int),
-    "sha256": str,
-}
-_COUNTS: dict[str, type] = dict.fromkeys(("episodes", "steps", "shards", "bytes"), int)
-_TASK_KEYS: dict[str, Any] = {
-    **dict.fromkeys(("episodes", "steps", "seeds_tried", "redraws"), int),
-    "success_rate": int | float,
-}
+# What a manifest must hold, besides its checksum.
+_KEYS = ("command", "config", "versions", "licence", "content_hash", "counts", "tasks", "index", "shards")
 _SHARD_NAME = re.compile(r"\w[\w.+-]{0,200}\.arrow")
 
 _NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
@@ -135,17 +121,16 @@ def read_previous_summaries(folder: Path) -> dict[str, ShardSummary]:
     """
     path = folder / MANIFEST_NAME
     try:
-        manifest = parse_manifest(read_inside(path if path.exists() else folder / PREVIOUS_NAME))
-        index = parse_index(read_inside(folder / INDEX_NAME), manifest)
+        manifest = parse_manifest((path if path.exists() else folder / PREVIOUS_NAME).read_bytes())
+        index = parse_index((folder / INDEX_NAME).read_bytes(), manifest)
     except (OSError, DatasetError):
         return {}
     found = {}
     for name, part in split_index(index).items():
         entry = manifest["shards"][name]
         with contextlib.suppress(ShardError):
-            if "skipped" in entry and is_inside(folder / name):
-                Shard(folder / name, Envelope.from_entry(entry))
-                found[name] = ShardSummary(name, entry, part)
+            Shard(folder / name, Envelope.from_entry(entry))
+            found[name] = ShardSummary(name, entry, part)
     return found
 
 
@@ -161,15 +146,8 @@ def split_index(index: pa.Table) -> dict[str, pa.Table]:
     return {name: index.take(rows) for name, rows in zip(names, np.split(order, starts), strict=True)}
 
 
-def summarise_shard(
-    path: Path,
-    known: Mapping[str, Any] | None = None,
-) -> ShardSummary:
+def summarise_shard(path: Path) -> ShardSummary:
     """Read what index and manifest hold of a shard.
-
-    Args:
-        path: The shard.
-        known: Its `fingerprint`, if that has been taken already.
 
     Raises:
         ShardError: It is damaged.
@@ -183,7 +161,7 @@ def summarise_shard(
         "redraws": _sum(table, "redraws"),
         "skipped": dict(sorted(skipped.items())),
     }
-    entry = {**counts, **(known or fingerprint(path)), **envelope.to_entry()}
+    entry = {**counts, **fingerprint(path), **envelope.to_entry()}
     return ShardSummary(path.name, entry, _make_index_part(table, path.name, spans))
 
 
@@ -207,7 +185,7 @@ def compose_manifest(
     manifest = {
         "schema": SCHEMA_VERSION,
         **origin,
-        "content_hash": joint_hash(index.column("content_hash")),
+        "content_hash": joint_hash(index.column("content_hash").to_pylist()),
         "counts": {
             "episodes": index.num_rows,
             "steps": sum(summary.entry["steps"] for summary in summaries),
@@ -256,9 +234,11 @@ def parse_manifest(content: bytes) -> dict[str, Any]:
         raise DatasetError(f"it has schema {written_as}; this package reads {SCHEMA_VERSION}")
     if checksum != manifest_checksum(manifest):
         raise DatasetError("it is damaged or was edited (its checksum is wrong)")
-    if lacking := _find_lacking(manifest):
-        raise DatasetError(f"it lacks {', '.join(lacking)}, or has other things there")
-    _check_names(manifest["shards"])
+    if lacking := [key for key in _KEYS if key not in manifest]:
+        raise DatasetError(f"it lacks {', '.join(lacking)}")
+    for name in manifest["shards"]:
+        if not _SHARD_NAME.fullmatch(name):  # the object cache has files of these names
+            raise DatasetError(f"it names the shard {name!r:.80}, which is no plain file name like a.arrow")
     return manifest
 
 
@@ -277,75 +257,7 @@ def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:
         raise DatasetError(f"it is no Parquet file ({error})") from None
     if not index.schema.equals(INDEX_SCHEMA):
         raise DatasetError(f"it has other columns than schema version {SCHEMA_VERSION} asks for")
-    _check_rows(index, manifest["shards"])
     return index
-
-
-def _find_lacking(manifest: Mapping[str, Any]) -> list[str]:
-    """Name what a manifest lacks that something else than this package wrote."""
-    lacking = [key for key, kind in _TYPES.items() if not isinstance(manifest.get(key), kind)]
-    if lacking:
-        return lacking
-    entries = [("counts", manifest["counts"], _COUNTS)]
-    entries += [(name, entry, _TASK_KEYS) for name, entry in manifest["tasks"].items()]
-    entries += [(name, entry, _SHARD_KEYS) for name, entry in manifest["shards"].items()]
-    return [
-        f"{key} of {name}"
-        for name, entry, keys in entries
-        for key, kind in keys.items()
-        if not isinstance(entry, dict) or not _is_value(entry.get(key), kind)
-    ]
-
-
-def _is_value(value: object, kind: Any) -> bool:
-    """Whether a value has a type, and is no whole number that a count or an index could not hold."""
-    return isinstance(value, kind) and (not isinstance(value, int) or 0 <= value < 2**63)
-
-
-def _check_names(names: Iterable[str]) -> None:
-    """Refuse shards that are not plain names of files inside the folder."""
-    for name in names:
-        if not _SHARD_NAME.fullmatch(name):
-            raise DatasetError(f"it names the shard {name!r:.80}, which is no plain file name like a.arrow")
-
-
-def _check_rows(index: pa.Table, shards: Mapping[str, Any]) -> None:
-    """Refuse an index of shards or rows that the manifest does not have."""
-    names = index.column("shard").combine_chunks().dictionary_encode()
-    if unknown := sorted(set(names.dictionary.to_pylist()) - shards.keys()):
-        raise DatasetError(f"it names the shard {unknown[0]!r:.80}, which the manifest does not list")
-    counts = np.array([shards[name]["episodes"] for name in names.dictionary.to_pylist()], np.int64)
-    rows = index.column("row").to_numpy()
-    if ((rows < 0) | (rows >= counts[names.indices.to_numpy()])).any():
-        raise DatasetError("it names rows that its shards do not have, says the manifest")
-
-
-def is_inside(path: Path) -> bool:
-    """Whether a file is a regular one, and no link that leads out of its folder."""
-    return path.is_file() and path.resolve().is_relative_to(path.parent.resolve())
-
-
-def check_failed(folder: Path) -> None:
-    """Refuse a folder whose `failed` is a link out of it, for its files are written and deleted too.
-
-    Raises:
-        DatasetError: It is.
-    """
-    failed = folder / FAILED_FOLDER
-    if not failed.resolve().is_relative_to(folder.resolve()):
-        raise DatasetError(f"{failed} is a link that leads out of the folder. Delete it.")
-
-
-def read_inside(path: Path) -> bytes:
-    """Read a manifest or an index.
-
-    Raises:
-        FileNotFoundError: There is none.
-        DatasetError: It is no regular file, or a link out of its folder; the message is the bare cause.
-    """
-    if not is_inside(path) and (path.exists() or path.is_symlink()):
-        raise DatasetError("it is no regular file, or a link that leads out of the folder")
-    return path.read_bytes()
 
 
 def fingerprint(path: Path) -> dict[str, Any]:
@@ -355,12 +267,9 @@ def fingerprint(path: Path) -> dict[str, Any]:
         return {"bytes": file.tell(), "sha256": digest}
 
 
-def joint_hash(content_hashes: pa.ChunkedArray) -> str:
+def joint_hash(content_hashes: Iterable[str]) -> str:
     """Return 32 hexadecimal digits that stand for all episodes in their order."""
-    digest = hashlib.sha256()
-    for chunk in content_hashes.chunks:
-        digest.update("".join(chunk.to_pylist()).encode())
-    return digest.hexdigest()[:32]
+    return hashlib.sha256("".join(content_hashes).encode()).hexdigest()[:32]
 
 
 def _make_index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
@@ -387,7 +296,6 @@ def is_finished(folder: Path) -> bool:
 
 def clear(folder: Path) -> None:
     """Delete a data set, its failed episodes too; other files stay."""
-    check_failed(folder)
     for part in (folder, folder / FAILED_FOLDER):
         for path in [*(part / name for name in _NAMES), *part.glob("*.arrow")]:
             path.unlink(missing_ok=True)

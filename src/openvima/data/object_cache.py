@@ -510,7 +510,7 @@ def _open_files(
         except ShardError:
             files[name] = None
             continue
-        asked = (joint_hash(index.column("content_hash")), kind, variant)
+        asked = (joint_hash(index.column("content_hash").to_pylist()), kind, variant)
         files[name] = file if (file.source, file.kind, file.variant) == asked else None
     return files
 
@@ -569,7 +569,7 @@ def _write(work: _Work, count: Callable[[int], None]) -> None:
             # Random appearances have no names.
             episodes.append(episode if variant.appearance is None else replace(episode, descriptions={}))
         count(row + 1)
-    source = joint_hash(index.column("content_hash"))
+    source = joint_hash(index.column("content_hash").to_pylist())
     write_cache_file(work.path, episodes, work.kind, source, variant.name)
 
 

@@ -1,8 +1,8 @@
 """One published episode: unpickling its files without running their code, and what it demonstrates.
 
-A pickle is a program that may call any function. `read_pickle` first checks the opcodes, then runs them with
-a `pickle.Unpickler` that knows a closed list of classes. Each is replaced by an inert stand-in that holds
-arguments and state; other names are refused. Arrays and numbers are decoded from their stand-ins afterwards.
+A pickle is a program that may call any function. `read_pickle` runs it with a `pickle.Unpickler` that knows a
+closed list of classes. Each is replaced by an inert stand-in that holds arguments and state; other names are
+refused. Arrays and numbers are decoded from their stand-ins afterwards.
 """
 
 import contextlib
@@ -20,8 +20,7 @@ from openvima.catalog import OBJECTS
 from openvima.data.published_sources import PICKLES, frame_number
 from openvima.data.records import Demonstration, versions_of
 from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
-from openvima.errors import InputFileError, MemberError, PromptError, unknown_name
-from openvima.pickle_opcodes import OPCODES, check_opcodes
+from openvima.errors import MemberError, PromptError, unknown_name
 from openvima.render import channels_first
 from openvima.render.camera import TOP, project
 from openvima.scene import (
@@ -38,8 +37,6 @@ from openvima.scene.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from openvima.tasks import task_spec
 from openvima.tasks.sampling import MAX_SEED
 
-_OPCODES = OPCODES | {"BYTEARRAY8"}  # in which protocol 5 writes the content of arrays
-MAX_OPERATIONS = 100_000  # opcodes; the largest known file has about 3,000
 _MAX_TEXT = 200  # characters of a name or reason that a message quotes
 # What `pickle` raises when it is given damaged bytes.
 _DAMAGE_ERRORS = (
@@ -137,15 +134,12 @@ def read_pickle(content: bytes) -> Any:
         content: The file.
 
     Raises:
-        MemberError: It is damaged, too large, or more than data.
+        MemberError: It is damaged, or more than data.
     """
     try:
-        check_opcodes(content, max_operations=MAX_OPERATIONS, opcodes=_OPCODES)
         return _Unpickler(io.BytesIO(content)).load()
     except MemberError:
         raise
-    except InputFileError as error:
-        raise MemberError(str(error)) from None
     except _DAMAGE_ERRORS as error:
         reason = str(error)[:_MAX_TEXT] or type(error).__name__
         raise MemberError(f"it is truncated or no pickle of data ({reason}).") from None

@@ -14,10 +14,8 @@ from openvima.catalog import LEVELS, OBJECTS, TEXTURES
 from openvima.data.manifest import (
     INDEX_NAME,
     MANIFEST_NAME,
-    is_inside,
     parse_index,
     parse_manifest,
-    read_inside,
 )
 from openvima.data.records import Demonstration, Step
 from openvima.data.schema import VIEWS
@@ -26,8 +24,6 @@ from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
 from openvima.html import notebook_html
 from openvima.hub import cache_folder, dataset_name, fetch
 from openvima.input_files import as_path, names_of
-
-_MAX_MANIFEST_BYTES = 2**28  # of 500,000 shards
 
 
 class Dataset:
@@ -155,7 +151,7 @@ def _reopen(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
 def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:
     path = folder / INDEX_NAME
     try:
-        return parse_index(read_inside(path), manifest)
+        return parse_index(path.read_bytes(), manifest)
     except FileNotFoundError:
         raise DatasetError(f"{path} is missing. {remedy(folder)}") from None
     except DatasetError as error:
@@ -168,9 +164,6 @@ def _check_shards(folder: Path, names: Sequence[str]) -> None:
         raise DatasetError(
             f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {remedy(folder)}"
         )
-    outside = [name for name in names if not is_inside(folder / name)]
-    if outside:
-        raise DatasetError(f"{folder / outside[0]} is a link that leads out of the folder. {remedy(folder)}")
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -181,7 +174,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST_NAME
     try:
-        return parse_manifest(read_inside(path))
+        return parse_manifest(path.read_bytes())
     except (FileNotFoundError, NotADirectoryError):
         raise DatasetError(explain_missing(folder)) from None
     except DatasetError as error:
@@ -254,13 +247,9 @@ def data_folder(path: str | Path, *, shards: bool = True) -> Path:
     manifest = folder / MANIFEST_NAME
     if not manifest.is_file():
         raise DatasetError(f"{name} on the Hugging Face Hub holds no data set ({MANIFEST_NAME} is missing).")
-    if (size := manifest.stat().st_size) > _MAX_MANIFEST_BYTES:
-        raise DatasetError(
-            f"{MANIFEST_NAME} of {fixed} has {size} bytes; at most {_MAX_MANIFEST_BYTES} are read."
-        )
     if shards:
         try:
-            names = list(parse_manifest(read_inside(manifest))["shards"])  # plain file names
+            names = list(parse_manifest(manifest.read_bytes())["shards"])
         except DatasetError as error:
             raise DatasetError(f"{MANIFEST_NAME} of {fixed}: {error}.") from None
         fetch(fixed, names, kind="dataset", into=folder)

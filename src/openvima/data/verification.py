@@ -21,49 +21,28 @@ from openvima.data.manifest import (
     FAILED_FOLDER,
     INDEX_NAME,
     MANIFEST_NAME,
-    ShardSummary,
-    check_failed,
-    compose_manifest,
     fingerprint,
-    is_inside,
     joint_hash,
     parse_index,
     parse_manifest,
-    read_inside,
     split_index,
-    summarise_shard,
 )
 from openvima.data.object_cache import CacheFile
 from openvima.data.planning import COMMAND, generate_command
 from openvima.data.preprocessed import PreprocessedEpisode, preprocess
 from openvima.data.reader import explain_missing
-from openvima.data.records import Demonstration, package_versions
+from openvima.data.records import package_versions
 from openvima.data.replay import ReplayTask, replay_shard
-from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
 from openvima.data.shard import Envelope, Shard, list_spans, map_file, remedy
-from openvima.env.config import ENV_SETTINGS
 from openvima.errors import AssetError, ConfigError, DatasetError, OpenVimaError, ShardError, echo
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, check_workers, imap_unordered
-from openvima.scene import (
-    ACTION_SHAPES,
-    BACKGROUND_ID,
-    END_EFFECTORS,
-    FIRST_OBJECT_ID,
-    WORKSPACE_HIGH,
-    WORKSPACE_LOW,
-)
-from openvima.scene.action import PRIMITIVES
-from openvima.tasks.oracle import TIED_TO_TABLE
-from openvima.tasks.prompts import MULTIMODAL
 from openvima.user_code import is_code
 
 __all__ = ["Problem", "Verification", "VerifyConfig", "verify"]
 
 _PUBLISHED = "published"  # domain of imported demonstrations
 _MAX_ROWS_NAMED = 8
-_UNIT_TOLERANCE = 1e-3  # float32 quaternions of published data are off by up to 1e-7
-_KEY_COLUMNS = ("task", "level", "domain", "seed", "steps", "content_hash", "success")
 _NOT_AGAIN = "The files are intact, but another machine or other code wrote them. Generate them again."
 _CACHE_REMEDY = "Delete it; `openvima data preprocess` makes it again."
 _IN_ANY_CACHE = ("task", "seed", "end_effector", "actions")  # what depends on no detector
@@ -175,7 +154,6 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     folder = as_path(folder)
     if config.assets is not None and is_code(config.assets):
         load_assets(config.assets)
-    check_failed(folder)
     found = _Verifier(folder, config, report).run()
     failed = folder / FAILED_FOLDER
     if not (failed / MANIFEST_NAME).is_file() and not any(failed.glob("*.arrow")):
@@ -196,17 +174,11 @@ class _ShardTask:
         path: The file.
         entry: Its entry in the manifest; None where that cannot be trusted.
         index: Its part of the index; None where that cannot be trusted.
-        config: Settings of the manifest that all generated shards share; empty for others.
-        versions: Those of the manifest, for generated shards; empty for others.
-        is_failed: Whether it holds unsolved episodes.
     """
 
     path: Path
     entry: dict[str, Any] | None
     index: pa.Table | None
-    config: dict[str, Any]
-    versions: dict[str, str]
-    is_failed: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,15 +187,13 @@ class _Checked:
 
     Args:
         causes: What is wrong with it.
-        summary: Its part of index and manifest, as they should be; None if it is damaged.
-        info: Its metadata; None if unreadable.
-        num_episodes: Records that were decoded.
+        info: Its metadata; None if it is damaged.
+        content_hashes: Of its records; empty if it is damaged.
     """
 
     causes: Sequence[str]
-    summary: ShardSummary | None = None
     info: ShardInfo | None = None
-    num_episodes: int = 0
+    content_hashes: Sequence[str] = ()
 
 
 @dataclass(slots=True)
@@ -259,7 +229,6 @@ class _Verifier:
         for name, found in checked.items():
             for cause in found.causes:
                 self._add(name, cause, self._remedy)
-        self._check_totals([found.summary for found in checked.values()])
         num_replayed = self._replay(checked)
         num_cache_files = self._check_cache(checked)
         return Verification(
@@ -267,7 +236,7 @@ class _Verifier:
             tuple(sorted(self.problems)),
             tuple(self.notes),
             num_shards=len(tasks),
-            num_episodes=sum(found.num_episodes for found in checked.values()),
+            num_episodes=sum(len(found.content_hashes) for found in checked.values()),
             num_replayed=num_replayed,
             num_cache_files=num_cache_files,
         )
@@ -306,13 +275,13 @@ class _Verifier:
 
     def _read_manifest_and_index(self) -> None:
         try:
-            self.manifest = parse_manifest(read_inside(self.folder / MANIFEST_NAME))
+            self.manifest = parse_manifest((self.folder / MANIFEST_NAME).read_bytes())
         except FileNotFoundError:
             self._add(MANIFEST_NAME, "it is missing", "Repeat the command that wrote the folder.")
         except DatasetError as error:
             self._add(MANIFEST_NAME, str(error), self._remedy)
         try:
-            content = read_inside(self.folder / INDEX_NAME)
+            content = (self.folder / INDEX_NAME).read_bytes()
             self.index = None if self.manifest is None else parse_index(content, self.manifest)
         except FileNotFoundError:
             self._add(INDEX_NAME, "it is missing", self._remedy)
@@ -322,7 +291,6 @@ class _Verifier:
     def _shard_tasks(self, found: Sequence[str]) -> list[_ShardTask]:
         """Return the manifest's shards in the order of the data set; without a manifest, all files."""
         manifest, index = self.manifest, self.index
-        generated = manifest if manifest is not None and self._is_generated else {}
         parts = {} if index is None else split_index(index)
         listed = found if manifest is None else [*parts, *sorted(manifest["shards"].keys() - parts.keys())]
         return [
@@ -330,38 +298,9 @@ class _Verifier:
                 path=self.folder / name,
                 entry=None if manifest is None else manifest["shards"][name],
                 index=None if index is None else parts.get(name, index.slice(0, 0)),
-                config=generated.get("config", {}),
-                versions=generated.get("versions", {}),
-                is_failed=self._holds_failed,
             )
             for name in listed
         ]
-
-    def _check_totals(self, found: Sequence[ShardSummary | None]) -> None:
-        """Compare whole shards with each other, and all together with index and manifest."""
-        summaries = [summary for summary in found if summary is not None]
-        first: dict[str, str] = {}
-        for summary in summaries:
-            hashes = summary.index.column("content_hash").to_pylist()
-            twice = []
-            for content_hash in hashes:
-                if content_hash in first:
-                    twice.append(first[content_hash])
-                first.setdefault(content_hash, summary.name)
-            if twice:
-                cause = f"{len(twice)} of its {len(hashes)} episodes are there twice, "
-                cause += f"the first of them also in {twice[0]}"
-                remedy = "Take one away, and repeat the command that wrote the folder."
-                self._add(summary.name, cause, remedy)
-        if self.manifest is None or len(summaries) < len(found):
-            return
-        index, expected = compose_manifest(summaries, {})
-        for key, value in expected.items():
-            if key != "shards" and self.manifest[key] != value:  # those were compared one by one
-                self._add(MANIFEST_NAME, f"{key!r} is not what the shards say", self._remedy)
-        if self.index is not None and not self.index.combine_chunks().equals(index):
-            cause = "it does not list what the shards hold, or not in this order"
-            self._add(INDEX_NAME, cause, self._remedy)
 
     def _replay(self, checked: Mapping[str, _Checked]) -> int:
         """Replay a sample of episodes; return their number."""
@@ -382,7 +321,7 @@ class _Verifier:
                 self.notes.append(f"{name} cannot be replayed: {found}")
                 continue
             num_replayed += len(task.rows)
-            for cause in _by_cause(found, checked[name].num_episodes):
+            for cause in _by_cause(found, len(checked[name].content_hashes)):
                 if others := _other_versions(task.info):
                     self.notes.append(f"{name}, written by {others}, which may be why: replayed, {cause}")
                 else:
@@ -393,9 +332,9 @@ class _Verifier:
         """Choose a pseudorandom sample of each task by hashes of content and seed."""
         ranked: dict[str, list[tuple[bytes, str, int]]] = {}
         for name, found in checked.items():
-            if found.summary is None or found.info is None or found.info.domain == _PUBLISHED:
+            if found.info is None or found.info.domain == _PUBLISHED:
                 continue
-            for row, content_hash in enumerate(found.summary.index.column("content_hash").to_pylist()):
+            for row, content_hash in enumerate(found.content_hashes):
                 rank = hashlib.sha256(f"{self.config.seed} {content_hash}".encode()).digest()
                 ranked.setdefault(found.info.task, []).append((rank, name, row))
         chosen = [place for places in ranked.values() for place in sorted(places)[: self.config.replay]]
@@ -411,10 +350,10 @@ class _Verifier:
         tasks, total = [], 0
         for name, found in sorted(checked.items()):
             for path in sorted((self.folder / CACHE_FOLDER).glob(f"*/{name}")):
-                if found.summary is not None:
-                    content_hash = joint_hash(found.summary.index.column("content_hash"))
+                if found.info is not None:
+                    content_hash = joint_hash(found.content_hashes)
                     tasks.append(_CacheTask(path, self.folder / name, content_hash))
-                    total += found.num_episodes
+                    total += len(found.content_hashes)
         num_files = 0
         for task, causes in self._map(check_cache_file, tasks, total, "comparing the object cache"):
             num_files += causes is not None
@@ -427,17 +366,15 @@ def check_shard(task: _ShardTask, count: Callable[[int], None]) -> _Checked:
     """Check a shard; `count` is called with the number of episodes checked so far."""
     if causes := list(_find_byte_faults(task)):
         return _Checked(causes)
-    known = None if task.entry is None else {key: task.entry[key] for key in ("bytes", "sha256")}
     try:
         shard = Shard(task.path)
-        summary = summarise_shard(task.path, known)
+        hashes = shard.table(["content_hash"]).column(0).to_pylist()
     except ShardError as error:
         return _Checked([_bare_cause(error, task.path)])
-    found = list(_find_record_faults(task, shard, count))
-    is_damaged = any(is_damage for _, _, is_damage in found)
+    found = list(_find_record_faults(shard, hashes, count))
     causes = _by_cause(((row, cause) for row, cause, _ in found), len(shard))
-    causes += [*_find_setting_faults(task, shard.info), *_find_summary_faults(task, summary)]
-    return _Checked(causes, None if is_damaged else summary, shard.info, len(shard))
+    is_damaged = any(is_damage for *_, is_damage in found)
+    return _Checked(causes) if is_damaged else _Checked(causes, shard.info, hashes)
 
 
 def _bare_cause(error: OpenVimaError, path: Path) -> str:
@@ -450,8 +387,6 @@ def _find_byte_faults(task: _ShardTask) -> Iterator[str]:
     """Yield damage of the bytes, with its place."""
     if not task.path.is_file():
         yield "it is missing"
-    elif not is_inside(task.path):
-        yield "it is a link that leads out of the folder"
     elif task.entry is not None:
         found = fingerprint(task.path)
         if (found["bytes"], found["sha256"]) == (task.entry["bytes"], task.entry["sha256"]):
@@ -466,11 +401,10 @@ def _find_byte_faults(task: _ShardTask) -> Iterator[str]:
 
 
 def _find_record_faults(
-    task: _ShardTask, shard: Shard, count: Callable[[int], None]
+    shard: Shard, hashes: Sequence[str], count: Callable[[int], None]
 ) -> Iterator[tuple[int, str, bool]]:
     """Yield row, fault, and whether damaged bytes are the cause."""
-    keys = shard.table(_KEY_COLUMNS).to_pylist()
-    for row, key in enumerate(keys):
+    for row, content_hash in enumerate(hashes):
         try:
             demo = shard[row]
         except ShardError as error:
@@ -480,117 +414,13 @@ def _find_record_faults(
             yield row, f"its images cannot be rendered: {error}", False
             continue
         # Rendered images were compared on reading.
-        if shard.info.images and demo.content_hash() != key["content_hash"]:
+        if shard.info.images and demo.content_hash() != content_hash:
             yield row, "its content hash is not that of its content", True
-        if demo.num_steps != key["steps"]:
-            yield row, "it does not have as many actions as steps", False
-        if task.config and demo.outcome.success == task.is_failed:
-            yield row, f"it is {'' if task.is_failed else 'not '}solved", False
-        if task.config and row and key["seed"] <= keys[row - 1]["seed"]:
-            yield row, "its seed does not follow that of the record before", False
-        yield from ((row, fault, False) for fault in find_faults(demo))
         count(row + 1)
 
 
-def _find_setting_faults(task: _ShardTask, info: ShardInfo) -> Iterator[str]:
-    """Yield contradictions between a generated shard and the manifest."""
-    if not task.config:
-        return
-    settings = {"prompts": MULTIMODAL, "task_options": "", "control": PRIMITIVES, **task.config}
-    for name in ("level", "domain", *ENV_SETTINGS, "compression", "images"):
-        if name in settings and getattr(info, name) != settings[name]:
-            there, stated = str(getattr(info, name)) or "none", str(settings[name]) or "none"
-            yield f"{name} is {there}, in the manifest {stated}"
-    if info.versions != task.versions:
-        yield f"it was written by {info.versions}, says the manifest {task.versions}"
-    if task.path.name != info.file_name:
-        yield f"it says that it is {info.file_name}"
-
-
-def _find_summary_faults(task: _ShardTask, summary: ShardSummary) -> Iterator[str]:
-    """Yield contradictions of manifest and index with the shard."""
-    entry = task.entry or {}
-    if names := [key for key, value in entry.items() if summary.entry.get(key) != value]:
-        yield f"the manifest says otherwise of its {', '.join(names)}"
-    if task.index is not None:
-        here, there = summary.index.to_pydict(), task.index.to_pydict()
-        if names := [name for name in here if here[name] != there[name]]:
-            yield f"the index says otherwise of its {', '.join(names)}"
-
-
-def find_faults(demo: Demonstration) -> Iterator[str]:
-    """Yield violated invariants of a demonstration, wherever it comes from.
-
-    Args:
-        demo: The demonstration, with its images.
-    """
-    yield from _find_image_faults(demo)
-    yield from _find_action_faults(demo)
-    yield from _find_object_faults(demo)
-    yield from _find_scene_faults(demo)
-    if demo.end_effector not in END_EFFECTORS:
-        yield f"the end effector {demo.end_effector!r} does not exist"
-    if demo.outcome.success and demo.outcome.failure:
-        yield "it is both a success and a failure"
-    if demo.num_steps > demo.max_steps:
-        yield "it has more actions than steps are allowed"
-
-
-def _find_image_faults(demo: Demonstration) -> Iterator[str]:
-    num_seen = demo.num_steps + 1
-    first = FIRST_OBJECT_ID.get(demo.end_effector, 0)
-    known = {*range(first), BACKGROUND_ID, *(record.object_id for record in demo.objects)}
-    for view in VIEWS:
-        if demo.rgb[view].shape != (num_seen, 3, *IMAGE_SHAPE):
-            yield f"the {view} view does not have one image more than there are actions"
-        if demo.segm[view].shape != (num_seen, *IMAGE_SHAPE):
-            yield f"the {view} view does not have one segmentation more than there are actions"
-        counts = np.bincount(demo.segm[view].reshape(-1), minlength=1)
-        if not known.issuperset(np.flatnonzero(counts).tolist()):
-            yield f"the segmentation of the {view} view shows an object that is not in the scene"
-
-
-def _find_action_faults(demo: Demonstration) -> Iterator[str]:
-    low, high = (np.array(corner, np.float32) for corner in (WORKSPACE_LOW, WORKSPACE_HIGH))
-    for key in ACTION_SHAPES:
-        values = np.array([getattr(action, key) for action in demo.actions])
-        if not np.isfinite(values).all():
-            yield f"{key} is not a number"
-        elif demo.domain == _PUBLISHED or not len(values):
-            continue
-        elif key.endswith("position"):
-            if (values < low).any() or (values > high).any():
-                yield f"{key} lies outside the workspace"
-        elif (np.abs(np.linalg.norm(values, axis=-1) - 1) > _UNIT_TOLERANCE).any():
-            yield f"{key} is no unit quaternion"
-
-
-def _find_object_faults(demo: Demonstration) -> Iterator[str]:
-    ids = [record.object_id for record in demo.objects]
-    if len(set(ids)) < len(ids):
-        yield "two objects have the same id"
-    for name, own in (("pick_ids", {*ids, UNKNOWN_ID}), ("place_ids", {*ids, UNKNOWN_ID, TIED_TO_TABLE})):
-        values = getattr(demo, name)
-        if len(values) != demo.num_steps:
-            yield f"{name} does not have one id an action"
-        if not own.issuperset(values):
-            yield f"{name} names an object that is not in the scene"
-
-
-def _find_scene_faults(demo: Demonstration) -> Iterator[str]:
-    if demo.scenes and len(demo.scenes) != demo.num_steps + 1:
-        yield "the objects do not have one pose more than there are actions"
-    poses = [[*p.pose.position, *p.pose.quaternion] for scene in demo.scenes for p in scene.placements]
-    if not np.isfinite(np.array(poses)).all():
-        yield "a pose is not a number"
-    if demo.joint_paths and len(demo.joint_paths) != demo.num_steps:
-        yield "the arm does not have one path an action"
-    if not all(np.isfinite(path).all() for path in demo.joint_paths):
-        yield "a path of the arm is not a number"
-
-
 def _notes_on_origin(checked: Mapping[str, _Checked]) -> Iterator[str]:
-    infos = [(found.info, found.num_episodes) for found in checked.values() if found.info is not None]
+    infos = [(each.info, len(each.content_hashes)) for each in checked.values() if each.info is not None]
     if imported := sum(num for info, num in infos if info.domain == _PUBLISHED):
         yield f"{imported} episodes are imported ones; these cannot be replayed."
     others = {_other_versions(info) for info, _ in infos if info.domain != _PUBLISHED} - {""}
