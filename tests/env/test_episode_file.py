@@ -160,7 +160,7 @@ def test_photos_outside_the_folder_are_refused(tmp_path: Path) -> None:
 
 def test_two_objects_of_one_name_are_refused(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(HAND_WRITTEN.replace("  bowl:", "  block:"), encoding="utf-8")
-    with pytest.raises(InputFileError, match="it has the key 'block' twice"):
+    with pytest.raises(InputFileError, match="it has a key twice: block"):
         openvima.load_episode(tmp_path / "scene.yaml")
 
 
