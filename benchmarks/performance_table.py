@@ -15,8 +15,8 @@ command: The command that measures it.
 commit:  The commit that was measured.
 against: Only for a ratio of two commits: the commit before, measured in the same run.
 
-The date is that of the file's name. Rows are in the order of the files, then of their entries. Figures whose
-script no longer exists are left out.
+The date is that of the file's name. Rows are in the order of the files, then of their entries. Ratios of two
+commits, and figures whose script no longer exists, stay in the records alone.
 """
 
 import argparse
@@ -29,13 +29,11 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "performance.md"
 HEAD = """# Performance
 
-Made from the JSON files in [results](../results/) by `python benchmarks/performance_table.py`; do not edit.
-Absolute figures are those of the machine that the source names, ratios were measured in one run. `a / b` in
-the column of commits is a ratio of commit `a` to commit `b`. × is a speed-up, or in rows of a time the ratio
-of the times.
+The newest figures of each kind. Each is that of the machine in its record, where command and commit stand too.
+Made by `python benchmarks/performance_table.py`; do not edit.
 
-| what | figure | command | commit | date | source |
-|---|---:|---|---|---|---|
+| what | figure | record |
+|---|---:|---|
 """
 
 
@@ -58,10 +56,8 @@ class Row:
         """Return the row in Markdown."""
         value = self.value if isinstance(self.value, str) else f"{self.value:,}"
         figure = f"{value}{'' if self.unit == '×' else ' '}{self.unit}"
-        commit = f"`{self.commit}`" + (f" / `{self.against}`" if self.against else "")
-        date, name = source.stem.split("_", 1)
-        link = f"[{name}](../results/{source.with_suffix('.md').name})"
-        return f"| {self.what} | {figure} | `{self.command}` | {commit} | {date} | {link} |"
+        date = source.stem.split("_", 1)[0]
+        return f"| {self.what} | {figure} | [{date}](../results/{source.with_suffix('.md').name}) |"
 
 
 def read_rows(results: Path) -> dict[str, tuple[Row, Path]]:
@@ -95,7 +91,8 @@ def _row(entry: dict, file: Path) -> Row:
 
 def page(results: Path) -> str:
     """Return docs/performance.md."""
-    rows = [(row, file) for row, file in read_rows(results).values() if _can_be_repeated(row)]
+    found = read_rows(results).values()
+    rows = [(row, file) for row, file in found if not row.against and _can_be_repeated(row)]
     return HEAD + "".join(f"{row.cells(file)}\n" for row, file in rows)
 
 

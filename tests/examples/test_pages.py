@@ -22,7 +22,7 @@ BEGINNINGS = {  # page to the example that it begins with
     "observations": "joints_and_depth",
     "prompts": "language_prompts",
     "your_own_objects": "custom_object",
-    "your_own_policy": "score_my_policy",
+    "your_own_policy": "own_network",
     "your_own_task": "custom_task",
     "your_own_training": "own_training_loop",
 }
@@ -89,5 +89,5 @@ def test_code_that_starts_worker_processes_has_a_guard(page: Path) -> None:
 def test_the_page_begins_with_its_example(page: str, example: str) -> None:
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     code = (ROOT / "examples" / f"{example}.py").read_text(encoding="utf-8")
-    assert len(code.splitlines()) <= 45
+    assert len(code.splitlines()) <= 55
     assert text.split("```")[1] == f"python\n{code}"
