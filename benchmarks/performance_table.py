@@ -32,8 +32,8 @@ HEAD = """# Performance
 The newest figures of each kind. Each is that of the machine in its record, where command and commit stand too.
 Made by `python benchmarks/performance_table.py`; do not edit.
 
-| what | figure | record |
-|---|---:|---|
+| what | figure |
+|---|---:|
 """
 
 
@@ -56,8 +56,7 @@ class Row:
         """Return the row in Markdown."""
         value = self.value if isinstance(self.value, str) else f"{self.value:,}"
         figure = f"{value}{'' if self.unit == '×' else ' '}{self.unit}"
-        date = source.stem.split("_", 1)[0]
-        return f"| {self.what} | {figure} | [{date}](../results/{source.with_suffix('.md').name}) |"
+        return f"| {self.what} | [{figure}](../results/{source.with_suffix('.md').name}) |"
 
 
 def read_rows(results: Path) -> dict[str, tuple[Row, Path]]:

@@ -31,9 +31,9 @@ def test_a_newer_result_replaces_the_row(tmp_path: Path) -> None:
     ratio = {"what": "in turns", "unit": "×", "against": "def"}
     record(tmp_path, "2026-01-02_b.json", ENTRY | {"value": 1.5, "unit": "×"}, ENTRY | ratio)
     assert page(tmp_path).splitlines()[-3:] == [
-        "|---|---:|---|",
-        "| other | 9 to 27 ms | [2026-01-01](../results/2026-01-01_a.md) |",
-        "| decision | 1.5× | [2026-01-02](../results/2026-01-02_b.md) |",
+        "|---|---:|",
+        "| other | [9 to 27 ms](../results/2026-01-01_a.md) |",
+        "| decision | [1.5×](../results/2026-01-02_b.md) |",
     ]
 
 

@@ -64,7 +64,7 @@ def test_the_rule_solves_every_episode_that_colours_tell(policy: Any) -> None:
                 solved.append(outcome.success)
     assert solved and all(solved)
     if policy.control == "primitives":
-        assert len(solved) == 50  # of 72; docs/vla.md says so
+        assert len(solved) == 50  # of 72
 
 
 def test_the_rule_reads_the_text() -> None:
