@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "performance.md"
 HEAD = """# Performance
 
-The newest figures of each kind. Each is that of the machine in its record, where command and commit stand too.
+The newest figures of each kind. Each is that of the machine in its record, where command and commit are.
 Made by `python benchmarks/performance_table.py`; do not edit.
 
 | what | figure |

@@ -17,6 +17,7 @@ from openvima.cli.main import VERBS, main
 
 ROOT = Path(__file__).parents[1]
 PAGES = (*(ROOT / name for name in ("README.md", "CONTRIBUTING.md")), *sorted((ROOT / "docs").glob("*.md")))
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 FENCE = re.compile(r"^```(\w*).*?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9.-]*")
 OTHER_PROGRAMS = {"git", "pip", "pyright", "pytest", "python", "ray", "ruff", "sbatch", "torchrun"}
@@ -209,6 +210,40 @@ def anchors(page: Path) -> set[str]:
     prose = FENCE.sub("", page.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def guides() -> list[Path]:
+    """Return the pages that docs/README.md lists as guides."""
+    text = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    table = text.partition("**Guides**")[2].partition("**Reference**")[0]
+    return [ROOT / "docs" / name for name in re.findall(r"\]\((\w+\.md)\)", table)]
+
+
+def count_words(*pages: Path) -> int:
+    """Count what spaces separate, as `wc -w`: code and the bars of tables too."""
+    return sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
+
+
+def test_the_readme_guides_and_all_pages_are_short() -> None:
+    assert count_words(ROOT / "README.md") <= 750
+    long = {page.name: words for page in guides() if (words := count_words(page)) > 900}
+    assert len(guides()) >= 10 and not long
+    assert count_words(*(ROOT / "docs").rglob("*.md")) <= 30_000
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_lines_fit_a_screen(page: Path) -> None:
+    wide = [
+        f"{page.relative_to(ROOT)}:{number}"
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        if len(line) > 110 and not re.match(r"\s*(\||!\[)", line)  # tables and pictures cannot be wrapped
+    ]
+    assert not wide, "\n".join(wide)
+
+
+def test_code_of_the_readme_is_shown_whole() -> None:
+    code = [line for block in FENCE.findall(README) for line in block[1].splitlines()]
+    assert code and max(map(len, code)) <= 100
 
 
 def test_a_stale_command_is_reported_with_its_line(parse: Callable[..., str]) -> None:

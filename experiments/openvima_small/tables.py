@@ -27,8 +27,7 @@ _PREVIOUS = ("7.3M", "52,000")  # parameters and demonstrations
 _CHANCE = 1 / 3  # with the other attribute: docs/evaluation.md
 _SETTINGS = tuple(name for name in EVALUATIONS if name not in ("controls", "text"))
 _IN_SIMULATOR = (
-    "In the published benchmark itself, served over the network: its PyBullet simulator, assets and order of "
-    "objects, none of which any training has seen."
+    "In the original simulator, with its assets and its order of objects. Training has seen none of them."
 )
 _HERE = "In this package, boxes from the segmentation unless stated."
 _LEAST_SOLVED = 0.95  # tasks below are listed with their failures
