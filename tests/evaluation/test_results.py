@@ -107,15 +107,6 @@ def test_damaged_results_are_refused(tmp_path, text):
         Results.read(tmp_path)
 
 
-@pytest.mark.parametrize("steps", [-1, 2**63, 10**400, True, "1"])
-def test_counts_of_another_type_or_size_are_refused(results, tmp_path, steps):
-    content = json.loads(results.to_json())
-    content["rows"][0]["outcomes"][0]["steps"] = steps
-    (tmp_path / "results.json").write_text(json.dumps(content))
-    with pytest.raises(DatasetError, match=r"is damaged \("):
-        Results.read(tmp_path)
-
-
 def test_results_of_another_schema_are_refused(tmp_path):
     (tmp_path / "results.json").write_text('{"schema": 2}')
     with pytest.raises(DatasetError, match="schema 2"):
@@ -151,37 +142,6 @@ def test_a_file_that_is_no_text_is_damaged(tmp_path):
         Results.read(tmp_path)
 
 
-def test_values_of_other_types_are_refused_and_named(results, tmp_path):
-    path = results.write(tmp_path / "results.json")
-    text = path.read_text()
-    for old, new in (
-        ('"seed": 3', '"seed": "3"'),
-        ('"success": true', '"success": 1'),
-        ('"policy": "mine"', '"policy": ["mine"]'),
-        ('"mujoco": "1.2.3"', '"mujoco": 1'),
-        ('"actions_sha256": ""', '"actions_sha256": null'),
-        ('"kind": "run"', '"kind": []'),
-        (f'"sha256": "{"ab" * 32}"', '"sha256": 5'),
-        ('"kind": "oracle"', '"kind": "untrained", "preset": 5'),
-    ):
-        assert old in text
-        path.write_text(text.replace(old, new, 1))
-        with pytest.raises(DatasetError, match=r"is damaged .*stands for a value of type"):
-            Results.read(path)
-    for config in ({"tasks": 5}, {"tasks": [1]}, {"levels": "L1"}, {"ablations": [None]}):
-        path.write_text(json.dumps({**json.loads(text), "config": config}))
-        with pytest.raises(DatasetError, match=r"is damaged .*stands for a value of type"):
-            Results.read(path)
-    content = json.loads(text)
-    content["rows"][0]["outcomes"] = []
-    path.write_text(json.dumps(content))
-    with pytest.raises(DatasetError, match="a row has no outcomes"):
-        Results.read(path)
-    path.write_text("[" * 100_000)
-    with pytest.raises(DatasetError, match="is damaged"):
-        Results.read(path)
-
-
 def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path):
     with (tmp_path / "results.json").open("wb") as stream:
         stream.truncate(2**40)
@@ -189,13 +149,8 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path):
         Results.read(tmp_path)
 
 
-def test_a_number_that_is_not_finite_is_neither_written_nor_read(results, tmp_path):
+def test_a_number_that_is_not_finite_is_not_written(results, tmp_path):
     hostile = replace(results, policies={"a": {"kind": "remote", "metadata": {"score": float("nan")}}})
     with pytest.raises(ValueError, match="JSON compliant"):
         hostile.write(tmp_path / "results.json")
     assert list(tmp_path.iterdir()) == []
-    text = results.to_json().replace('"policies": {', '"policies": {"a": {"score": NaN}, ')
-    assert "NaN" in text
-    (tmp_path / "results.json").write_text(text)
-    with pytest.raises(DatasetError, match="NaN is no JSON"):
-        Results.read(tmp_path)

@@ -5,7 +5,6 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from openvima.env import EnvConfig
@@ -179,27 +178,6 @@ def test_damaged_actions_are_refused(copy):
     path = copy / ACTIONS_NAME
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(DatasetError, match="damaged"):
-        verify_results(copy)
-
-
-@pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_compressed_actions_are_refused_before_they_are_unpacked(copy, compression):
-    path = copy / ACTIONS_NAME
-    table = pa.ipc.open_file(path.read_bytes()).read_all()
-    options = pa.ipc.IpcWriteOptions(compression=compression)
-    with pa.ipc.new_file(path, table.schema, options=options) as writer:
-        writer.write_table(pa.concat_tables([table] * 1000).combine_chunks())
-    with pytest.raises(DatasetError, match=r"is damaged \(it is compressed"):
-        verify_results(copy)
-
-
-def test_actions_of_before_version_5_of_the_format_are_refused(copy):
-    path = copy / ACTIONS_NAME
-    table = pa.ipc.open_file(path.read_bytes()).read_all()
-    options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
-    with pa.ipc.new_file(path, table.schema, options=options) as writer:
-        writer.write_table(table)
-    with pytest.raises(DatasetError, match=r"before 1\.0"):
         verify_results(copy)
 
 

@@ -1,7 +1,6 @@
 """Recorded actions of an evaluation: `actions.arrow`, one record a step, from which outcomes are replayed."""
 
 import hashlib
-import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -25,8 +24,6 @@ _SCHEMAS = {
     for width in _WIDTHS.values()
 }
 _MAX_BYTES = 1 << 28  # five million steps
-_MAGIC_BYTES = 8  # before the first message of an Arrow file
-_METADATA_V5 = 4  # in messages of Arrow 1.0 and later
 
 Steps = list[list[float]]  # the actions of one episode, 12 float32 numbers each, or 5 of a command
 
@@ -140,19 +137,17 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
             content = stream.read(_MAX_BYTES + 1)
         if len(content) > _MAX_BYTES:
             raise DatasetError(f"{path} has more than {_MAX_BYTES} bytes, the most that is read.")
-        table, width = _read_table(content)
-        table.validate(full=True)
-        if any(column.null_count for column in table.columns):
-            raise ValueError("it lacks numbers")
+        table = pa.ipc.open_file(content).read_all()
+        width = next(width for width, schema in _SCHEMAS.items() if table.schema.equals(schema))
         seeds = table.column(0).to_numpy()
         numbers = table.column(1).combine_chunks().flatten().to_numpy(zero_copy_only=False)
     except FileNotFoundError:
         raise DatasetError(
             f"there is no {path}; evaluations of this version write it. Evaluate again with --force."
         ) from None
-    except (EOFError, struct.error, *DAMAGE_ERRORS) as error:
-        if isinstance(error, DatasetError):
-            raise
+    except DatasetError:
+        raise
+    except (StopIteration, *DAMAGE_ERRORS) as error:
         raise DatasetError(f"{path} is damaged ({(str(error).splitlines() or [repr(error)])[0]}).") from None
     numbers = numbers.reshape(-1, width)
     counts = [outcome.steps for row in rows for outcome in row.outcomes]
@@ -162,53 +157,6 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
         raise DatasetError(f"{path} has steps of other seeds than results.json.")
     episodes = iter(np.split(numbers, np.cumsum(counts)[:-1]))
     return {i: [next(episodes) for _ in row.outcomes] for i, row in enumerate(rows)}, _digest(seeds, numbers)
-
-
-def _read_table(content: bytes) -> tuple[pa.Table, int]:
-    """Read a file without allocating more memory than it has bytes; return its table and width.
-
-    Batches are read one after the other: a footer could name one of them a thousand times. None is compressed
-    by `write_actions`, and Arrow allocates whatever size a compressed one claims.
-
-    Raises:
-        ValueError: It has other columns, or is compressed.
-    """
-    num_batches = pa.ipc.open_file(content).num_record_batches
-    source = pa.BufferReader(content)
-    source.seek(_MAGIC_BYTES)
-    found = pa.ipc.read_schema(pa.ipc.read_message(source))
-    width = next((width for width, schema in _SCHEMAS.items() if found.equals(schema)), 0)
-    if not width:
-        raise ValueError("it has other columns")
-    batches = []
-    for _ in range(num_batches):
-        message = pa.ipc.read_message(source)
-        if not _is_plain(message.metadata.to_pybytes()):
-            raise ValueError("it is compressed, or of a version of Arrow before 1.0")
-        batches.append(pa.ipc.read_record_batch(message, _SCHEMAS[width]))
-    return pa.Table.from_batches(batches, _SCHEMAS[width]), width
-
-
-def _is_plain(metadata: bytes) -> bool:
-    """Whether a batch is stored uncompressed, by the flatbuffer before it (`Message.fbs` of Arrow).
-
-    Before version 5 compression was said elsewhere.
-    """
-    (message,) = struct.unpack_from("<I", metadata)
-    version, header = (_field(metadata, message, number) for number in (0, 2))
-    if not version or not header or struct.unpack_from("<h", metadata, version)[0] != _METADATA_V5:
-        return False
-    batch = header + struct.unpack_from("<I", metadata, header)[0]
-    return not _field(metadata, batch, 3)
-
-
-def _field(metadata: bytes, table: int, number: int) -> int:
-    """Position of a field of a flatbuffer's table; 0 where it has none."""
-    fields = table - struct.unpack_from("<i", metadata, table)[0]
-    (num_bytes,) = struct.unpack_from("<H", metadata, fields)
-    place = 4 + 2 * number
-    offset = struct.unpack_from("<H", metadata, fields + place)[0] if place < num_bytes else 0
-    return table + offset if offset else 0
 
 
 def _numbers(decision: Decision, control: str) -> list[float]:

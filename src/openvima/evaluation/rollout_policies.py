@@ -29,7 +29,7 @@ from openvima.policies.loading import checked_policy
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene import Action
 from openvima.scene.action import END_EFFECTOR, PRIMITIVES, ToolCommand
-from openvima.scene.explanation import PLACE_KINDS, Explanation
+from openvima.scene.explanation import Explanation
 from openvima.serving.chat import DEFAULT_VLM, SEGMENTATION, ChatClient, VlmConfig, VlmPolicy
 from openvima.serving.client import RemotePolicy
 from openvima.user_code import described
@@ -210,8 +210,6 @@ class PromptedRolloutPolicy:
                     f"explain() of {self._name} returned {echo(repr(found))}; give a list of an Explanation "
                     "or None for each episode, see docs/explain.md."
                 )
-            for fault in (fault for each in found if each is not None for fault in _faults_in(each)):
-                raise PolicyError(f"explain() of {self._name} returned {fault}; see docs/explain.md.")
             return list(found)
 
         return checked
@@ -356,19 +354,6 @@ def build_policy(
     if boxes:
         options["extractor"] = plugged_extractor(boxes)
     return load_policy(source, **options)
-
-
-def _faults_in(explanation: Explanation) -> Iterator[str]:
-    """Name what could not be drawn."""
-    for kind, weights in explanation.attention.items():
-        if len(weights) != len(explanation.prompt):
-            yield (
-                f"{len(weights)} weights of attention {echo(repr(kind))} to a prompt of "
-                f"{len(explanation.prompt)} parts"
-            )
-    for place in explanation.places:
-        if place.kind not in PLACE_KINDS:
-            yield f"a place of kind {echo(repr(place.kind))}; allowed: {', '.join(PLACE_KINDS)}"
 
 
 def _episodes(envs: Sequence[TabletopEnv]) -> str:
