@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from openvima.errors import MissingExtraError
-from openvima.imports import import_extra, lacks_memory, require_address_space
+from openvima.imports import import_extra, lacks_memory
 
 
 @pytest.mark.parametrize(
@@ -42,9 +42,3 @@ def test_lack_of_memory_is_found_in_the_causes_of_an_exception() -> None:
     assert lacks_memory(error)
     assert not lacks_memory(ImportError("failed to map segment from shared object: Operation not permitted"))
     assert not lacks_memory(ValueError("memory"))
-
-
-def test_address_space_is_checked_without_using_it() -> None:
-    require_address_space(1024)
-    with pytest.raises(MemoryError):
-        require_address_space(1 << 40)

@@ -113,34 +113,13 @@ def test_a_number_of_workers_that_cannot_be_is_refused(num_workers: int) -> None
 
 
 @pytest.mark.parametrize(
-    ("groups", "files", "quotas"),
-    [
-        ("0::/\n", {"cpu.max": "150000 100000\n"}, [1.5]),
-        ("0::/\n", {"cpu.max": "max 100000\n"}, []),
-        ("0::/slurm/job/step\n", {"slurm/job/cpu.max": "400000 100000\n", "cpu.max": "max 100000"}, [4.0]),
-        ("1:name=systemd:/\n0::/\n", {"unified/cpu.max": "200000 100000\n"}, [2.0]),
-        (
-            "4:cpu,cpuacct:/docker/1234\n0::/\n",  # the group is mounted as the root in a container
-            {"cpu,cpuacct/cpu.cfs_quota_us": "100000\n", "cpu,cpuacct/cpu.cfs_period_us": "50000\n"},
-            [2.0],
-        ),
-        ("1:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, []),
-        ("3:memory:/a\n", {"memory/a/cpu.max": "100000 100000"}, []),
-        ("damaged\n", {"cpu.max": "100000 100000"}, []),
-    ],
+    ("quota", "count"), [("max", 64), ("100000", 1), ("150000", 2), ("x", 64), (None, 64)]
 )
-def test_quotas_of_containers_are_read(
-    tmp_path: Path, groups: str, files: dict[str, str], quotas: list[float]
+def test_the_quota_of_a_container_bounds_the_number_of_cpus(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quota: str | None, count: int
 ) -> None:
-    (tmp_path / "own").write_text(groups)
-    for name, content in files.items():
-        (tmp_path / "cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "cgroup" / name).write_text(content)
-    assert list(multiprocess._cpu_quotas(tmp_path / "cgroup", tmp_path / "own")) == quotas
-
-
-def test_a_quota_bounds_the_number_of_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    if quota is not None:
+        (tmp_path / "cpu.max").write_text(f"{quota} 100000\n")
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(64))
-    for quotas, count in (([], 64), ([1.0], 1), ([0.2], 1), ([8.0, 1.5], 2), ([128.0], 64)):
-        monkeypatch.setattr(multiprocess, "_cpu_quotas", lambda mounted, own, found=quotas: iter(found))
-        assert multiprocess.num_cpus() == count
+    monkeypatch.setattr(multiprocess, "_CPU_QUOTA", tmp_path / "cpu.max")
+    assert multiprocess.num_cpus() == count

@@ -1,6 +1,5 @@
 """Imports on first use, packages that are not always installed, and too little memory for them."""
 
-import mmap
 import re
 import sys
 from collections.abc import Callable, Mapping
@@ -57,36 +56,6 @@ def lacks_memory(error: BaseException) -> bool:
             return True
         known = known.__cause__ or (None if known.__suppress_context__ else known.__context__)
     return False
-
-
-def address_space_remedy() -> str:
-    """Return what to do about the limit of this process's address space; empty if there is none."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return ""
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return "" if limit == resource.RLIM_INFINITY else f"raise `ulimit -v`, which is {limit // 1024} kB"
-
-
-def require_address_space(size_mb: int) -> None:
-    """Check that this process may still map that much memory; none of it is used.
-
-    Under `ulimit -v` libraries end the process when they cannot map memory (Arrow, LLVM), or try it again for
-    ever (OpenBLAS while it is loaded), so it has to be known before.
-
-    Args:
-        size_mb: Size in 2**20 bytes.
-
-    Raises:
-        MemoryError: The system allows less.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    try:  # what cannot be accessed does not count as memory in use
-        mmap.mmap(-1, size_mb * 2**20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
-    except OSError as error:
-        raise MemoryError(f"less than {size_mb} MB can be mapped") from error
 
 
 def import_extra(module: str, message: str) -> ModuleType:

@@ -29,6 +29,7 @@ from openvima.imports import import_extra
 POLL_S = 0.2
 PARENT_END_S = 5.0  # grace period for the parent to exit
 MAX_WORKERS = 1024
+_CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 WORKER_VARIABLES = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
     # By default glibc returns the memory of freed arrays to the system, which clears that of the next ones
@@ -139,42 +140,11 @@ def imap_with_progress(
 
 def num_cpus() -> int:
     """Return how many CPUs this process may use; the quota of a container counts."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(
-        1, min([count, *map(math.ceil, _cpu_quotas(Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")))])
-    )
-
-
-def _cpu_quotas(mounted: Path, own: Path) -> Iterator[float]:
-    """Yield the CPUs that the control groups of this process may use, where they are limited.
-
-    Args:
-        mounted: Where the groups are mounted; in a container that of the process may be this one itself.
-        own: The file that names the groups of this process, as HIERARCHY:CONTROLLERS:PATH.
-    """
+    count = len(os.sched_getaffinity(0))
     with contextlib.suppress(OSError, ValueError):
-        for line in own.read_text(encoding="utf-8").splitlines():
-            _, controllers, path = line.split(":", 2)
-            if controllers and "cpu" not in controllers.split(","):
-                continue
-            for root in (mounted / controllers, mounted / ("cpu" if controllers else "unified")):
-                group = root / path.strip("/")
-                for folder in (group, *group.parents):
-                    if folder.is_relative_to(root):
-                        yield from _quota_of(folder)
-
-
-def _quota_of(group: Path) -> Iterator[float]:
-    """Yield the CPUs of one control group, of version 2 or 1, if they are limited."""
-    with contextlib.suppress(OSError, ValueError):
-        quota, period = (group / "cpu.max").read_text(encoding="utf-8").split()
-        yield int(quota) / int(period)  # "max" is no number
-    with contextlib.suppress(OSError, ValueError):
-        quota, period = (
-            int((group / f"cpu.cfs_{name}_us").read_text("utf-8")) for name in ("quota", "period")
-        )
-        if quota > 0:
-            yield quota / period
+        quota, period = _CPU_QUOTA.read_text(encoding="utf-8").split()
+        count = min(count, math.ceil(int(quota) / int(period)))  # "max" is no number
+    return count
 
 
 def check_workers(num_workers: int) -> None:

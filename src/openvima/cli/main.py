@@ -21,7 +21,7 @@ from openvima.errors import (
     one_word_warning,
     unknown_name,
 )
-from openvima.imports import address_space_remedy, lacks_memory, require_address_space
+from openvima.imports import lacks_memory
 from openvima.input_files import expand_home
 
 # Verb → summary. Each verb is a module of this package.
@@ -61,11 +61,6 @@ _INTERRUPTED = {
     "studio": "the studio is closed; goodbye.",
 }
 _SCORING = ("evaluate", "study", "quickstart")  # verbs that play many episodes
-# Least address space of the verbs that simulate or train, in 2**20 bytes.
-_LEAST_MB = dict.fromkeys(
-    ("demo", "generate", "train", "detector", "evaluate", "study", "quickstart", "studio"), 1000
-)
-
 OVERVIEW = """openvima {version}: robot manipulation from multimodal prompts
 
 Usage: openvima VERB [OPTIONS]      openvima VERB --help explains one verb
@@ -105,8 +100,6 @@ def _run(verb: str, rest: list[str]) -> int:
     import tyro
 
     try:
-        if verb in _LEAST_MB and not set(_HELP) & set(rest):
-            require_address_space(_LEAST_MB[verb])
         rest = [expand_home(word) for word in rest]
         module = importlib.import_module(_module(verb))
         commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
@@ -142,7 +135,7 @@ def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, i
     """Return the line that reports an exception, and the exit status; raise it if it is a bug."""
     name, out = type(error).__name__, _out(rest)
     if lacks_memory(error):
-        remedy = address_space_remedy() or _MEMORY_REMEDIES.get(verb, "close other programs")
+        remedy = _MEMORY_REMEDIES.get(verb, "close other programs")
         return f"out of memory while working on {out}; {remedy}. Complete files were kept.", 1
     if isinstance(error, OpenVimaError):
         from openvima.cli.options import name_options

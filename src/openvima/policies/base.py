@@ -1,7 +1,6 @@
 """The policy interface, the random policy, and where networks compute."""
 
 import hashlib
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,15 +9,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from openvima.errors import PolicyError, PromptError
-from openvima.imports import import_extra, require_address_space
+from openvima.imports import import_extra
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 from openvima.scene.prompt import PLACEHOLDER
 
 if TYPE_CHECKING:
     import torch
 
-# Least that torch and the libraries loaded after it map, in 2**20 bytes; measured with torch 2.13 on the CPU.
-TORCH_MB = 800
 POLICIES_THAT_EXPLAIN = (
     "Those that do: openvima-small, openvima-vima, and networks of the presets nano, nano-bins, small, "
     "vima-* and flamingo-*, unless their head or conditioning was exchanged."
@@ -100,8 +97,6 @@ def require_torch(what: str) -> None:
         MissingExtraError: One is not installed; the message names the extra.
         MemoryError: They do not fit into memory.
     """
-    if "torch" not in sys.modules:
-        require_address_space(TORCH_MB)
     for module in ("torch", "safetensors"):
         import_extra(module, f"{what} needs {module}; install it with: pip install 'openvima[train]'")
 

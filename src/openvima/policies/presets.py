@@ -18,7 +18,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from openvima.errors import ConfigError, UnknownPolicyError, brief_repr, unknown_name
+from openvima.errors import ConfigError, UnknownPolicyError, echo, unknown_name
 from openvima.user_code import load_entry_point, load_file
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def register_policy(name: str) -> Callable[[_Make], _Make]:
     """
     if not isinstance(name, str) or not _NAME.fullmatch(name) or name in PRESETS:
         raise ConfigError(
-            f"a policy is named {brief_repr(name)}; give up to 100 letters, digits, underscores and hyphens, "
+            f"a policy is named {echo(repr(name))}; give up to 100 letters, digits, underscores and hyphens, "
             "and not the name of a preset."
         )
 
