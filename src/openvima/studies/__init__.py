@@ -17,8 +17,8 @@ from openvima.studies.study import (
 )
 
 if TYPE_CHECKING:
+    from openvima.studies.library import STUDIES, check_options, make_study
     from openvima.studies.runner import Execution, run_study
-    from openvima.studies.study import STUDIES, check_options, make_study
 
 __all__ = [
     "SCALES",
@@ -43,8 +43,8 @@ __getattr__, __dir__ = lazy_names(
     {
         "Execution": "runner",
         "run_study": "runner",
-        "STUDIES": "study",
-        "check_options": "study",
-        "make_study": "study",
+        "STUDIES": "library",
+        "check_options": "library",
+        "make_study": "library",
     },
 )
