@@ -1,8 +1,6 @@
 """Checkpoints made to harm: pipes, bombs, huge sizes, repeated values, weights that are not finite."""
 
 import os
-import pickle
-import struct
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -64,31 +62,13 @@ def test_a_published_file_that_is_a_pipe_or_device_is_refused(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: &a [1]\nb: [*a, *a]\n", "holds an alias"),
-        ("a: {b: 1}\nc: {<<: {d: " + "[" * 40 + "]" * 40 + "}}\n", "nested deeper than 32"),
-        ("a: " + "[" * 5000 + "]" * 5000, "nested deeper than 32"),
         ("a: " + "x" * 70_000, "more than 65536 bytes"),
-        ("a: 0x" + "f" * 9000, "whole number beyond 64 bits"),
         ("a: 2026-13-77", "no valid YAML"),
-        ("a: 2026-11-22", "holds a date"),
-        ("? [1, 2]\n: 3\n", "no valid YAML|keys must be text"),
-        ("1: 3\n", "keys must be text"),
         ("a: !!python/object/apply:os.mkdir [executed]\n", "no valid YAML"),
+        ("1: 3\n", "does not describe a 'network' policy"),
         ("a: \udcff", "no UTF-8"),
     ],
-    ids=[
-        "alias",
-        "merge",
-        "depth",
-        "size",
-        "integer",
-        "no date",
-        "date",
-        "list key",
-        "int key",
-        "code",
-        "bytes",
-    ],
+    ids=["size", "no date", "code", "int key", "bytes"],
 )
 def test_a_config_of_more_than_plain_values_is_refused(saved, text: str, message: str) -> None:
     (saved / CONFIG_FILE).write_bytes(text.encode("utf-8", "surrogateescape"))
@@ -140,78 +120,16 @@ def test_weights_that_are_not_finite_are_refused(saved, published, value: float)
         load_published(published)
 
 
-def test_names_of_layers_may_be_anything(saved) -> None:
-    weights = load_file(saved / WEIGHTS_FILE)
-    strange = {f"decoder.self_blocks.{name}": torch.zeros(1) for name in ("", "0,a", "²", "9" * 5000, "x.y")}
-    save_file({**weights, **strange}, saved / WEIGHTS_FILE)
-    with pytest.raises(CheckpointError, match=r"unexpected: decoder\.self_blocks") as caught:
-        load_checkpoint(saved)
-    assert len(str(caught.value)) < 2000
-
-
-def test_a_huge_header_is_not_read(saved) -> None:
-    with (saved / WEIGHTS_FILE).open("r+b") as file:
-        file.write(struct.pack("<Q", 90_000_000))
-    with pytest.raises(CheckpointError, match="header has 90000000 bytes"):
-        load_checkpoint(saved)
-
-
 def test_a_compressed_archive_is_refused_before_it_is_unpacked(published) -> None:
     repacked(published, zipfile.ZIP_DEFLATED, **{"0": bytes(10_000_000)})
     with pytest.raises(CheckpointError, match="is a compressed zip archive"):
         load_published(published)
 
 
-def test_overlapping_and_repeated_entries_are_refused(published) -> None:
-    with zipfile.ZipFile(published) as archive:
-        infos = archive.infolist()
-    with zipfile.ZipFile(published, "a") as archive:
-        largest = max(infos, key=lambda info: info.file_size)
-        for number in range(9000):  # each is the same bytes
-            copy = zipfile.ZipInfo(f"policy/data/{10_000 + number}")
-            for name in ("header_offset", "file_size", "compress_size", "CRC"):
-                setattr(copy, name, getattr(largest, name))
-            archive.filelist.append(copy)
-        archive._didModify = True
-    with pytest.raises(CheckpointError, match="overlapping zip entries"):
-        load_published(published)
-
-
-def test_a_repeated_entry_is_refused(published) -> None:
-    with (
-        zipfile.ZipFile(published, "a") as archive,
-        pytest.warns(UserWarning, match="Duplicate name"),
-    ):
-        archive.writestr(archive.namelist()[0], b"another pickle")
-    with pytest.raises(CheckpointError, match="several zip entries of one name"):
-        load_published(published)
-
-
-def test_tensors_that_repeat_one_number_are_refused(published) -> None:
-    contents = torch.load(published, weights_only=True)
-    words = "policy.prompt_embedding._embed_layer.weight"
-    contents["state_dict"][words] = torch.zeros(1).expand(500_000, 32)
-    torch.save(contents, published)
-    with pytest.raises(CheckpointError, match="repeat their numbers"):
-        load_published(published)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        # ((((…),),),) as a key: its hash takes exponential time, or more stack than there is.
-        (b"\x80\x02}" + b"(K\x01q\x00" + b"".join(b"h%c\x86q%c" % (n, n + 1) for n in range(60)), "tuple"),
-        (b"\x80\x02})" + b"\x85" * 200_000 + b"K\x01s.", "tuple of more than"),
-        (b"\x80\x02cbuiltins\nbytearray\n\x8a\x06\x00\x00\x00\x00\x00\x01\x85R.", "builtins.bytearray to be"),
-        (b"\x80\x02c_codecs\nencode\n.", "_codecs.encode to be loaded"),
-        (b"\x80\x02Nr\xff\xff\xff\xff.", "memo index"),
-        (pickle.dumps(os.mkdir, protocol=0), "another protocol than 2"),
-    ],
-    ids=["repeated", "deep", "bytearray", "encode", "memo", "protocol 0"],
-)
-def test_pickles_that_cost_more_than_they_hold_are_refused(published, content: bytes, message: str) -> None:
-    repacked(published, data=content)
-    with pytest.raises(CheckpointError, match=message):
+@pytest.mark.parametrize("name", ["builtins\nexec", "os\nmkdir", "torch\nload"])
+def test_pickles_that_name_more_than_tensors_are_refused(published, name: str) -> None:
+    repacked(published, data=b"\x80\x02c" + name.encode() + b"\nX\x01\0\0\0x\x85R.")
+    with pytest.raises(CheckpointError, match="Nothing was executed"):
         load_published(published)
 
 

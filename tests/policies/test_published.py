@@ -306,7 +306,7 @@ class Touch:
 def test_code_in_a_file_is_refused_and_not_executed(vima_contents, tmp_path, entry) -> None:
     trace = tmp_path / "executed"
     file = saved({**vima_contents, entry: Touch(trace)}, tmp_path)
-    with pytest.raises(CheckpointError, match=r"wants posix\.mkdir to be loaded.*Nothing was executed"):
+    with pytest.raises(CheckpointError, match="Nothing was executed"):
         load_published(file)
     assert not trace.exists()
     torch.load(file, weights_only=False)  # the file would have done it
@@ -334,7 +334,7 @@ def test_an_empty_file_and_another_archive_are_refused(tmp_path) -> None:
         load_published(file)
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("weights.npy", b"numbers")
-    with pytest.raises(CheckpointError, match="is a zip archive, but no torch checkpoint"):
+    with pytest.raises(CheckpointError, match="is damaged"):
         load_published(file)
 
 

@@ -23,15 +23,15 @@ from openvima.detector.config import DetectorConfig, resnet50
 from openvima.detector.layers import BOX_WEIGHTS, PROPOSAL_WEIGHTS
 from openvima.detector.network import MaskRCNN
 from openvima.errors import CheckpointError, ConfigError, InputFileError
-from openvima.input_files import read_yaml
 from openvima.policies.config_fields import check_limits
 from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
 from openvima.policies.nn.layers import MetaInit
 from openvima.policies.tensor_files import (
     check_finite,
-    described,
-    listed,
+    check_replaceable,
+    mismatches,
     read_archive,
+    read_description,
     read_safetensors,
     write_safetensors,
 )
@@ -48,13 +48,7 @@ def save_network(network: MaskRCNN, folder: str | Path) -> None:
         CheckpointError: The folder contains other files.
     """
     folder = Path(folder)
-    if folder.exists():
-        found = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
-        if others := sorted(found - {WEIGHTS_FILE, CONFIG_FILE}):
-            raise CheckpointError(
-                f"{folder} contains other files than a checkpoint ({', '.join(others[:_MAX_LISTED])}), which "
-                "would be deleted; give another folder."
-            )
+    check_replaceable(folder, (WEIGHTS_FILE, CONFIG_FILE))
     with atomic_folder(folder) as partial:
         write_network(network, partial)
 
@@ -100,15 +94,7 @@ def read_config(folder: Path) -> DetectorConfig:
     Raises:
         CheckpointError: There is no config, or it is invalid.
     """
-    file = folder / CONFIG_FILE
-    try:
-        values = read_yaml(file)
-    except OSError as error:
-        raise CheckpointError(f"{folder} is no checkpoint: it contains no {CONFIG_FILE}.") from error
-    except InputFileError as error:
-        raise CheckpointError(str(error)) from error
-    if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
-        raise CheckpointError(f"{file} does not describe a {_KIND}; `openvima policies` is for policies.")
+    file, values = folder / CONFIG_FILE, read_description(folder, _KIND)
     try:
         return DetectorConfig.from_dict(values["config"])
     except ConfigError as error:
@@ -147,17 +133,8 @@ def build_network(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *
 
 def _check(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, source: Path) -> None:
     expected = {name: own for name, own in network.state_dict().items() if not name.endswith(_COUNTER)}
-    wrong = [
-        f"{name} is {described(tensors[name].dtype, tensors[name].shape)} instead of "
-        f"{described(own.dtype, own.shape)}"
-        for name, own in expected.items()
-        if name in tensors and tensors[name].shape != own.shape
-    ]
-    problems = [
-        *listed("missing", [name for name in expected if name not in tensors], limit=_MAX_LISTED),
-        *listed("unexpected", [name for name in tensors if name not in expected], limit=_MAX_LISTED),
-        *listed("wrong", wrong, limit=_MAX_LISTED),
-    ]
+    given = {name: tensor for name, tensor in tensors.items() if not name.endswith(_COUNTER)}
+    problems = mismatches(given, expected, limit=_MAX_LISTED)
     if problems:
         raise CheckpointError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
 

@@ -5,7 +5,6 @@ config.yaml          config of the network, precision of the weights
 tokenizer/           the vocabulary, or the files of the T5 tokenizer
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,18 +15,26 @@ import yaml
 
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
-from openvima.errors import CheckpointError, ConfigError, InputFileError
-from openvima.input_files import as_path, read_yaml
+from openvima.errors import CheckpointError, ConfigError
+from openvima.input_files import as_path
 from openvima.policies.build import PolicyConfig, config_from_dict, config_to_dict, outline_network
 from openvima.policies.naming import CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE, find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published import load_published
 from openvima.policies.t5 import T5Tokenizer, tokenizer_for
-from openvima.policies.tensor_files import described, file_digest, listed, read_safetensors, write_safetensors
+from openvima.policies.tensor_files import (
+    check_replaceable,
+    described,
+    file_digest,
+    listed,
+    mismatches,
+    read_description,
+    read_safetensors,
+    write_safetensors,
+)
 from openvima.policies.tokenizer import Tokenizer, WordTokenizer
 
 _KIND = "network"
-_LAYER = re.compile(r"decoder\.self_blocks\.([0-9]{1,4})\.")
 _MAX_LISTED = 5  # names that a message lists per kind of problem
 _PRECISIONS = {
     "float32": torch.float32,
@@ -76,7 +83,7 @@ def save_checkpoint(
             it.
     """
     folder = as_path(folder)
-    _check_replaceable(folder)
+    check_replaceable(folder, (WEIGHTS_FILE, CONFIG_FILE, TOKENIZER_FOLDER))
     with atomic_folder(folder) as partial:
         write_checkpoint(network, partial, tokenizer, dtype=dtype)
 
@@ -133,7 +140,7 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     info = read_info(folder)
     network = _outline(folder, info.config)
     tensors = _read_weights(folder / WEIGHTS_FILE)
-    _check(network, tensors, info.dtype, source=str(folder / WEIGHTS_FILE))
+    _check(network, tensors, source=str(folder / WEIGHTS_FILE))
     if info.digest and info.digest != file_digest(folder / WEIGHTS_FILE):
         raise CheckpointError(
             f"{folder / WEIGHTS_FILE} is damaged: its digest is not the one in {CONFIG_FILE}. Take another "
@@ -150,15 +157,7 @@ def read_info(folder: Path) -> CheckpointInfo:
     Raises:
         CheckpointError: The config is missing or invalid.
     """
-    file = folder / CONFIG_FILE
-    if not file.exists():
-        raise CheckpointError(f"{folder} is no checkpoint: it holds no {CONFIG_FILE}.")
-    try:
-        values = read_yaml(file)
-    except InputFileError as error:
-        raise CheckpointError(str(error)) from error
-    if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
-        raise CheckpointError(f"{file} does not describe a {_KIND!r} policy.")
+    file, values = folder / CONFIG_FILE, read_description(folder, _KIND)
     precision = values.get("precision", "float32")
     if not isinstance(precision, str) or precision not in _PRECISIONS:
         raise CheckpointError(f"{file}: precision is {short(precision)}; allowed: {', '.join(_PRECISIONS)}.")
@@ -192,25 +191,12 @@ def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, s
     Raises:
         CheckpointError: Names, shapes or dtypes differ; one message lists all differences.
     """
-    _check(model, tensors, None, source=source)
+    _check(model, tensors, source=source)
     model.load_state_dict(tensors)
 
 
-def _check(
-    network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], dtype: torch.dtype | None, *, source: str
-) -> None:
-    """Compare names, shapes and dtypes with those of the network; `dtype` defaults to its own."""
-    expected = network.state_dict()
-    problems = _size_mismatch(tensors, expected)
-    problems += listed("missing", [name for name in expected if name not in tensors], limit=_MAX_LISTED)
-    problems += listed("unexpected", [name for name in tensors if name not in expected], limit=_MAX_LISTED)
-    differing = []
-    for name, wanted in expected.items():
-        want = (dtype or wanted.dtype, tuple(wanted.shape))
-        if name in tensors and (have := (tensors[name].dtype, tuple(tensors[name].shape))) != want:
-            differing.append(f"{name} is {described(*have)} instead of {described(*want)}")
-    problems += listed("wrong", differing, limit=_MAX_LISTED)
-    if problems:
+def _check(network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:
+    if problems := mismatches(tensors, network.state_dict(), limit=_MAX_LISTED):
         raise CheckpointError(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
             "Use the config that was written with the weights."
@@ -230,26 +216,6 @@ def _check_range(stored: Mapping[str, torch.Tensor], weights: Mapping[str, torch
         raise CheckpointError(f"{listed(most, overflown, limit=_MAX_LISTED)[0]}. Store them in float32.")
 
 
-def _size_mismatch(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
-    """Describe how width, layers and vocabulary of two networks differ."""
-    given, wanted = _sizes(tensors), _sizes(expected)
-    differing = [
-        f"{what} {given[what]}, where the config says {wanted[what]}"
-        for what in wanted
-        if what in given and given[what] != wanted[what]
-    ]
-    return [f"it is of another size: {', '.join(differing)}"] if differing else []
-
-
-def _sizes(tensors: Mapping[str, torch.Tensor]) -> dict[str, int]:
-    layers = [int(match[1]) for match in map(_LAYER.match, tensors) if match]
-    sizes = {"layers": 1 + max(layers)} if layers else {}
-    for what, name, axis in (("width", "observation_out.weight", 0), ("words", "prompt.words.weight", 0)):
-        if name in tensors and tensors[name].ndim > axis:
-            sizes[what] = tensors[name].shape[axis]
-    return sizes
-
-
 def _outline(folder: Path, config: PolicyConfig) -> PolicyNetwork:
     """Build the network of a config without weights, to check them before they are read."""
     try:
@@ -264,17 +230,3 @@ def _read_weights(file: Path) -> dict[str, torch.Tensor]:
     if not file.exists():
         raise CheckpointError(f"{file.parent} is no checkpoint: it holds no {WEIGHTS_FILE}.")
     return read_safetensors(file)
-
-
-def _check_replaceable(folder: Path) -> None:
-    """Replacing a folder deletes its contents, which must be a checkpoint and nothing else."""
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise CheckpointError(f"{folder} is a file; give the name of a folder.")
-    others = {path.name for path in folder.iterdir()} - {WEIGHTS_FILE, CONFIG_FILE, TOKENIZER_FOLDER}
-    if others:
-        raise CheckpointError(
-            f"{folder} holds other files than a checkpoint ({', '.join(sorted(others)[:_MAX_LISTED])}), "
-            "which would be lost; give another folder."
-        )

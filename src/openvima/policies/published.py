@@ -23,7 +23,7 @@ from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
 from openvima.policies.sizes import SIZES, TUNED_T5_LAYERS, Size
-from openvima.policies.tensor_files import check_finite, described, listed, read_archive
+from openvima.policies.tensor_files import check_finite, listed, mismatches, read_archive
 
 _MAX_LISTED = 20  # names that a message lists per kind of problem
 _DEFAULTS = SIZES["2m"]  # sizes to use where a weight is missing
@@ -407,17 +407,7 @@ def _check_fit(network: PolicyNetwork, weights: Mapping[str, torch.Tensor]) -> N
     """Compare published names and shapes with what the network expects."""
     expected = to_published(network)
     given = {name: tensor for name, tensor in without_prefix(weights).items() if not is_unused(name)}
-    wrong = [
-        f"{name} is {described(given[name].dtype, given[name].shape)} instead of "
-        f"{described(wanted.dtype, wanted.shape)}"
-        for name, wanted in expected.items()
-        if name in given and (given[name].shape != wanted.shape or not given[name].is_floating_point())
-    ]
-    problems = [
-        *listed("missing", [name for name in expected if name not in given], limit=_MAX_LISTED),
-        *listed("unexpected", [name for name in given if name not in expected], limit=_MAX_LISTED),
-        *listed("wrong", wrong, limit=_MAX_LISTED),
-    ]
+    problems = mismatches(given, expected, limit=_MAX_LISTED)
     if problems:
         raise CheckpointError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
 
