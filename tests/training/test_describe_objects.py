@@ -18,7 +18,7 @@ from openvima.tasks.prompts import describe, description_of, image_descriptions,
 from openvima.training import source as source_module
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.augmentation.prompts import (
-    DescribeObjects,
+    describe_objects,
     rename_objects,
     text_of,
     with_descriptions,
@@ -80,11 +80,12 @@ def test_each_image_is_replaced_with_that_probability_and_the_others_stay(demos)
 
 def test_whole_prompts_become_text_with_a_probability_of_their_own(demos) -> None:
     episode = preprocess(demos["visual_manipulation"], "objects")
-    augment, rng = DescribeObjects(0.25, prompt_prob=0.5), np.random.default_rng(0)
-    shown = [augment(episode, rng).prompt.image_names for _ in range(1000)]
+    rng = np.random.default_rng(0)
+    described = [describe_objects(episode, rng, image_prob=0.25, prompt_prob=0.5) for _ in range(1000)]
+    shown = [each.prompt.image_names for each in described]
     assert 0.48 < np.mean([names == () for names in shown]) < 0.58  # 0.5 + 0.5 · 0.25²
     assert len(set(shown)) == 4  # the others one by one
-    assert DescribeObjects(0.0)(episode, rng) is episode
+    assert describe_objects(episode, rng, image_prob=0.0) is episode
 
 
 def test_synonyms_are_aliases_of_the_catalogue(demos) -> None:

@@ -21,7 +21,7 @@ from openvima.training.augmentation.demonstrations import (
     drop_unused_objects,
 )
 from openvima.training.augmentation.prompts import (
-    UnknownWords,
+    mask_words,
     paraphrase,
     rename_objects,
     shuffle_prompt_objects,
@@ -75,10 +75,10 @@ def test_a_paraphrase_keeps_images_numbers_and_textures(task, episodes):
 
 def test_unknown_words_are_words_and_neither_images_nor_numbers(episodes):
     episode = episodes["rotate"]
-    all_unknown = UnknownWords(1.0)(episode, np.random.default_rng(0)).prompt.text
+    all_unknown = mask_words(episode, np.random.default_rng(0), prob=1.0).prompt.text
     assert re.fullmatch(r"<unknown> <unknown> \{dragged_obj\} \d+ <unknown>\.", all_unknown)
-    assert UnknownWords(0.0)(episode, np.random.default_rng(0)) is episode
-    texts = [UnknownWords(0.3)(episode, np.random.default_rng(k)).prompt.text for k in range(200)]
+    assert mask_words(episode, np.random.default_rng(0), prob=0.0) is episode
+    texts = [mask_words(episode, np.random.default_rng(k), prob=0.3).prompt.text for k in range(200)]
     assert abs(np.mean([text.count("<unknown>") for text in texts]) - 0.9) < 0.2
 
 
@@ -191,7 +191,7 @@ def test_only_unused_objects_are_dropped_from_observations_or_prompt_frames(task
     assert bystanders
     unseen, unpictured = set(), set()
     for seed in range(20):
-        less = drop_unused_objects(motion, 0.5, np.random.default_rng(seed))
+        less = drop_unused_objects(motion, np.random.default_rng(seed), prob=0.5)
         assert less.objects_per_step.sum() == len(less.objects)
         assert less.prompt.objects_per_image.sum() == len(less.prompt.objects)
         assert np.array_equal(less.pick_ids, motion.pick_ids)
@@ -210,7 +210,7 @@ def test_only_unused_objects_are_dropped_from_observations_or_prompt_frames(task
         unseen |= gone[0]
         unpictured |= gone[1]
     assert unseen == unpictured == bystanders
-    same = drop_unused_objects(motion, 0.0, np.random.default_rng(0))
+    same = drop_unused_objects(motion, np.random.default_rng(0), prob=0.0)
     for ours, theirs in ((same.objects, motion.objects), (same.prompt.objects, motion.prompt.objects)):
         assert np.array_equal(rows_of(ours), rows_of(theirs))
 

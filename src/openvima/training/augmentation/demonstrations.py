@@ -5,7 +5,7 @@ Shape suffixes: B batch, T steps, V views, N objects in view (slots of a view).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -19,8 +19,8 @@ from openvima.policies.batch import Batch, HistoryBatch
 from openvima.render.camera import VIEWS
 from openvima.tasks.registry import task_spec
 from openvima.training.augmentation.prompts import (
-    DescribeObjects,
-    UnknownWords,
+    describe_objects,
+    mask_words,
     paraphrase,
     rename_objects,
     shuffle_prompt_objects,
@@ -30,26 +30,18 @@ from openvima.training.augmentation.prompts import (
 from openvima.training.config import AugmentationConfig
 
 
-@dataclass(frozen=True, slots=True)
-class DropUnusedObjects:
-    """Drops unused objects from the observations, and others from the prompt frames.
+def drop_unused_objects(
+    episode: PreprocessedEpisode, rng: np.random.Generator, *, prob: float
+) -> PreprocessedEpisode:
+    """Drop unused objects from the observations, and others from the prompt frames.
 
     Args:
-        prob: Probability of the first for each unused object, and of the second for each that is left; it
-            needs the ids of the segmentation.
+        episode: The demonstration, with the ids of the segmentation.
+        rng: Draws the objects.
+        prob: Probability of the first for each unused object, and of the second for each that is left.
     """
-
-    prob: float
-
-    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
-        """Augment a demonstration."""
-        return drop_unused_objects(episode, self.prob, rng) if self.prob else episode
-
-
-def drop_unused_objects(
-    episode: PreprocessedEpisode, prob: float, rng: np.random.Generator
-) -> PreprocessedEpisode:
-    """Drop unused objects from the observations, and others from the prompt frames."""
+    if not prob:
+        return episode
     ids = np.setdiff1d(episode.objects.ids, [episode.pick_ids, episode.place_ids])
     is_unobserved, is_unprompted = rng.random((2, len(ids))) < prob
     prompt = episode.prompt
@@ -183,14 +175,19 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
     shuffle = Randomly(config.shuffle_prompt_objects_prob, shuffle_prompt_objects)
     return DemonstrationAugmentation(
         config.inverse_dynamics_prob,
-        of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob), shuffle),
+        of_inverse_dynamics=(partial(drop_unused_objects, prob=config.drop_unused_objects_prob), shuffle),
         of_tasks=(
             Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
             Randomly(config.rename_objects_prob, rename_objects),
             Randomly(config.shuffle_sentences_prob, shuffle_sentences),
             # after those that look for images
-            DescribeObjects(config.text_description_prob, config.synonym_prob, config.text_prompt_prob),
-            UnknownWords(config.unknown_word_prob),
+            partial(
+                describe_objects,
+                image_prob=config.text_description_prob,
+                synonym_prob=config.synonym_prob,
+                prompt_prob=config.text_prompt_prob,
+            ),
+            partial(mask_words, prob=config.unknown_word_prob),
             shuffle,
         ),
     )

@@ -9,7 +9,7 @@ place of object images: MIDAS (Li et al. 2023).
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -156,30 +156,31 @@ def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> Prepro
 _FORMS = "all {x}. {x}. is a zup {x}"  # plural, articles and colon, which descriptions bring with them
 
 
-@dataclass(frozen=True, slots=True)
-class DescribeObjects:
-    """Replaces object images of task prompts by texture and name of the object.
+def describe_objects(
+    episode: PreprocessedEpisode,
+    rng: np.random.Generator,
+    *,
+    image_prob: float,
+    synonym_prob: float = 0.0,
+    prompt_prob: float = 0.0,
+) -> PreprocessedEpisode:
+    """Replace object images of a task prompt by texture and name of the object.
 
     "Put the {a} into the {b}."    "Put the red swirl letter A into the {b}."
 
     Args:
+        episode: The demonstration.
+        rng: Draws the images.
         image_prob: Probability for each image.
         synonym_prob: Probability that a description names the object by an alias of the catalogue.
         prompt_prob: Probability for each demonstration that all its images are replaced.
     """
-
-    image_prob: float
-    synonym_prob: float = 0.0
-    prompt_prob: float = 0.0
-
-    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
-        """Augment a demonstration."""
-        if not (self.image_prob or self.prompt_prob):
-            return episode
-        prob = 1.0 if self.prompt_prob and rng.random() < self.prompt_prob else self.image_prob
-        if self.synonym_prob:
-            episode = with_synonyms(episode, self.synonym_prob, rng)
-        return with_descriptions(episode, prob, rng)
+    if not (image_prob or prompt_prob):
+        return episode
+    prob = 1.0 if prompt_prob and rng.random() < prompt_prob else image_prob
+    if synonym_prob:
+        episode = with_synonyms(episode, synonym_prob, rng)
+    return with_descriptions(episode, prob, rng)
 
 
 def with_descriptions(
@@ -223,27 +224,23 @@ def text_of(description: str) -> str:
 _SLOT_OR_WORD = re.compile(rf"\{{\w+\}}|{UNKNOWN}|[^\W\d_]+(?:-[^\W\d_]+)*")
 
 
-@dataclass(frozen=True, slots=True)
-class UnknownWords:
-    """Replaces words of prompts by the unknown token; images, numbers and punctuation stay.
+def mask_words(episode: PreprocessedEpisode, rng: np.random.Generator, *, prob: float) -> PreprocessedEpisode:
+    """Replace words of a prompt by the unknown token; images, numbers and punctuation stay.
 
     Args:
+        episode: The demonstration.
+        rng: Draws the words.
         prob: Probability for each word.
     """
+    if not prob:
+        return episode
 
-    prob: float
+    def mask(found: re.Match[str]) -> str:
+        is_word = found[0][0] != "{"
+        return UNKNOWN if is_word and rng.random() < prob else found[0]
 
-    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
-        """Augment a demonstration."""
-        if not self.prob:
-            return episode
-
-        def mask(found: re.Match[str]) -> str:
-            is_word = found[0][0] != "{"
-            return UNKNOWN if is_word and rng.random() < self.prob else found[0]
-
-        text = _SLOT_OR_WORD.sub(mask, episode.prompt.text)
-        return replace(episode, prompt=replace(episode.prompt, text=text))
+    text = _SLOT_OR_WORD.sub(mask, episode.prompt.text)
+    return replace(episode, prompt=replace(episode.prompt, text=text))
 
 
 def shuffle_prompt_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
