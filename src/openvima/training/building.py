@@ -35,7 +35,7 @@ from openvima.training.pretraining.stage import caption_texts
 from openvima.training.validation import flatten
 from openvima.user_code import with_absolute_path
 
-_FOR_OBJECTS = ("drop_unused_objects_prob", "rename_objects_prob", "distractor_prob")
+_FOR_OBJECTS = ("centre_picks", "drop_unused_objects_prob", "rename_objects_prob", "distractor_prob")
 
 
 def resolve(config: TrainingConfig) -> TrainingConfig:
@@ -89,7 +89,7 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
     for name in _FOR_OBJECTS:
         if getattr(augmentation, name) and sizes.inputs.tokens == "frames":
             raise ConfigError(
-                f"augmentation.{name} is {getattr(augmentation, name):g}, but preset {config.preset!r} takes "
+                f"augmentation.{name} is {getattr(augmentation, name)}, but preset {config.preset!r} takes "
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
     if (weight := config.optimizer.pointing_loss_weight) and not _has_object_tokens(sizes):

@@ -218,6 +218,9 @@ class AugmentationConfig:
     """Augmentation of demonstrations, drawn anew for each demonstration and batch.
 
     Args:
+        centre_picks: Move each demonstrated pick, a random point of its object, to the object's most interior
+            pixel, and the place with it; in validation, too. Pointer models read the pick from the object
+            and have no use for it.
         false_positive_prob: Probability that a view of a step contains a false detection.
         inverse_dynamics_prob: Probability of replacing the prompt by "Follow this motion: frame … frame":
             1 for inverse-dynamics pretraining, less for in-context demonstrations. Validation uses the
@@ -243,6 +246,7 @@ class AugmentationConfig:
             its own; else an object has the same position in all frames.
     """
 
+    centre_picks: bool = False
     false_positive_prob: Probability = 0.05
     inverse_dynamics_prob: Probability = 0.0
     drop_unused_objects_prob: Probability = 0.0

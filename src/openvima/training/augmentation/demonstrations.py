@@ -14,9 +14,11 @@ import torch
 from openvima.data.preprocessed import PreprocessedEpisode
 from openvima.errors import UnknownTaskError
 from openvima.perception.boxes import box_iou
+from openvima.perception.objects import TOP
 from openvima.perception.preprocessing import ObjectTable
 from openvima.policies.batch import Batch, HistoryBatch
-from openvima.render.camera import VIEWS
+from openvima.policies.nn.actions import ACTION_PARTS, yaw_between
+from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.tasks.registry import task_spec
 from openvima.training.augmentation.prompts import (
     describe_objects,
@@ -28,6 +30,8 @@ from openvima.training.augmentation.prompts import (
     with_motion_prompt,
 )
 from openvima.training.config import AugmentationConfig
+
+PICK, PLACE = ACTION_PARTS["pose0_position"], ACTION_PARTS["pose1_position"]
 
 
 def drop_unused_objects(
@@ -108,6 +112,27 @@ def _boxes_by_view(objects: ObjectTable) -> tuple[np.ndarray, np.ndarray]:
     return objects.boxes.swapaxes(0, 1), objects.masks.T
 
 
+def centre_picks(episode: PreprocessedEpisode) -> PreprocessedEpisode:
+    """Move picks to the most interior visible pixel of their object, and places so that it ends as before.
+
+    Demonstrated picks are random points of an object. Bins cannot predict which one, so they learn the choice
+    of the object through noise of two nats a coordinate. Sweeps stay as they are.
+    """
+    if episode.end_effector:
+        return episode
+    step = np.repeat(np.arange(episode.num_steps), episode.objects_per_step)
+    is_picked = (episode.objects.ids == episode.pick_ids[step]) & episode.objects.masks[:, TOP]
+    step = step[is_picked]
+    points = unproject(episode.objects.grasps[is_picked, TOP], CAMERAS["top"])
+    actions = episode.actions.copy()
+    shift = points - actions[step, PICK]
+    turn = np.exp(1j * yaw_between(torch.from_numpy(actions[step])).numpy())  # the object turns on its way
+    turned = turn * (shift[:, 0] + 1j * shift[:, 1])
+    actions[step, PICK] = points
+    actions[step, PLACE] += np.stack([turned.real, turned.imag], axis=-1)
+    return replace(episode, actions=actions)
+
+
 Transform: TypeAlias = Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
 
 
@@ -134,11 +159,13 @@ class DemonstrationAugmentation:
 
     Args:
         inverse_dynamics_prob: Probability of the inverse-dynamics prompt.
+        centres_picks: Whether picks are moved, see `centre_picks`.
         of_inverse_dynamics: Transforms of demonstrations with that prompt.
         of_tasks: Transforms of those with the prompt of their task, after distractors were inserted.
     """
 
     inverse_dynamics_prob: float = 0.0
+    centres_picks: bool = False
     of_inverse_dynamics: tuple[Transform, ...] = ()
     of_tasks: tuple[Transform, ...] = ()
 
@@ -155,6 +182,8 @@ class DemonstrationAugmentation:
             rng: Source of all draws.
             other: A demonstration from which distractors are inserted; None inserts none.
         """
+        if self.centres_picks:
+            episode = centre_picks(episode)
         prob = self.inverse_dynamics_prob
         is_inverse = prob == 1 or (rng is not None and prob > 0 and rng.random() < prob)
         if is_inverse:
@@ -175,6 +204,7 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
     shuffle = Randomly(config.shuffle_prompt_objects_prob, shuffle_prompt_objects)
     return DemonstrationAugmentation(
         config.inverse_dynamics_prob,
+        config.centre_picks,
         of_inverse_dynamics=(partial(drop_unused_objects, prob=config.drop_unused_objects_prob), shuffle),
         of_tasks=(
             Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
