@@ -177,14 +177,9 @@ class ChatFormat:
         parts: list[Part] = [f"You control a robot arm with a {shown} above a table. The task:"]
         parts += [part if isinstance(part, str) else self._picture(part) for part in prompt.sequence()]
         parts += self._scene(observation, extractor)
-        scale, _, order = self.points.partition("-")
-        width, height = self.size
-        where = "picture" if len(self.views) == 1 else "first of these pictures"
         parts += [
             _SUCTION if tool == "suction" else _SPATULA,
-            f"A POINT is {_ORDERS[order]} in the {where}, x to the right and y down, in "
-            f"{_RANGES[scale].format(width=width, height=height)}. A task may take several steps; "
-            "answer with the next one.",
+            f"{point_meaning(self)} A task may take several steps; answer with the next one.",
         ]
         return Turn("user", _joined(parts))
 
@@ -238,10 +233,10 @@ class ChatFormat:
             "additionalProperties": False,
         }
 
-    def point(self, position: Sequence[float] | np.ndarray, *, height_m: float = 0.0) -> list[float]:
-        """Write a position in metres as a point of the picture."""
+    def point(self, position: Sequence[float]) -> list[float]:
+        """Write a position on the table, in metres, as a point of the picture."""
         camera = CAMERAS[self.views[0]]
-        pixel = project(np.array([*position[:2], height_m]), camera)
+        pixel = project(np.array([*position[:2], 0.0]), camera)
         return self._ordered((pixel + 0.5) / (camera.width, camera.height))
 
     def _ordered(self, fractions: np.ndarray) -> list[float]:
@@ -304,6 +299,15 @@ class ChatFormat:
             cut = cut_to_object(np.ascontiguousarray(channels_last(rgb)), image.segm[self.views[0]])
             return encode_picture(np.moveaxis(cut, -1, 0), self.enlarge)
         return encode_picture(rgb, self.enlarge)
+
+
+def point_meaning(form: ChatFormat) -> str:
+    """Say in a sentence how points are written."""
+    scale, _, order = form.points.partition("-")
+    width, height = form.size
+    where = "picture" if len(form.views) == 1 else "first of these pictures"
+    numbers = _RANGES[scale].format(width=width, height=height)
+    return f"A POINT is {_ORDERS[order]} in the {where}, x to the right and y down, in {numbers}."
 
 
 def demo_turns(

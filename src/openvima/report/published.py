@@ -17,17 +17,19 @@ BESIDE = ("VIMA", "200M")
 RELIABILITY = (
     "Published numbers, not measured here. Reliability A (*): printed by the authors. B (†): quoted by "
     "public re-implementations. C (no mark): read off figures of the VIMA and MIDAS papers, to about 0.2 "
-    "points, those with ~ to about 0.5. Each model was evaluated on 200 episodes per task; that alone gives "
-    "an uncertainty of 1.6 points on the means of L1 to L3 and 3.5 on L4. Simulator, assets and "
+    "points, those with ~ to about 0.5. Each of these models was evaluated on 200 episodes per task; that "
+    "alone gives an uncertainty of 1.6 points on the means of L1 to L3 and 3.5 on L4. D (‡): counted from "
+    "public results of single episodes, 20 per task: LLaRA, LLaVA-1.5 of 7 B weights fine-tuned on 80,000 "
+    "demonstrations, whose text lists boxes and names of the objects from the simulator. Simulator, assets and "
     "demonstrations differ, and some results use detected boxes: differences of a few points are not "
     "meaningful."
 )
 BY_TASK = (
     "Rates by task of VIMA 200M were printed by the authors and are taken from re-implementations that quote "
     "them (A by way of B); those of MIDAS are the authors’ ablations (A), those with ~ rounded to whole "
-    "points (C). Other models have no published rates by task."
+    "points (C). Those of LLaRA are counted (D). Other models have no published rates by task."
 )
-_MARKS = {"A": "*", "B": "†", "C": ""}
+_MARKS = {"A": "*", "B": "†", "C": "", "D": "‡"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +42,7 @@ class PublishedModel:
         data_fraction: Fraction of the demonstrations that it was trained on.
         levels: Success rate at each level (%).
         rough: Levels whose number is read off to half a point only.
-        grade: Reliability of the numbers: "A", "B" or "C", see `RELIABILITY`.
+        grade: Reliability of the numbers: "A", "B", "C" or "D", see `RELIABILITY`.
         aside: Whether it is a variant or another kind of model, outside curves and leading models.
     """
 
@@ -119,7 +121,8 @@ def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | Non
     whole = published_tasks(level)
     if whole and whole.keys() == set(tasks):
         return model.levels.get(level)
-    rates = published_tasks(level, (model.model, model.size)) if model.data_fraction == 1 else {}
+    is_known = model.data_fraction == 1 or model.aside  # rates by task are of one fraction of each model
+    rates = published_tasks(level, (model.model, model.size)) if is_known else {}
     known = tasks and rates.keys() >= set(tasks)
     return sum(rates[task] for task in tasks) / len(tasks) if known else None
 

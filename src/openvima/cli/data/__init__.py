@@ -2,6 +2,7 @@
 
 from openvima.cli.data.reading import info, verify
 from openvima.cli.data.writing import (
+    export_chat,
     export_lerobot,
     import_published,
     merge,
@@ -21,5 +22,6 @@ COMMANDS = {
     "import": import_published,
     "preprocess": preprocess,
     "export-lerobot": export_lerobot,
+    "export-chat": export_chat,
     "push-to-hub": push_to_hub,
 }

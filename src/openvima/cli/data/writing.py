@@ -1,4 +1,4 @@
-"""`openvima data merge`, `sample`, `split`, `import`, `preprocess`, `export-lerobot` and `push-to-hub`."""
+"""`openvima data merge`, `sample`, `split`, `import`, `preprocess`, exports and `push-to-hub`."""
 
 import json
 import sys
@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from openvima.cli.terminal import parse_list, parse_tasks, print_files, progress_bar
+from openvima.data.chat import DEFAULT_ENLARGE, ChatFormat, ChatView, Points
 
 Compression = Literal["lz4", "zstd"]
 
@@ -241,6 +242,67 @@ def export_lerobot(
         export_lerobot(config, report)
     print(f'LeRobotDataset("local/{out.name}", root="{out}") opens it in LeRobot.', file=sys.stderr)
     print(out)
+    return 0
+
+
+def export_chat(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    *,
+    format: Literal["messages", "llava"] = "messages",
+    tasks: str = "all",
+    view: ChatView = "top",
+    points: Points = "1000-xy",
+    enlarge: int = DEFAULT_ENLARGE,
+    boxes: str = "",
+    questions: int = 0,
+    seed: int = 0,
+    force: bool = False,
+) -> int:
+    """Export demonstrations as conversations for the fine-tuning of a vision-language model.
+
+    An example is a step: what `openvima evaluate --policy vlm:MODEL` asks before it, in the same words, and
+    the oracle's answer. docs/vlms.md says how to train on it.
+
+    Example: openvima data export-chat demos chats --format messages --questions 2
+
+    Args:
+        folder: Folder of demonstrations.
+        out: Folder of the export: train.jsonl, and PNG files in images.
+        format: messages: roles and contents, as TRL reads them; llava: conversations with <image>.
+        tasks: Names of tasks with commas between them, or "all".
+        view: Camera that is shown, and in whose picture points lie; top+front shows both.
+        points: Largest number of a point (1000, 1, or pixels) and order.
+        enlarge: Whole factor on images, without smoothing.
+        boxes: List boxes of the objects in the text: segmentation; detector, the bundled one, or
+            MODULE:FUNCTION.
+        questions: Auxiliary questions for each demonstration: where an object is, which there are, how two
+            lie to each other, what was moved.
+        seed: Of the choice of questions.
+        force: Replace the export that is in OUT.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.chat_export import ChatExportConfig
+    from openvima.data.chat_export import export_chat as write_export
+    from openvima.detector.plugins import plugged_extractor
+    from openvima.perception.objects import GROUND_TRUTH
+    from openvima.serving.chat import SEGMENTATION
+
+    config = ChatExportConfig(
+        data=folder,
+        out=out,
+        format=format,
+        tasks=parse_tasks(tasks),
+        form=ChatFormat(points, view, enlarge),
+        questions=questions,
+        seed=seed,
+        force=force,
+    )
+    extractor = GROUND_TRUTH if boxes == SEGMENTATION else plugged_extractor(boxes) if boxes else None
+    with progress_bar("export") as report:
+        print(write_export(config, extractor, report))
     return 0
 
 

@@ -1,0 +1,232 @@
+"""Export of demonstrations as conversations, for the fine-tuning of vision-language models.
+
+An example is a step: what `openvima evaluate --policy vlm:MODEL` asks before it, and the oracle's answer.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
+from openvima.data.chat import (
+    ChatFormat,
+    Part,
+    Turn,
+    demo_turns,
+    encode_picture,
+    point_meaning,
+    wording_hash,
+)
+from openvima.data.reader import Dataset
+from openvima.data.records import Demonstration
+from openvima.errors import ConfigError, DatasetError
+from openvima.input_files import settle
+from openvima.multiprocess import Report
+from openvima.perception.objects import ObjectExtractor
+
+ExportFormat = Literal["messages", "llava"]
+EXAMPLES_NAME, SOURCE_NAME = "train.jsonl", "source.json"
+_IMAGES = "images"
+
+
+@dataclass(frozen=True, slots=True)
+class ChatExportConfig:
+    """What to export, and where to.
+
+    Args:
+        data: Folder of demonstrations.
+        out: Folder of the export.
+        format: "messages": roles and contents, as TRL reads them; "llava": conversations with <image>.
+        tasks: Keep the episodes of these tasks only; None keeps all.
+        form: How views are shown and points are written.
+        questions: Auxiliary questions on the scene for each demonstration.
+        seed: Of the choice of questions.
+        force: Replace the export that is at `out`.
+
+    Raises:
+        ConfigError: A value is not allowed, or `out` holds `data`.
+    """
+
+    data: Path
+    out: Path
+    format: ExportFormat = "messages"
+    tasks: tuple[str, ...] | None = None
+    form: ChatFormat = field(default_factory=ChatFormat)
+    questions: int = 0
+    seed: int = 0
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        settle(self, paths=("data", "out"), names=("tasks",))
+        if self.questions < 0:
+            raise ConfigError(f"questions is {self.questions}; it must be at least 0.")
+        if self.data.resolve().is_relative_to(self.out.resolve()):
+            raise ConfigError(f"{self.out} holds the demonstrations themselves; give another folder.")
+
+
+def export_chat(
+    config: ChatExportConfig, extractor: ObjectExtractor | None = None, report: Report | None = None
+) -> Path:
+    """Write `train.jsonl` and its images; the folder appears whole, or not at all.
+
+    Args:
+        config: What and where to.
+        extractor: Finds the objects whose boxes are listed; None lists none.
+        report: Called as `report(episodes done, episodes in all, task)`.
+
+    Returns:
+        The folder.
+
+    Raises:
+        DatasetError: There are no such demonstrations, or the folder has content and `force` is not set.
+        ShardError: A shard is damaged.
+    """
+    dataset = Dataset(config.data, tasks=config.tasks)
+    out = config.out
+    is_taken = not all(map(is_lock_file, out.iterdir())) if out.is_dir() else out.exists()
+    if is_taken and not config.force:
+        raise DatasetError(f"{out} is there already; give another folder, or --force to replace it.")
+    if is_taken and not (out / EXAMPLES_NAME).is_file():
+        raise DatasetError(f"{out} holds other things than an export, so --force does not replace it.")
+    write = _messages if config.format == "messages" else _llava
+    with folder_lock(out), atomic_folder(out) as folder:
+        (folder / _IMAGES).mkdir()
+        with (folder / EXAMPLES_NAME).open("w", encoding="utf-8") as lines:
+            for number, demo in enumerate(dataset, 1):
+                name = f"{demo.task}-{demo.level}-{demo.domain}-{demo.seed}"
+                turns = demo_turns(demo, config.form, extractor)
+                paths = _save(folder, name, turns)
+                for end in range(2, len(turns) + 1, 2):
+                    lines.write(_line(write(f"{name}-{end // 2}", turns[:end], paths)))
+                rng = np.random.default_rng([config.seed, number])
+                for index, question in enumerate(_questions(demo, config, rng)):
+                    asked = f"{name}-question{index}"
+                    lines.write(_line(write(asked, question, _save(folder, asked, question))))
+                if report:
+                    report(number, len(dataset), demo.task)
+        source = {
+            "command": "openvima data export-chat",
+            "config": {**asdict(config.form), "questions": config.questions, "seed": config.seed},
+            "boxes": extractor is not None,
+            "wording": wording_hash(),
+            "content_hash": dataset.manifest["content_hash"],
+        }
+        (folder / SOURCE_NAME).write_text(json.dumps(source, indent=1) + "\n", encoding="utf-8")
+    return out
+
+
+def _line(example: dict[str, Any]) -> str:
+    return json.dumps(example, ensure_ascii=False) + "\n"
+
+
+def _save(folder: Path, name: str, turns: Sequence[Turn]) -> list[str]:
+    """Save the images of a conversation; return their paths in the folder, in reading order."""
+    paths = []
+    for part in (part for turn in turns for part in turn.parts):
+        if isinstance(part, bytes):
+            paths.append(f"{_IMAGES}/{name}-{len(paths)}.png")
+            (folder / paths[-1]).write_bytes(part)
+    return paths
+
+
+def _messages(name: str, turns: Sequence[Turn], paths: Sequence[str]) -> dict[str, Any]:
+    contents = [{"role": turn.role, "content": [_block(part) for part in turn.parts]} for turn in turns]
+    return {"id": name, "messages": contents, "images": list(paths[: _num_images(turns)])}
+
+
+def _block(part: Part) -> dict[str, str]:
+    return {"type": "text", "text": part} if isinstance(part, str) else {"type": "image"}
+
+
+def _llava(name: str, turns: Sequence[Turn], paths: Sequence[str]) -> dict[str, Any]:
+    speakers = {"user": "human", "assistant": "gpt"}
+    said = [
+        {
+            "from": speakers[turn.role],
+            "value": "\n".join(part if isinstance(part, str) else "<image>" for part in turn.parts),
+        }
+        for turn in turns
+    ]
+    return {"id": name, "image": list(paths[: _num_images(turns)]), "conversations": said}
+
+
+def _num_images(turns: Sequence[Turn]) -> int:
+    return sum(isinstance(part, bytes) for turn in turns for part in turn.parts)
+
+
+def _questions(
+    demo: Demonstration, config: ChatExportConfig, rng: np.random.Generator
+) -> Iterator[tuple[Turn, Turn]]:
+    """Ask on the scene: where an object is, which there are, how two lie to each other, what has changed."""
+    kinds = (_where, _which, _relation, _change) if demo.scenes else ()
+    for _ in range(config.questions if kinds else 0):
+        kind = kinds[rng.integers(len(kinds))]
+        step = int(rng.integers(demo.num_steps))
+        found = kind(demo, step, config.form, rng)
+        if found is not None:
+            parts, answer = found
+            yield Turn("user", parts), Turn("assistant", (answer,))
+
+
+Asked = tuple[tuple[Part, ...], str] | None  # question and answer; None where the scene has no such thing
+
+
+def _where(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
+    points = _points(demo, step, form)
+    if not points:
+        return None
+    name = sorted(points)[rng.integers(len(points))]
+    asked = f'Where is the {name}? Answer with JSON: {{"point": POINT}}. {point_meaning(form)}'
+    return (_view(demo, step, form), asked), json.dumps({"point": points[name]})
+
+
+def _which(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
+    points = _points(demo, step, form)
+    asked = 'Which objects are on the table? Answer with JSON: {"objects": {NAME: POINT}}. '
+    asked += point_meaning(form)
+    return (_view(demo, step, form), asked), json.dumps({"objects": dict(sorted(points.items()))})
+
+
+def _relation(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
+    points = _points(demo, step, ChatFormat("pixels-xy", form.view, form.enlarge))
+    if len(points) < 2:
+        return None
+    one, other = (sorted(points)[index] for index in rng.choice(len(points), 2, replace=False))
+    across, down = np.subtract(points[one], points[other])
+    where = (
+        ("left", "right")[int(across > 0)] if abs(across) > abs(down) else ("above", "below")[int(down > 0)]
+    )
+    asked = f"Where in the picture is the {one}, from the {other}? Answer left, right, above or below."
+    return (_view(demo, step, form), asked), where
+
+
+def _change(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
+    before, after = _points(demo, step, form), _points(demo, step + 1, form)
+    moved = [name for name in sorted(before) if name in after and before[name] != after[name]]
+    asked = (
+        'What was moved between these pictures? Answer with JSON: {"moved": {NAME: [POINT, POINT]}}, from '
+        f"and to. {point_meaning(form)}"
+    )
+    answer = {"moved": {name: [before[name], after[name]] for name in moved}}
+    return (_view(demo, step, form), _view(demo, step + 1, form), asked), json.dumps(answer)
+
+
+def _view(demo: Demonstration, step: int, form: ChatFormat) -> bytes:
+    return encode_picture(demo.rgb[form.views[0]][step], form.enlarge)
+
+
+def _points(demo: Demonstration, step: int, form: ChatFormat) -> dict[str, list[float]]:
+    """Return the points of the objects whose name, texture and object, no other has."""
+    placements = demo.scenes[step].placements
+    names = [f"{placement.texture} {placement.object}" for placement in placements]
+    count = Counter(names)
+    return {
+        name: form.point(placement.pose.position)
+        for name, placement in zip(names, placements, strict=True)
+        if count[name] == 1
+    }
