@@ -109,8 +109,8 @@ def test_all_published_rates_by_task_stand_beside_measured_ones():
     found = cells(table)
     assert table and len(table.columns) == 3 + len(models_by_task())
     assert found["rotate L1"][:3] == ["L1", "50.0", "99.5"]
-    assert found["twist L1"] == ["L1", "–", "18.0", "100.0", "20.5", "–"]
-    assert found["rearrange_then_restore L1"] == ["L1", "–", "56.5", "94.0", "~88.0", "~65.0"]
+    assert found["twist L1"] == ["L1", "–", "18.0", "100.0", "20.5", "–", "25.0", "50.0"]
+    assert found["rearrange_then_restore L1"] == ["L1", "–", "56.5", "94.0", "~88.0", "~65.0", "90.0", "65.0"]
     assert found["manipulate_old_neighbor L3"][2:4] == ["46.0", "47.0"]
     assert "A by way of B" in table.caption
     assert published_task_table(Results((row("mine", "rotate", "train", 1),))) is None
