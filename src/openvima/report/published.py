@@ -20,8 +20,8 @@ RELIABILITY = (
     "points, those with ~ to about 0.5. Each of these models was evaluated on 200 episodes per task; that "
     "alone gives an uncertainty of 1.6 points on the means of L1 to L3 and 3.5 on L4. D (‡): counted from "
     "public results of single episodes, 20 per task: LLaRA, LLaVA-1.5 of 7 B weights fine-tuned on 80,000 "
-    "demonstrations, whose text lists boxes and names of the objects from the simulator. Simulator, assets and "
-    "demonstrations differ, and some results use detected boxes: differences of a few points are not "
+    "demonstrations, whose text lists boxes and names of the objects from the simulator. Simulator, assets "
+    "and demonstrations differ, and some results use detected boxes: differences of a few points are not "
     "meaningful."
 )
 BY_TASK = (
