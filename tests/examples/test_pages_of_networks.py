@@ -1,5 +1,6 @@
 """What the pages of networks say in code and numbers is so, and their figures can be drawn."""
 
+import json
 import re
 import runpy
 import sys
@@ -11,16 +12,16 @@ pytest.importorskip("torch")
 
 import torch
 
-from findings import Findings
+from findings import LEVELS, Findings
 from openvima.cli.detector import COMMANDS
 from openvima.detector.config import detector_config
 from openvima.detector.network import MaskRCNN
 from openvima.policies import preset
 from openvima.policies.build import policy_size
-from openvima.policies.naming import BUNDLED, SMALL
+from openvima.policies.naming import BUNDLED, SMALL, VIMA
 from openvima.policies.pointer.candidates import GridCandidates
 from openvima.training.recipes import RECIPES
-from publish import _FIGURES, weights_tables
+from publish import _FIGURES, OUT, weights_tables
 from tables import tables
 
 ROOT = Path(__file__).parents[2]
@@ -123,6 +124,22 @@ def test_numbers_of_openvima_small_are_between_marks() -> None:
     outside = re.sub(r"<!-- small:(\S+) -->.*?<!-- /small:\1 -->", "", OPENVIMA_SMALL, flags=re.DOTALL)
     assert not re.search(r"\d(\.\d+)? ?(%|points|M\b|million)", outside)
     assert f"{len(GridCandidates(1).points_mm)} grid candidates" in OPENVIMA_SMALL
+
+
+def readme_scores(policy: str) -> list[str]:
+    """Return the four success rates of a policy in the table of README.md."""
+    (row,) = re.findall(rf"^\| `{policy}`.*$", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE)
+    return row.strip(" |").split(" | ")[-4:]
+
+
+def test_the_readme_has_the_scores_of_the_record_and_of_the_guide() -> None:
+    record = json.loads((ROOT / OUT).with_suffix(".json").read_text("utf-8"))
+    means = {each["level"]: each["mean"] for each in record["scores"]["simulator"]["levels"]}
+    assert readme_scores("openvima-small") == [f"{100 * means[level]:.1f}" for level in LEVELS]
+    (row,) = re.findall(
+        r"^\| VIMA, trained here.*$", (DOCS / "train_vima.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert readme_scores("openvima-vima") == re.findall(r"([\d.]+) \(", row)
 
 
 def test_the_figure_of_the_policies_shows_every_crop_and_patch(monkeypatch: pytest.MonkeyPatch) -> None:
