@@ -13,6 +13,8 @@ from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.errors import ConfigError
 from openvima.policies.processor import Processor
+from openvima.render.camera import CAMERAS, project
+from openvima.scene import Action
 from openvima.tasks.novel_words import NOUNS
 from openvima.training import TrainingConfig, train
 from openvima.training.augmentation.demonstrations import (
@@ -247,3 +249,23 @@ def test_each_prompt_image_lists_its_objects_in_an_order_of_its_own(task, episod
         assert any(len(set(order)) > 1 for order in orders)  # not one permutation for all frames
     else:
         assert orders == {((0,),) * len(before)}
+
+
+@pytest.mark.parametrize("task", ["rotate", "twist", "rearrange", "sweep_without_exceeding"])
+def test_centred_picks_are_on_their_objects_and_solve_the_episode_as_well(task) -> None:
+    env = TabletopEnv(task, level="train", domain="user")
+    for seed in range(3):
+        demo = rollout_oracle(env, seed)
+        episode = preprocess(demo, "objects")
+        centred = DemonstrationAugmentation(centres_picks=True)(episode, None)
+        env.reset(seed=seed)
+        for t, action in enumerate(centred.actions):
+            x, y = action[:2]
+            observation = env.observe()
+            column, row = project(np.array([x, y, 0.0]), CAMERAS["top"]).round().astype(int)
+            assert observation["segm"]["top"][row, column] == episode.pick_ids[t]
+            pose0, pose1 = np.split(action.astype(np.float64), 2)
+            arrays = {"pose0_position": pose0[:2], "pose0_rotation": pose0[2:]}
+            arrays |= {"pose1_position": pose1[:2], "pose1_rotation": pose1[2:]}
+            _, _, terminated, _, info = env.step(Action.from_arrays(arrays))
+        assert terminated and info["success"]
