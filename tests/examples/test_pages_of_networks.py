@@ -18,7 +18,7 @@ from openvima.detector.config import detector_config
 from openvima.detector.network import MaskRCNN
 from openvima.policies import preset
 from openvima.policies.build import policy_size
-from openvima.policies.naming import BUNDLED, SMALL, VIMA
+from openvima.policies.naming import BUNDLED, SMALL
 from openvima.policies.pointer.candidates import GridCandidates
 from openvima.training.recipes import RECIPES
 from publish import _FIGURES, OUT, weights_tables
