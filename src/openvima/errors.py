@@ -266,7 +266,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") 
 
 
 class Terminated(KeyboardInterrupt):
-    """A training was ended by SIGTERM, and wrote a checkpoint before it stopped."""
+    """A training was ended by SIGTERM; while it takes steps, it writes a checkpoint before it stops."""
 
 
 MAX_CHARACTERS = 800  # of a representation

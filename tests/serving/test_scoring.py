@@ -13,9 +13,10 @@ from served_policies import Telltale, scripted_server
 torch = pytest.importorskip("torch")
 
 from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import ConfigError, ServerError  # noqa: E402
+from openvima.errors import ConfigError, PolicyError, PolicyRaisedError, PromptError, ServerError  # noqa: E402
 from openvima.evaluation import EvaluationConfig, Results, evaluate  # noqa: E402
 from openvima.evaluation.config import Batch, policy_sources  # noqa: E402
+from openvima.evaluation.results import POLICY_ERROR  # noqa: E402
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
@@ -129,17 +130,38 @@ def test_outcomes_are_kept_for_the_same_server_and_played_again_for_another(tmp_
         assert json.loads(path.read_text())["policies"]["tiny"]["metadata"]["policy"] == {"sha256": "other"}
 
 
-def test_a_policy_that_fails_on_its_server_is_an_error_that_names_the_server(tmp_path: Path) -> None:
+def test_a_policy_that_always_fails_on_its_server_is_an_error_of_one_line(tmp_path: Path) -> None:
     class Bad(Telltale):
         def reset(self, prompts):
             raise RuntimeError("out of memory")
 
     with serve_in_thread(Bad()) as url:
         config = replace(TINY, policies=(f"bad={url}",), out=tmp_path)
-        with pytest.raises(ServerError, match=rf"{url} refuses: the policy failed: RuntimeError: out of"):
+        said = "bad: the policy on the server raised RuntimeError: out of memory, in rotate, L1, seeds 0, 1"
+        with pytest.raises(PolicyRaisedError, match=said):
             evaluate(config)
     with pytest.raises(ServerError, match="no policy server answers"):
         evaluate(config)
+
+
+@pytest.mark.parametrize("error", [KeyError("step"), PolicyError("too many words"), PromptError("no image")])
+def test_an_episode_in_which_a_served_policy_raises_has_failed(error: Exception, tmp_path: Path) -> None:
+    class Bad(RandomPolicy):
+        def act(self, observations):
+            self.calls = getattr(self, "calls", 0) + 1
+            if self.calls in (2, 3):  # the second step of the first two episodes, and that of the first alone
+                raise error
+            return super().act(observations)
+
+        def new_session(self):
+            return self
+
+    with serve_in_thread(Bad()) as url:
+        config = replace(TINY, policies=(f"bad={url}",), tasks=("rotate",), out=tmp_path)
+        path = evaluate(config)
+    (row,) = Results.read(path).rows
+    assert [outcome.kind == POLICY_ERROR for outcome in row.outcomes] == [True, False, False]
+    assert "the policy on the server" in row.outcomes[0].reason and url not in path.read_text()
 
 
 def test_one_connection_serves_all_that_a_process_plays() -> None:

@@ -149,3 +149,26 @@ def test_sigterm_ends_the_command_with_a_line(settings, tmp_path, processes: int
     assert not any("Traceback" in line for line in lines)
     (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
     assert (checkpoint / "optimizer.safetensors").exists()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_sigterm_ends_the_rendering_of_scenes_and_its_workers(settings, tmp_path, workers: int) -> None:
+    words = ["train", "--data", settings["data"], "--out", tmp_path / "run", "--recipe", "nano"]
+    words += ["--pretraining.steps", "5", "--pretraining.num-scenes", "100000", "--runtime.workers", workers]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "openvima", *map(str, words)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stderr is not None
+    lines = []
+    for line in process.stderr:  # ends when no worker holds the pipe any more
+        if "rendering scenes" in line and not any("rendering scenes" in before for before in lines):
+            process.send_signal(signal.SIGTERM)
+        lines.append(line)
+    process.stderr.close()
+    assert process.wait() == 143
+    assert lines[-1].endswith("interrupted; complete files were kept, and the same command resumes.\n")
+    assert not any("Traceback" in line for line in lines)
+    assert not list((tmp_path / "run" / "checkpoints").glob("*"))

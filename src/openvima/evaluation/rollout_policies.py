@@ -184,6 +184,8 @@ class PromptedRolloutPolicy:
         """Name policy, task and seeds where the policy raises."""
         try:
             yield
+        except PolicyRaisedError as error:  # on a server
+            raise PolicyRaisedError(f"{self._name}: {error}, in {_episodes(envs)}.") from None
         except OpenVimaError:
             raise
         except Exception as error:

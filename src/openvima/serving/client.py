@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -9,12 +10,13 @@ from threading import Timer
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from openvima.errors import MessageError, PolicyError, ServerError, echo
+from openvima.errors import MessageError, PolicyError, PolicyRaisedError, ServerError, echo
 from openvima.policies.base import Policy
 from openvima.scene import RenderedPrompt
 from openvima.scene.action import PRIMITIVES
 from openvima.serving.protocol import (
     DEFAULT_MODALITIES,
+    POLICY_FAILED,
     PROTOCOL,
     TOKEN_VARIABLE,
     check_address,
@@ -81,18 +83,27 @@ class Connection:
 
         Raises:
             ServerError: The server is lost, refuses, or answers what it must not.
+            PolicyError: The policy refuses, or raised.
         """
         with self._closed_by_errors(f"has not answered within {self._timeout_s:g} s"):
             with self._limited():
                 self._socket.send(request)
             data = self._socket.recv(timeout=self._timeout_s)
         if isinstance(data, str):  # a refusal; the connection stays as it is
-            raise ServerError(f"{self.url} refuses: {echo(data)}")
+            raise self._refusal(data)
         with self._closed_by_errors():
             answer = _map_in(data)
             if type_of(answer) != kind:
                 raise MessageError(f"the answer to a {kind!r} has type {str(type_of(answer))[:40]!r}")
         return answer
+
+    def _refusal(self, text: str) -> ServerError | PolicyError:
+        """Return the error for a refusal; that of a policy names no address, since results keep it."""
+        if text.startswith(POLICY_FAILED):
+            return PolicyRaisedError(f"the policy on the server raised {echo(text[len(POLICY_FAILED) :])}")
+        if re.match(r"(Policy|Prompt|Detection|Shape|Action)Error: ", text):
+            return PolicyError(f"the policy on the server refuses: {echo(text)}")
+        return ServerError(f"{self.url} refuses: {echo(text)}")
 
     def broken(self, what: str) -> ServerError:
         """Close the connection, and return the error for an answer that must not be."""

@@ -180,6 +180,7 @@ def _is_shape(shape: object) -> bool:
 # The number counts versions that do not understand each other: whatever is added, removed or changes its
 # meaning makes a new one, as both sides refuse what they do not know.
 PROTOCOL = "openvima-policy/1"
+POLICY_FAILED = "the policy failed: "  # begins a refusal whose cause is the policy, for this one request
 TOKEN_VARIABLE = "OPENVIMA_SERVE_TOKEN"  # read by server and client where no token is given
 MODALITIES = ("rgb", "segm", "joints")  # that observations may hold besides `ee`
 DEFAULT_MODALITIES = ("rgb", "segm")  # of policies that name none

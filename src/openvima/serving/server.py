@@ -27,6 +27,7 @@ from openvima.scene.action import PRIMITIVES
 from openvima.serving.protocol import (
     DEFAULT_MODALITIES,
     MAX_LENGTH,
+    POLICY_FAILED,
     PROTOCOL,
     TOKEN_VARIABLE,
     check_control,
@@ -198,7 +199,7 @@ class Session:
         except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
             where = "\n".join(map(echo, traceback.format_exc().splitlines()[-40:]))
             _LOG.error("the policy failed\n%s", where)
-            return f"the policy failed: {type(error).__name__}: {echo(str(error))}"
+            return f"{POLICY_FAILED}{type(error).__name__}: {echo(str(error))}"
 
     def _read(self, data: bytes | str) -> Answer:
         if isinstance(data, str):

@@ -68,24 +68,44 @@ def step_generator(seed: int, purpose: str, step: int) -> torch.Generator:
     return torch.Generator().manual_seed(step_seed(seed, purpose, step))
 
 
-@contextmanager
-def note_sigterm() -> Iterator[Callable[[], bool]]:
-    """Let SIGTERM end nothing within the block.
+def _raise_terminated(number: int, frame: object) -> None:
+    raise Terminated
 
-    Yields:
-        A function that tells whether the signal came. In another thread than the main one, and where the
-        caller's program handles the signal itself, it comes never, and acts as outside of the block.
+
+@contextmanager
+def end_on_sigterm() -> Iterator[None]:
+    """Let SIGTERM raise `Terminated` within the block, so that workers and files end as with Ctrl-C.
+
+    In another thread than the main one, and where the caller's program handles the signal itself, it acts as
+    outside of the block.
     """
-    came: list[int] = []
     in_main = threading.current_thread() is threading.main_thread()
     if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, _raise_terminated)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextmanager
+def note_sigterm() -> Iterator[Callable[[], bool]]:
+    """Let SIGTERM end nothing within a block inside of `end_on_sigterm`.
+
+    Yields:
+        A function that tells whether the signal came. Where `end_on_sigterm` has no effect, it comes never.
+    """
+    came: list[int] = []
+    if signal.getsignal(signal.SIGTERM) is not _raise_terminated:
         yield lambda: False
         return
     signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
     try:
         yield lambda: bool(came)
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, _raise_terminated)
 
 
 Metrics = dict[str, float]

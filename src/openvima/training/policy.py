@@ -26,7 +26,15 @@ from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, 
 from openvima.training.building import build_learner, resolve, training_texts
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
-from openvima.training.loop import Animate, PlannedStage, Rollout, Stage, Trainer, num_steps
+from openvima.training.loop import (
+    Animate,
+    PlannedStage,
+    Rollout,
+    Stage,
+    Trainer,
+    end_on_sigterm,
+    num_steps,
+)
 from openvima.training.parallel import Parallel, compile_layers, join_processes
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
@@ -92,6 +100,7 @@ def train(
     with (
         torch_threads(runtime.threads),
         join_processes(runtime.device, runtime.sharding) as parallel,
+        end_on_sigterm(),  # not while processes join, a wait that no handler interrupts
         run_lock(config.out, is_first=parallel.is_first),
     ):
         with_captions = config.pretraining.attribute_loss_weight > 0

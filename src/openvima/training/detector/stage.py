@@ -24,6 +24,7 @@ from openvima.training.loop import (
     Metrics,
     PlannedStage,
     Trainer,
+    end_on_sigterm,
     num_steps,
     step_generator,
     step_seed,
@@ -152,6 +153,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
     with (
         torch_threads(runtime.threads),
         join_processes(runtime.device, runtime.sharding) as parallel,
+        end_on_sigterm(),  # not while processes join, a wait that no handler interrupts
         run_lock(config.out, is_first=parallel.is_first),
     ):
         if parallel.num_ranks > 1:
