@@ -13,7 +13,7 @@ import openvima
 from openvima.errors import ActionError, ConfigError
 from openvima.scene import Action
 from openvima.tasks import list_tasks, task_spec
-from openvima.wrappers import FlatAction, FlatObservation, ProgressReward
+from openvima.wrappers import FlatAction, FlatObservation, ImageObservation, ProgressReward
 
 
 @pytest.mark.parametrize(
@@ -102,6 +102,67 @@ def test_the_tool_and_where_to_pick_are_seen_under_low_level_control() -> None:
     assert 0.01 < (z + 1) / 2 * 0.35 < 0.06
     with pytest.raises(ConfigError, match="control is 'end_effector', whose actions are a box already"):
         FlatAction(openvima.make("rotate", control="end_effector"))
+
+
+def test_images_and_words_are_a_flat_dictionary() -> None:
+    env = ImageObservation(FlatAction(openvima.make("visual_manipulation")), shrink=4)
+    observation, _ = env.reset(seed=3)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*different from the unwrapped version")
+        check_env(env, skip_render_check=True)
+    shapes = {name: value.shape for name, value in observation.items()}
+    assert shapes == {"front": (3, 32, 64), "top": (3, 32, 64), "prompt": (12, 32, 64), "words": (65,)}
+    observation, _ = env.reset(seed=3)
+    seen = env.unwrapped.observe()["rgb"]["top"]
+    assert (
+        observation["top"][:, 5, 7].tolist() == seen[:, 20:24, 28:32].mean(axis=(1, 2)).astype(int).tolist()
+    )
+    first, second, rest = observation["prompt"][:3], observation["prompt"][3:6], observation["prompt"][6:]
+    assert not np.array_equal(first, second) and second.any() and not rest.any()
+    assert np.array_equal(observation["words"], FlatObservation(env.env).reset(seed=3)[0][-65:])
+    too_few = ImageObservation(openvima.make("visual_manipulation"), max_prompt_images=1)
+    with pytest.raises(ConfigError, match="max_prompt_images is 1, but the prompt has 2; give more"):
+        too_few.reset(seed=3)
+    with pytest.raises(ConfigError, match="shrink 3; give an integer of at least 1, and 1, 2 or 4"):
+        ImageObservation(openvima.make("rotate"), shrink=3)
+    tool = ImageObservation(openvima.make("rotate", control="end_effector"))
+    assert tool.observation_space.contains(tool.reset(seed=0)[0])
+
+
+def test_the_reward_sees_how_far_from_its_object_an_action_picks() -> None:
+    env = ProgressReward(FlatAction(openvima.make("rotate", num_distractors=1)), reach_weight=2.0)
+    rewards = []
+    for offset_m in (0.2, 0.1):
+        env.reset(seed=2)
+        (goal,) = env.unwrapped.episode.problem.goals
+        pose = env.unwrapped.scene[goal.object_id].pose
+        x = pose.x + offset_m * (1 if pose.x < 0.5 else -1)
+        action = FlatAction.flatten(Action.planar((x, pose.y), (x, pose.y)))
+        _, reward, *_, info = env.step(action)
+        assert not info["grasped"] and not info["success"]
+        rewards.append(reward)
+    assert rewards == pytest.approx([-0.4, -0.2], abs=1e-5)
+
+
+def test_the_reward_sees_the_tool_near_its_object() -> None:
+    """As a potential, so that going there and back earns nothing."""
+    base = openvima.make("rotate", control="end_effector", num_distractors=0)
+    env = ProgressReward(base, reach_weight=1.0)
+    env.reset(seed=0)
+    (goal,) = base.episode.problem.goals
+
+    def distance() -> float:
+        pose = base.scene[goal.object_id].pose
+        return float(np.hypot(pose.x - base.tool[0], pose.y - base.tool[1]))
+
+    before, total = distance(), 0.0
+    for sign in (1, 1, 1, -1):
+        total += env.step(np.array([0, 0.04 * sign, 0, 0, 0], np.float32))[1]
+    assert distance() != pytest.approx(before) and total == pytest.approx(before - distance(), abs=1e-5)
+    with pytest.raises(ConfigError, match="commands need control 'end_effector'"):
+        primitives = openvima.make("rotate")
+        primitives.reset(seed=0)
+        _ = primitives.tool
 
 
 def test_words_tell_prompts_of_one_task_apart() -> None:

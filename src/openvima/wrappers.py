@@ -1,8 +1,9 @@
 """Wrappers for libraries of reinforcement learning: vectors as observations and actions, dense rewards."""
 
+import math
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any  # observations and infos are nested dictionaries
 
 import gymnasium
@@ -14,6 +15,7 @@ from openvima.perception.objects import TOP, ObjectViews, observe, observe_promp
 from openvima.render.camera import CAMERAS
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action
 from openvima.scene.action import END_EFFECTOR, HIGHEST_TIP_Z_M
+from openvima.scene.goal import object_of
 from openvima.tasks.goals import LEVER_M
 
 ACTION_SIZE = 6
@@ -179,11 +181,7 @@ class FlatObservation(gymnasium.Wrapper):
         parts = self._base.prompt.sequence()
         images = [part for part in parts if not isinstance(part, str)]
         seen = [(observe_prompt_image(image), image.kind == "scene") for image in images]
-        rows = self._rows(seen, "max_prompt_objects")
-        words = np.zeros(NUM_BUCKETS, np.float32)
-        for word in re.findall(r"\w+", " ".join(part for part in parts if isinstance(part, str)).lower()):
-            words[zlib.crc32(word.encode()) % NUM_BUCKETS] = 1
-        return np.concatenate([rows.ravel(), words])
+        return np.concatenate([self._rows(seen, "max_prompt_objects").ravel(), _words(parts)])
 
     def _rows(self, images: list[tuple[ObjectViews, bool]], limit: str) -> np.ndarray:
         """One row for each object of images, shape (limit, 56), with its position if it is on the table."""
@@ -206,6 +204,78 @@ class FlatObservation(gymnasium.Wrapper):
         return rows
 
 
+class ImageObservation(gymnasium.Wrapper):
+    """Gives observations as a flat dictionary of images and words, such as SB3's `MultiInputPolicy` takes.
+
+    | key | value |
+    |---|---|
+    | `front`, `top` | uint8, shape (3, 128 / shrink, 256 / shrink) |
+    | `prompt` | top views of the prompt's images in reading order, one below the other in channels: uint8, \
+shape (3 × max_prompt_images, 128 / shrink, 256 / shrink), zeros where there is none |
+    | `words` | words of the prompt and end effector, with control "end_effector" also the tool, as in \
+`FlatObservation`: float32, shape (65,) or (71,), −1 … 1 |
+
+    Args:
+        env: An environment of the package, wrapped or not, that observes `rgb`.
+        max_prompt_images: Images of a prompt at most.
+        shrink: Images are averaged over squares of so many pixels a side: 1, 2 or 4.
+
+    Raises:
+        ConfigError: The environment does not observe `rgb`, or a number is not allowed.
+    """
+
+    def __init__(self, env: gymnasium.Env, *, max_prompt_images: int = 4, shrink: int = 2) -> None:
+        super().__init__(env)
+        self._base: Any = env.unwrapped  # a TabletopEnv, as in `FlatObservation`
+        if "rgb" not in self._base.modalities:
+            raise ConfigError(f"modalities are {self._base.modalities}; ImageObservation needs rgb.")
+        if not _is_count(max_prompt_images) or shrink not in (1, 2, 4):
+            raise ConfigError(
+                f"max_prompt_images is {max_prompt_images!r} and shrink {shrink!r}; give an integer of at "
+                "least 1, and 1, 2 or 4."
+            )
+        self.max_prompt_images, self.shrink = max_prompt_images, shrink
+        shape = CAMERAS["top"].height // shrink, CAMERAS["top"].width // shrink
+        images = {**dict.fromkeys(CAMERAS, 3), "prompt": 3 * max_prompt_images}
+        num_words = NUM_BUCKETS + 1 + TOOL_SIZE * (self._base.control == END_EFFECTOR)
+        self.observation_space = spaces.Dict(
+            {name: spaces.Box(0, 255, (channels, *shape), np.uint8) for name, channels in images.items()}
+            | {"words": spaces.Box(-1, 1, (num_words,), np.float32)}
+        )
+        self._prompt, self._words = np.zeros(0, np.uint8), np.zeros(0, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        """Start an episode.
+
+        Raises:
+            ConfigError: The prompt has more than `max_prompt_images` images.
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        parts = self._base.prompt.sequence()
+        images = [part.rgb["top"] for part in parts if not isinstance(part, str)]
+        if len(images) > self.max_prompt_images:
+            raise ConfigError(
+                f"max_prompt_images is {self.max_prompt_images}, but the prompt has {len(images)}; give more."
+            )
+        self._prompt = np.zeros(self.observation_space["prompt"].shape, np.uint8)  # type: ignore[index]
+        for index, image in enumerate(images):
+            self._prompt[3 * index : 3 * index + 3] = _shrunk(image, self.shrink)
+        self._words = _words(parts)
+        return self.observation(observation), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        """Take a step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self.observation(observation), float(reward), terminated, truncated, info
+
+    def observation(self, observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Return an observation of the running episode as a flat dictionary."""
+        tool = _tool(observation["tool"]) if "tool" in observation else ()
+        images = {view: _shrunk(image, self.shrink) for view, image in observation["rgb"].items()}
+        words = np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
+        return {**images, "prompt": self._prompt.copy(), "words": words}
+
+
 class ProgressReward(gymnasium.Wrapper):
     """Adds dense rewards, by the progress that a step makes.
 
@@ -213,28 +283,61 @@ class ProgressReward(gymnasium.Wrapper):
     best policy stays the same (Ng, Harada and Russell, 1999, without discount). The potential is `goals_met`
     minus `distance_m` minus 0.1 × `angle_rad` of `info["progress"]`.
 
+    Few random actions move anything, so this is 0 nearly always at first. With `reach_weight` the reward also
+    sees the reach: the planar distance in metres from where an action picks or begins to sweep to the nearest
+    object of the goals that can be met next. With control "primitives" it is subtracted at every step, which
+    favours short episodes; with "end_effector" it is the distance of the tool, and part of the potential.
+
     Args:
         env: An environment of the package, wrapped or not.
         weight: Factor of the potential.
+        reach_weight: Factor of the reach.
     """
 
-    def __init__(self, env: gymnasium.Env, weight: float = 1.0) -> None:
+    def __init__(self, env: gymnasium.Env, weight: float = 1.0, *, reach_weight: float = 0.0) -> None:
         super().__init__(env)
-        self.weight = weight
+        self.weight, self.reach_weight = weight, reach_weight
+        self._base: Any = env.unwrapped  # a TabletopEnv, as in `FlatObservation`
         self._potential = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._potential = _potential(info["progress"])
+        self._potential = self._potential_of(info)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
         """Take a step."""
+        cost = 0.0
+        if self.reach_weight and self._base.control != END_EFFECTOR:
+            cost = self.reach_weight * self._reach(self._pick(action))
         observation, reward, terminated, truncated, info = self.env.step(action)
-        before, self._potential = self._potential, _potential(info["progress"])
-        gain = self.weight * (self._potential - before)
-        return observation, float(reward) + gain, terminated, truncated, info
+        before, self._potential = self._potential, self._potential_of(info)
+        return observation, float(reward) + self._potential - before - cost, terminated, truncated, info
+
+    def _potential_of(self, info: Mapping[str, Any]) -> float:
+        potential = self.weight * _potential(info["progress"])
+        if self.reach_weight and self._base.control == END_EFFECTOR:
+            potential -= self.reach_weight * self._reach(self._base.tool[:2])
+        return potential
+
+    def _pick(self, action: Any) -> tuple[float, ...]:
+        """Return x, y where an action of this wrapper picks, in metres."""
+        env = self.env
+        while env is not env.unwrapped:
+            wrapper: Any = env
+            if isinstance(wrapper, gymnasium.ActionWrapper):
+                action = wrapper.action(action)
+            env = wrapper.env
+        return (action if isinstance(action, Action) else Action.from_arrays(action)).pose0_position
+
+    def _reach(self, point: Sequence[float]) -> float:
+        """Return the distance of a point from the nearest object of the goals that can be met next."""
+        problem, open_goals = self._base.episode.problem, self._base.progress.open_goals
+        stage = problem.stage_of(open_goals[0]) if open_goals else ()
+        ids = {object_of(problem.goals[index]) for index in open_goals if index in stage} - {None}
+        poses = [self._base.scene[object_id].pose for object_id in ids]
+        return min((math.hypot(pose.x - point[0], pose.y - point[1]) for pose in poses), default=0.0)
 
 
 def _is_count(value: object) -> bool:
@@ -249,6 +352,21 @@ def _tool(tool: np.ndarray) -> np.ndarray:
     x, y, z, yaw_rad, holds = tool
     height = 2 * z / HIGHEST_TIP_Z_M - 1
     return np.clip([*_scaled(np.array([x, y])), height, np.sin(yaw_rad), np.cos(yaw_rad), holds], -1, 1)
+
+
+def _words(parts: Sequence[object]) -> np.ndarray:
+    """Encode the words of a prompt, shape (64,), float32."""
+    words = np.zeros(NUM_BUCKETS, np.float32)
+    for word in re.findall(r"\w+", " ".join(part for part in parts if isinstance(part, str)).lower()):
+        words[zlib.crc32(word.encode()) % NUM_BUCKETS] = 1
+    return words
+
+
+def _shrunk(image: np.ndarray, side: int) -> np.ndarray:
+    """Average an image over squares: shape (3, H, W) to (3, H / side, W / side), uint8."""
+    channels, height, width = image.shape
+    tiles = image.reshape(channels, height // side, side, width // side, side)
+    return tiles.mean(axis=(2, 4)).astype(np.uint8)
 
 
 def _potential(progress: Mapping[str, float]) -> float:

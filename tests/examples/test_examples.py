@@ -21,7 +21,7 @@ EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 # another simulator.
 APART = (
     *("policy_server", "custom_learner", "own_network", "own_training_loop", "score_my_policy"),
-    *("score_in_original_benchmark", "dagger", "vla_policy", "language_rule"),
+    *("score_in_original_benchmark", "dagger", "soft_actor_critic", "vla_policy", "language_rule"),
 )
 
 
@@ -77,6 +77,16 @@ def test_dagger_and_behaviour_cloning_are_compared_at_equal_labels() -> None:
     lines = done.stdout.splitlines()
     assert [line.split(":")[0] for line in lines] == ["behaviour cloning, 90 labels", "DAgger, 90 labels"]
     assert all(" of 2, " in line for line in lines)
+
+
+@pytest.mark.slow
+def test_soft_actor_critic_is_compared_with_random_actions() -> None:
+    pytest.importorskip("stable_baselines3")
+    script = str(EXAMPLES[0].with_name("soft_actor_critic.py"))
+    words = ["--steps", "40", "--episodes", "2"]
+    done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True, check=True)
+    *_, random, learned = done.stdout.splitlines()
+    assert random.startswith("random actions: solved ") and learned.startswith("soft actor-critic: solved ")
 
 
 @pytest.mark.slow

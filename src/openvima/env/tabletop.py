@@ -448,6 +448,15 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         return self._running().world.joints.astype(np.float32)
 
     @property
+    def tool(self) -> np.ndarray:
+        """The tool, for control "end_effector": x, y, z in metres, yaw in radians, and 1 while it holds.
+
+        Raises:
+            ConfigError: The control is another.
+        """
+        return self._tool_run().observed_tool()["tool"]
+
+    @property
     def joint_path(self) -> np.ndarray:
         """Waypoints of the arm in the last step, shape (W, 6), float32, radians."""
         return self._running().joint_path
