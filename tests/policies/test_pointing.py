@@ -1,4 +1,4 @@
-"""The loss on which object is picked and at which one it is placed."""
+"""The loss on which object is picked and at which one it is placed, and positions that are read from it."""
 
 import math
 from pathlib import Path
@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from openvima.errors import ConfigError
-from openvima.policies.nn.action_head import ObservationTokens, add_pointing, pointing_loss
-from openvima.policies.nn.actions import PLACE_NEAR_M, ActionTargets
+from openvima.policies.nn.action_head import ObservationTokens, add_pointing, point_at_objects, pointing_loss
+from openvima.policies.nn.actions import PLACE_NEAR_M, ActionTargets, greedy
 from openvima.policies.presets import preset
+from openvima.policies.variants import with_variant
 from openvima.training import TrainingConfig
 from openvima.training.building import build_learner, resolve
 
@@ -81,3 +82,36 @@ def test_it_adds_no_weights(name):
     network = build_learner(config, ["put the block"]).network
     assert network.head.pointing_weight == 0.5
     assert network.config.head == preset(name).head
+
+
+def test_positions_are_those_of_the_objects_that_the_output_points_at():
+    pick, _, observations, targets = _inputs(torch.Generator().manual_seed(1))
+    moved = point_at_objects(targets.actions_BTC, pick, observations, greedy)
+    tokens, points = observations.tokens_BTQD.detach().numpy(), observations.points_BTQ2.numpy()
+    near, others = 0, [2, 3, 4, 5, 8, 9, 10, 11]
+    assert torch.equal(moved[..., others], targets.actions_BTC[..., others])
+    for b, t in np.ndindex(B, T):
+        exist, expected = np.isfinite(points[b, t, :, 0]), targets.actions_BTC[b, t].numpy().copy()
+        for half, part in ((slice(0, 4), slice(0, 2)), (slice(4, 8), slice(6, 8))):
+            scores = np.where(exist, tokens[b, t, :, half] @ pick[b, t, half].numpy(), -np.inf)
+            is_near = np.linalg.norm(points[b, t] - expected[part], axis=-1).min() < 0.06
+            if exist.any() and (part.start == 0 or is_near):
+                expected[part], near = points[b, t, scores.argmax()], near + (part.start > 0)
+        np.testing.assert_allclose(moved[b, t].numpy(), expected, rtol=1e-6)
+    assert 0 < near < B * T
+
+
+@pytest.mark.parametrize("name", ["small", "gato-nano", "midas-nano", "flamingo-nano"])
+def test_networks_that_cannot_point_refuse_to(name):
+    with pytest.raises(ConfigError, match="points"):
+        with_variant(preset(name), {"points": True})
+
+
+def test_pointing_needs_the_loss_that_teaches_it():
+    settings = {"data": Path("demos"), "out": Path("run"), "preset": "vima-nano", "model.points": True}
+    with pytest.raises(ConfigError, match=r"model\.points is True, but optimizer.pointing_loss_weight is 0"):
+        resolve(TrainingConfig.of(settings))
+    network = build_learner(
+        TrainingConfig.of({**settings, "optimizer.pointing_loss_weight": 1.0}), []
+    ).network
+    assert network.head.points

@@ -49,7 +49,11 @@ def test_the_paper_recipe_is_that_of_the_paper() -> None:
 
 
 def test_every_preset_has_a_recipe_that_trains_it() -> None:
-    assert default_recipe("vima-nano") == default_recipe("midas-nano") == "papers"
+    assert default_recipe("vima-nano") == "papers" and default_recipe("midas-nano") == "papers-midas"
+    assert default_recipe("gato-nano") == default_recipe("gpt-nano") == "papers-frames"
+    for name in ("vima-nano", "midas-nano", "gato-nano", "flamingo-nano", "gpt-nano"):
+        given = {"data": Path("demos"), "out": Path("run"), "preset": name}
+        resolve(TrainingConfig.of({**recipe_settings(default_recipe(name)), **given}))
     assert default_recipe("nano") == default_recipe("mine:learner") == "nano"
     assert default_recipe("small:learner") == default_recipe("nano-bins") == "nano"
     assert default_recipe("vima-20m") == default_recipe(None) == "paper"

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from openvima.errors import ConfigError
 from openvima.perception.objects import TOP
 from openvima.policies.batch import HistoryBatch, InputLayout, PromptBatch
-from openvima.policies.nn.action_head import BinsConfig, BinsHead, ObservationTokens
+from openvima.policies.nn.action_head import ActionHead, BinsConfig, BinsHead, ObservationTokens
 from openvima.policies.nn.decoder import AnyDecoderConfig, Decoder, DecoderConfig, build_decoder
 from openvima.policies.nn.heads import (
     AutoregressiveConfig,
@@ -58,6 +58,8 @@ class TokenPolicyConfig:
             none.
         query_token: Append a learned token to each observation and decode the action from there, instead of
             from its last image token.
+        points: Read positions from the object tokens that the action's output points at, as the pointing loss
+            trains it, instead of from the head alone; see `point_at_objects`. It adds no weights.
     """
 
     architecture: ClassVar[str]
@@ -67,9 +69,15 @@ class TokenPolicyConfig:
     head: HeadConfig
     resampler: ResamplerConfig | None = None
     query_token: bool = False
+    points: bool = False
 
     def __post_init__(self) -> None:
         images, width = self.images, self.decoder.width
+        if self.points and not (self.has_object_tokens and not isinstance(self.head, AutoregressiveConfig)):
+            raise ConfigError(
+                "policy: points needs a token for each object, and a head that is not autoregressive; set it "
+                "to False."
+            )
         check_widths(images.output_width if isinstance(images, VitConfig) else images.width, width)
         if self.resampler is None:
             return
@@ -79,6 +87,11 @@ class TokenPolicyConfig:
             raise ConfigError(
                 f"resampler: width {width} must be a multiple of its {self.resampler.num_heads} heads."
             )
+
+    @property
+    def has_object_tokens(self) -> bool:
+        """Whether each object has a token of its own."""
+        return isinstance(self.images, ObjectEncoderConfig) and self.resampler is None
 
     @property
     def inputs(self) -> InputLayout:
@@ -245,6 +258,8 @@ class TokenPolicy(PolicyNetwork):
         self.decoder = build_decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head = build_head(config.head, width, actions)
+        if isinstance(self.head, ActionHead):
+            self.head.points = config.points
         if token_width == width:
             self._align_attention()
         # Other heads have no bins, and the other decoder no attention to the prompt alone.
@@ -278,7 +293,7 @@ class TokenPolicy(PolicyNetwork):
             mask_BTQ = history.masks_BTVN.any(dim=2) if fused else history.masks_BTVN.flatten(2)
             if self.resampler is not None:
                 tokens_BTQE, mask_BTQ = self.resampler(tokens_BTQE, mask_BTQ), None
-            elif self.head.pointing_weight:  # never in acting
+            elif self.head.pointing_weight or self.config.points:
                 points_BTQ2 = _points_from_above(history, tokens_BTQE.shape[2])
         else:
             tokens_BTQE = self._frame_tokens(features_BTVNF)

@@ -244,6 +244,17 @@ def _with_convolutions(config: PolicyConfig, given: str, **sizes: int) -> Policy
 
 
 # In the order in which they are made: later ones see the parts of earlier ones.
+def with_points(config: PolicyConfig, value: bool) -> PolicyConfig:
+    """Return the same network, which reads positions from objects or not; see `TokenPolicyConfig.points`.
+
+    Raises:
+        ConfigError: It cannot.
+    """
+    if isinstance(config, PointerConfig):
+        raise _not_of_pointers(f"points is {value}", "objects to point at in any case")
+    return replace(config, points=value)
+
+
 SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "text_encoder": with_text_encoder,
     "tuned_layers": with_tuned_layers,
@@ -253,6 +264,7 @@ SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "num_layers": with_num_layers,
     "head": with_head,
     "visual_residual": with_visual_residual,
+    "points": with_points,
     "attributes": with_attributes,
     "crop_kernel": with_crop_kernel,
     "crop_width": with_crop_width,

@@ -92,10 +92,16 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
                 f"augmentation.{name} is {getattr(augmentation, name)}, but preset {config.preset!r} takes "
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
-    if (weight := config.optimizer.pointing_loss_weight) and not _has_object_tokens(sizes):
+    weight, is_token_policy = config.optimizer.pointing_loss_weight, isinstance(sizes, TokenPolicyConfig)
+    if weight and not (is_token_policy and sizes.has_object_tokens):
         raise ConfigError(
             f"optimizer.pointing_loss_weight is {weight:g}, but preset {config.preset!r} has no token for "
             "each object, or picks among objects by itself; leave it out."
+        )
+    if is_token_policy and sizes.points and not (weight or config.init_from):
+        raise ConfigError(
+            "model.points is True, but optimizer.pointing_loss_weight is 0, so nothing would teach the "
+            "network to point; give a weight such as 1, or set model.points to False."
         )
     has_appearance = appearance_width(sizes) > 0
     if config.pretraining.steps and sizes.inputs.tokens == "frames":
@@ -127,13 +133,6 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
             "weight such as 0.5, or set model.attributes to False."
         )
     return config
-
-
-def _has_object_tokens(sizes: PolicyConfig) -> bool:
-    """Whether a policy of the papers has a token for each object, which the pointing loss scores."""
-    return (
-        isinstance(sizes, TokenPolicyConfig) and sizes.resampler is None and sizes.inputs.tokens != "frames"
-    )
 
 
 def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
@@ -228,6 +227,8 @@ def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     """Check that a network can begin with the weights of another, whose vocabulary may have another size."""
     here, there = flatten(config_to_dict(ours)), flatten(config_to_dict(theirs))
+    for sizes in (here, there):
+        sizes.pop("points", None)  # it adds no weights
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")

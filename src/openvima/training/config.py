@@ -88,6 +88,8 @@ class ModelConfig:
         width: Width of the decoder and of image tokens, a multiple of the heads.
         num_layers: Layers of the decoder: pairs of a cross block and a self block, or with a prefix self
             blocks.
+        points: Read positions from the objects that the action's output points at; for VIMA and the like with
+            a token for each object, trained with `optimizer.pointing_loss_weight`.
         attributes: Compare objects by the attributes that a prompt names, such as "the same texture". For the
             preset small; `pretraining.attribute_loss_weight` trains them.
         crop_kernel: Kernel size of the last layer of a convolutional crop encoder (nano, small): 1 takes
@@ -103,6 +105,7 @@ class ModelConfig:
     conditioning: Literal["cross-attention", "prefix"] | None = None
     width: Count | None = None
     num_layers: Count | None = None
+    points: bool | None = None
     attributes: bool | None = None
     crop_kernel: Literal[1, 3] | None = None
     crop_width: Count | None = None

@@ -92,9 +92,18 @@ _PAPERS: Mapping[str, Any] = {
     **_VARIED_PAIRS,
     "pretraining.finetune_crop_encoder": False,  # nor after --init-from
     "optimizer.pointing_loss_weight": 1.0,
+    "model.points": True,
+    "augmentation.centre_picks": True,
     "augmentation.rename_objects_prob": 0.3,
     "augmentation.shuffle_sentences_prob": 0.3,
     "augmentation.distractor_prob": 0.3,
+}
+_PAPERS_MIDAS: Mapping[str, Any] = {
+    **{
+        name: value for name, value in _PAPERS.items() if name != "model.points"
+    },  # its head is autoregressive
+    "preset": "midas-nano",
+    "augmentation.inverse_dynamics_prob": 0.33,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
 RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
@@ -132,6 +141,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "loader.num_workers": 2,
         },
         "papers": _PAPERS,
+        "papers-midas": _PAPERS_MIDAS,
         "papers-frames": _PAPERS_FRAMES,
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
@@ -144,16 +154,16 @@ def default_recipe(preset: str | None) -> str:
     """Return the recipe for a preset.
 
     Returns:
-        "small" for "small", "nano" for the pointer network nano, nano-bins and learners of your own, "papers"
-        for the architectures of the papers in size nano, or "papers-frames" if they take whole frames, else
-        "paper".
+        "small" for "small", "nano" for the pointer network nano, nano-bins and learners of your own; of the
+        architectures of the papers in size nano "papers" for VIMA, "papers-midas" for MIDAS and
+        "papers-frames" for those that take whole frames; else "paper".
     """
     if preset == "small":
         return preset
     if preset and (preset.startswith("nano") or preset not in PRESETS):
         return "nano"
     if preset and preset.endswith("-nano"):
-        return "papers-frames" if preset.startswith(("gato", "flamingo", "gpt")) else "papers"
+        return {"vima-nano": "papers", "midas-nano": "papers-midas"}.get(preset, "papers-frames")
     return "paper"
 
 

@@ -89,6 +89,8 @@ def decode_observations(
     return outputs_BTQD, cache
 
 
+_POSITIONS = (ACTION_PARTS["pose0_position"], ACTION_PARTS["pose1_position"])
+_AT_OBJECT_M = 0.06  # a decoded place within this distance of an object is meant to be at one
 # The loss, a mean over all steps; its parts as `loss/<name>`; and the decoded actions, (B, T, C).
 ActionLoss = tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]
 
@@ -100,9 +102,11 @@ class ActionHead(nn.Module):
 
     Attributes:
         pointing_weight: Weight of `pointing_loss` in training.
+        points: Whether positions are read from objects; see `point_at_objects`.
     """
 
     pointing_weight = 0.0
+    points = False
 
     def __init__(self, actions: ActionEncoder) -> None:
         super().__init__()
@@ -146,7 +150,11 @@ class ActionHead(nn.Module):
         """Decode the next action."""
         previous = self._segment(previous_BTC, has_previous_BT, observations.tokens_BTQD.dtype)
         outputs_BTQD, cache = decode_observations(decoder, cache, observations, previous)
-        return self.action(observations.query(outputs_BTQD), strategy), cache
+        query_BTD = observations.query(outputs_BTQD)
+        actions_BTC = self.action(query_BTD, strategy)
+        if self.points:
+            actions_BTC = point_at_objects(actions_BTC, query_BTD, observations, strategy)
+        return actions_BTC, cache
 
     def _segment(
         self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
@@ -186,23 +194,52 @@ def pointing_loss(
         observations: The objects' tokens, as they enter the decoder.
         targets: Demonstrated actions; a place counts where an object is near.
     """
-    tokens_BTQD, points_BTQ2 = observations.tokens_BTQD, observations.points_BTQ2
+    points_BTQ2 = observations.points_BTQ2
     assert points_BTQ2 is not None  # they are made where the loss has a weight, and settings are checked
-    is_object_BTQ = points_BTQ2[..., 0].isfinite() & targets.steps_BT[..., None]
-    parts = zip(
-        ("pose0_position", "pose1_position"), (pick_BTD, place_BTD), (math.inf, PLACE_NEAR_M), strict=True
-    )
-    loss = tokens_BTQD.new_zeros(())
-    for half, (part, query_BTD, limit_m) in enumerate(parts):
-        query_BTE, keys_BTQE = query_BTD.chunk(2, -1)[half], tokens_BTQD.chunk(2, -1)[half]
-        scores_BTQ = torch.einsum("btqe,bte->btq", keys_BTQE, query_BTE) * query_BTE.shape[-1] ** -0.5
-        target_BT12 = targets.actions_BTC[..., None, ACTION_PARTS[part]].to(points_BTQ2)
+    has_object_BT = points_BTQ2[..., 0].isfinite().any(-1) & targets.steps_BT
+    loss = pick_BTD.new_zeros(())
+    for half, query_BTD, limit_m in ((0, pick_BTD, math.inf), (1, place_BTD, PLACE_NEAR_M)):
+        scores_BTQ = _score_objects(half, query_BTD, observations)
+        target_BT12 = targets.actions_BTC[..., None, _POSITIONS[half]].to(points_BTQ2)
         distance_BT, slot_BT = (points_BTQ2 - target_BT12).norm(dim=-1).min(dim=-1)
-        counts_BT = is_object_BTQ.any(-1) & (distance_BT < limit_m)
-        scores_MQ = scores_BTQ.masked_fill(~is_object_BTQ, -math.inf)[counts_BT]
-        losses = F.cross_entropy(scores_MQ, slot_BT[counts_BT], reduction="sum")
+        counts_BT = has_object_BT & (distance_BT < limit_m)
+        losses = F.cross_entropy(scores_BTQ[counts_BT], slot_BT[counts_BT], reduction="sum")
         loss = loss + losses / targets.steps_BT.sum().clamp(min=1)
     return loss
+
+
+def point_at_objects(
+    actions_BTC: torch.Tensor,
+    query_BTD: torch.Tensor,
+    observations: ObservationTokens,
+    strategy: DecodingStrategy,
+) -> torch.Tensor:
+    """Move each pick to the centre of the object that the output points at, and places at objects likewise.
+
+    Independent bins of two equally good picks may give the column of one and the row of the other; see
+    results/2026-11-28_vima_pointing.md. A place that is near no object stays.
+    """
+    points_BTQ2 = observations.points_BTQ2
+    assert points_BTQ2 is not None
+    actions_BTC = actions_BTC.clone()
+    for half, limit_m in ((0, math.inf), (1, _AT_OBJECT_M)):
+        slot_BT = strategy(_score_objects(half, query_BTD, observations))
+        point_BT2 = points_BTQ2.gather(2, slot_BT[..., None, None].expand(-1, -1, 1, 2)).squeeze(2)
+        decoded_BT12 = actions_BTC[..., None, _POSITIONS[half]].to(points_BTQ2)
+        is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < limit_m)[..., None]
+        actions_BTC[..., _POSITIONS[half]] = torch.where(is_near_BT1, point_BT2, decoded_BT12.squeeze(2)).to(
+            actions_BTC.dtype
+        )
+    return actions_BTC
+
+
+def _score_objects(half: int, query_BTD: torch.Tensor, observations: ObservationTokens) -> torch.Tensor:
+    """Score tokens as the object of the pick, half 0, or of the place, half 1; very low for no object."""
+    query_BTE, keys_BTQE = query_BTD.chunk(2, -1)[half], observations.tokens_BTQD.chunk(2, -1)[half]
+    scores_BTQ = torch.einsum("btqe,bte->btq", keys_BTQE, query_BTE) * query_BTE.shape[-1] ** -0.5
+    assert observations.points_BTQ2 is not None
+    is_object_BTQ = observations.points_BTQ2[..., 0].isfinite()
+    return scores_BTQ.masked_fill(~is_object_BTQ, torch.finfo(scores_BTQ.dtype).min)
 
 
 @torch.no_grad()
