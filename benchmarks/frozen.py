@@ -43,7 +43,7 @@ from openvima.tasks import list_tasks, sample_episode, task_spec
 
 RECORD = Path(__file__).with_suffix(".json")
 TOLERANCE = 1e-4
-RECIPES = {"nano": "nano", "small": "small", "vima-nano": "papers", "midas-nano": "papers"}  # by preset
+RECIPES = {"nano": "nano", "small": "small", "vima-nano": "papers", "midas-nano": "papers-midas"}  # by preset
 # What makes a training short; the recipe sets everything else.
 _SHORT = ("--loader.batch-size=16", "--runtime.processes=1", "--runtime.threads=1", "--runtime.device=cpu")
 _FLOAT = re.compile(r"-?\d+\.\d+(?:e[+-]?\d+)?")
