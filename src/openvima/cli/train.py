@@ -26,11 +26,10 @@ The same command resumes an interrupted run from its last checkpoint.
 
 Example: openvima train --data demos --preset nano --out run
 
---recipe selects default settings: "paper" (as in the VIMA paper), "papers" (its architectures in size nano,
-two cores), "workstation" (one GPU, less data), "nano" (minutes on a few cores), "small" (the bundled
-openvima-small), "midas-pretrain", "midas-finetune" or "midas-in-context". The default is "small" for the
-preset of that name, "papers" for vima-nano and the like, "nano" for nano, nano-bins and your own learners,
-else "paper". --init-from disables the pretraining of recipe and file; set --pretraining.steps to
+--recipe selects default settings: "paper" (as in the VIMA paper), "papers" (vima-nano on two cores),
+"papers-midas" and "papers-frames" (midas-nano; gato-nano and the like), "workstation" (one GPU, less data),
+"nano" (minutes on a few cores), "small" (the bundled openvima-small), "midas-pretrain", "midas-finetune" or
+"midas-in-context". The default is that of the preset, "nano" for your own learners, else "paper". --init-from disables the pretraining of recipe and file; set --pretraining.steps to
 pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
