@@ -150,9 +150,10 @@ class CacheFile:
     def __getitem__(self, row: int) -> PreprocessedEpisode:
         arrays = {}
         for ends, fields in self._lists.values():
-            span = slice(int(ends[row]), int(ends[row + 1]))
-            arrays |= {name: flat[span] for name, flat in fields.items()}
-        scalars = tuple(column[row].as_py() for column in self._scalars.values())
+            start, end = ends[row : row + 2].tolist()
+            for name, flat in fields.items():
+                arrays[name] = flat[start:end]
+        scalars = tuple([column[row].as_py() for column in self._scalars.values()])
         if _checksum(scalars, arrays.values()) != self._checksums[row].as_py():
             raise ShardError(
                 _describe_damage(self.path, f"the checksum of row {row} of {len(self)} is wrong")
@@ -295,7 +296,7 @@ def _checksum(scalars: tuple[object, ...], arrays: Iterable[np.ndarray]) -> int:
     """Return the xxh3 of a row, 64 bits."""
     digest = xxh3_64(repr(scalars).encode())
     for array in arrays:
-        digest.update(array.data)
+        digest.update(array)
     return digest.intdigest()
 
 

@@ -87,14 +87,13 @@ class PreprocessedEpisode:
 
     def with_image_offset(self, offset: int) -> "PreprocessedEpisode":
         """Return the same demonstration, its images `offset` further down a larger stack."""
-        prompt, false_positives = self.prompt, self.false_positives
-        return replace(
+        prompt, spurious = self.prompt, self.false_positives
+        objects = prompt.objects.with_image_offset(offset)
+        return replace(  # the records in it by their classes, which is faster
             self,
-            prompt=replace(prompt, objects=prompt.objects.with_image_offset(offset)),
+            prompt=PreprocessedPrompt(prompt.text, objects, prompt.objects_per_image, prompt.is_scene),
             objects=self.objects.with_image_offset(offset),
-            false_positives=replace(
-                false_positives, crop_index=offset_index(false_positives.crop_index, offset)
-            ),
+            false_positives=FalsePositives(offset_index(spurious.crop_index, offset), spurious.boxes),
             final=self.final.with_image_offset(offset),
         )
 

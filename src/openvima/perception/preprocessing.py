@@ -112,7 +112,7 @@ class ObjectTable:
 
     def with_image_offset(self, offset: int | np.ndarray) -> "ObjectTable":
         """Return the same objects, their images `offset` further down a larger stack."""
-        return replace(self, crop_index=offset_index(self.crop_index, offset))
+        return ObjectTable(self.ids, offset_index(self.crop_index, offset), self.boxes, self.grasps)
 
     @staticmethod
     def concatenate(tables: Sequence["ObjectTable"]) -> "ObjectTable":
@@ -242,7 +242,8 @@ def extract_ahead(
 
 def offset_index(crop_index: np.ndarray, offset: int | np.ndarray) -> np.ndarray:
     """Add an offset to indices of images, int64; 0 stays 0."""
-    return np.where(crop_index > 0, crop_index.astype(np.int64) + offset, 0)
+    moved = crop_index.astype(np.int64)
+    return np.add(moved, offset, out=moved, where=moved > 0)
 
 
 def image_names(text: str) -> tuple[str, ...]:
