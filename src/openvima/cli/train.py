@@ -29,8 +29,8 @@ Example: openvima train --data demos --preset nano --out run
 --recipe selects default settings: "paper" (as in the VIMA paper), "papers" (vima-nano on two cores),
 "papers-midas" and "papers-frames" (midas-nano; gato-nano and the like), "workstation" (one GPU, less data),
 "nano" (minutes on a few cores), "small" (the bundled openvima-small), "midas-pretrain", "midas-finetune" or
-"midas-in-context". The default is that of the preset, "nano" for your own learners, else "paper". --init-from disables the pretraining of recipe and file; set --pretraining.steps to
-pretrain anyway.
+"midas-in-context". The default is that of the preset, "nano" for your own learners, else "paper". --init-from
+disables the pretraining of recipe and file; set --pretraining.steps to pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
 --trust-code lets the file name code that is run, such as a learner or detector of your own.
