@@ -11,14 +11,14 @@ import inspect
 import json
 import math
 import re
+import struct
 import sys
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from PIL import Image
 
 from openvima.errors import AnswerError, ConfigError, echo, unknown_name
 from openvima.perception.objects import VIEWS, ObjectExtractor
@@ -329,10 +329,19 @@ def wording_hash() -> str:
 
 def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
     """Encode an image, shape (3, H, W), uint8, as a PNG file of `enlarge` times its size, unsmoothed."""
-    large = np.repeat(np.repeat(channels_last(rgb), enlarge, axis=0), enlarge, axis=1)
-    stream = BytesIO()
-    Image.fromarray(large).save(stream, "PNG", compress_level=1)  # half the time of the usual level
-    return stream.getvalue()
+    rows = np.repeat(channels_last(rgb), enlarge, axis=1)
+    height, width = rows.shape[0] * enlarge, rows.shape[1]
+    # Repeated rows are differences of zero to the one above (filter 2), with little left to compress: a third
+    # of the time that Pillow takes.
+    lines = np.zeros((rows.shape[0], enlarge, 1 + 3 * width), np.uint8)
+    lines[:, 0, 1:] = rows.reshape(len(rows), -1)
+    lines[:, 1:, 0] = 2
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # eight bits of red, green and blue
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines, 1)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
 
 
 def _tool(observation: Mapping) -> str:

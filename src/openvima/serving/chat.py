@@ -285,7 +285,8 @@ class ChatClient:
             sent = {name: value for name, value in body.items() if name not in left_out}
             started = time.perf_counter()
             try:
-                said = self._client.chat.completions.create(**sent)
+                # Not `chat.completions.create`, which walks through the images: a third of a step's time.
+                said = self._client.post("/chat/completions", cast_to=object, body=sent)
             except (openai.BadRequestError, openai.UnprocessableEntityError) as error:
                 refusal = refusal or error
                 continue
@@ -305,15 +306,14 @@ class ChatClient:
 
     def _answer(self, said: Any, request: str, seconds: float, left_out: tuple[str, ...]) -> Answer:
         """Take out of a response what counts; servers differ in what they leave out."""
-        choices, usage = getattr(said, "choices", None), getattr(said, "usage", None)
-        message = getattr(choices[0], "message", None) if isinstance(choices, list) and choices else None
-        words = [getattr(message, name, None) for name in ("reasoning", "reasoning_content", "content")]
+        names = ("reasoning", "reasoning_content", "content")
+        words = (_found(said, "choices", 0, "message", name) for name in names)
         text = "\n".join(word for word in words if isinstance(word, str) and word)
         if self._key:
             text = text.replace(self._key, "…")
-        counts = (getattr(usage, name, None) for name in ("prompt_tokens", "completion_tokens"))
+        counts = (_found(said, "usage", name) for name in ("prompt_tokens", "completion_tokens"))
         tokens_in, tokens_out = (count if isinstance(count, int) and count > 0 else 0 for count in counts)
-        name = echo(str(getattr(said, "model", None) or self.model))
+        name = echo(str(_found(said, "model") or self.model))
         return Answer(
             request, text[-_MOST_CHARACTERS:], name, tokens_in, tokens_out, round(seconds, 3), left_out
         )
@@ -337,6 +337,16 @@ class ChatClient:
     def _shown(self, error: object) -> str:
         text = str(error).strip(". ") or type(error).__name__
         return echo(text.replace(self._key, "…") if self._key else text)
+
+
+def _found(value: Any, *path: str | int) -> Any:
+    """Return what lies at a path in JSON values; None where there is no such place."""
+    for key in path:
+        try:
+            value = value[key]
+        except (LookupError, TypeError):
+            return None
+    return value
 
 
 @dataclass(slots=True)
