@@ -46,7 +46,6 @@ class ChatExportConfig:
         form: How views are shown and points are written.
         questions: Auxiliary questions on the scene for each demonstration.
         seed: Of the choice of questions.
-        force: Replace the export that is at `out`.
 
     Raises:
         ConfigError: A value is not allowed, or `out` holds `data`.
@@ -59,7 +58,6 @@ class ChatExportConfig:
     form: ChatFormat = field(default_factory=ChatFormat)
     questions: int = 0
     seed: int = 0
-    force: bool = False
 
     def __post_init__(self) -> None:
         settle(self, paths=("data", "out"), names=("tasks",))
@@ -83,16 +81,13 @@ def export_chat(
         The folder.
 
     Raises:
-        DatasetError: There are no such demonstrations, or the folder has content and `force` is not set.
+        DatasetError: There are no such demonstrations, or the folder has content.
         ShardError: A shard is damaged.
     """
     dataset = Dataset(config.data, tasks=config.tasks)
     out = config.out
-    is_taken = not all(map(is_lock_file, out.iterdir())) if out.is_dir() else out.exists()
-    if is_taken and not config.force:
-        raise DatasetError(f"{out} is there already; give another folder, or --force to replace it.")
-    if is_taken and not (out / EXAMPLES_NAME).is_file():
-        raise DatasetError(f"{out} holds other things than an export, so --force does not replace it.")
+    if out.exists() and not (out.is_dir() and all(map(is_lock_file, out.iterdir()))):
+        raise DatasetError(f"{out} is there already; give another folder.")
     write = _messages if config.format == "messages" else _llava
     with folder_lock(out), atomic_folder(out) as folder:
         (folder / _IMAGES).mkdir()

@@ -7,8 +7,8 @@ import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -47,41 +47,17 @@ def shot_turns(
     """
     if not count or _SHOT_LEVEL not in task_spec(env.task).levels:
         return ()
-    options = tuple(sorted(env.task_options.items()))
-    return _shot_turns(env.task, env.assets, env.compat, env.prompts, options, count, form, extractor)
-
-
-@lru_cache(maxsize=32)
-def _shot_turns(
-    task: str,
-    assets: Any,
-    compat: bool,
-    prompts: str,
-    options: Iterable[tuple[str, Any]],
-    count: int,
-    form: ChatFormat,
-    extractor: ObjectExtractor | None,
-) -> tuple[Turn, ...]:
-    env = TabletopEnv(
-        task,
-        level=_SHOT_LEVEL,
-        domain="train",
-        assets=assets,
-        compat=compat,
-        prompts=prompts,
-        **dict(options),
-    )
+    settings: dict[str, Any] = {"assets": env.assets, "compat": env.compat, "prompts": env.prompts}
+    shown = TabletopEnv(env.task, level=_SHOT_LEVEL, domain="train", **settings, **env.task_options)
     turns: list[Turn] = []
     seed = 0
     while count:
-        try:
-            demo = rollout_oracle(env, seed)
-        except OracleError:
-            demo = None
+        with suppress(OracleError):
+            demo = rollout_oracle(shown, seed)
+            if demo.outcome.success:
+                count -= 1
+                turns += demo_turns(demo, form, extractor)
         seed += 1
-        if demo is not None and demo.outcome.success:
-            count -= 1
-            turns += demo_turns(demo, form, extractor)
     return tuple(turns)
 
 

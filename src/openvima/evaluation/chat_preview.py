@@ -1,7 +1,6 @@
 """What an evaluation would ask a vision-language model: its first message as a page, and what it costs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -22,35 +21,14 @@ PAGE_NAME = "first_message.html"
 _CHARACTERS_PER_TOKEN = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """About what an evaluation asks, if episodes take as many steps as the oracle.
-
-    Args:
-        requests: Number of requests.
-        image_tokens: Tokens of all images in them, by the family of the model.
-        text_tokens: Tokens of all text in them, at four characters each.
-    """
-
-    requests: int
-    image_tokens: int
-    text_tokens: int
-
-    def __str__(self) -> str:
-        return (
-            f"{self.requests:,} requests, {self.image_tokens:,} tokens of images and {self.text_tokens:,} of "
-            "text, if episodes take as many steps as the oracle; failures take more, and answers come on top"
-        )
-
-
-def write_preview(config: EvaluationConfig) -> tuple[Path, Estimate]:
+def write_preview(config: EvaluationConfig) -> tuple[Path, str]:
     """Write the first message of the first vision-language model as a page; no server is asked.
 
     Args:
         config: The evaluation.
 
     Returns:
-        The page in `config.out`, and the estimate for that model.
+        The page in `config.out`, and an estimate for that model.
 
     Raises:
         ConfigError: No policy is vlm:MODEL.
@@ -78,8 +56,11 @@ def write_preview(config: EvaluationConfig) -> tuple[Path, Estimate]:
         requests += config.episodes * steps
         image_tokens += config.episodes * (steps * images + later * more_images)
         text_tokens += config.episodes * (steps * text + later * more_text)
-    estimate = Estimate(requests, image_tokens, text_tokens)
-    page = render_page("chat", model=models[0], turns=first, estimate=str(estimate), points=form.points)
+    estimate = (
+        f"{requests:,} requests, {image_tokens:,} tokens of images and {text_tokens:,} of text, if episodes "
+        "take as many steps as the oracle; failures take more, and answers come on top"
+    )
+    page = render_page("chat", model=models[0], turns=first, estimate=estimate, points=form.points)
     return atomic_write_file(config.out / PAGE_NAME, page), estimate
 
 

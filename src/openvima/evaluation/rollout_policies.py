@@ -228,8 +228,12 @@ class VlmRolloutPolicy(PromptedRolloutPolicy):
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Put demonstrations of the task before the episodes, if any are asked for."""
-        count = self._policy.client.config.options.shots
-        self._policy.shots = shot_turns(envs[0], count, self._policy.format, self._policy.extractor)
+        env, client, form = envs[0], self._policy.client, self._policy.format
+        key = (env.task, env.prompts, str(env.task_options))
+        if key not in client.shots:
+            count = client.config.options.shots
+            client.shots[key] = shot_turns(env, count, form, self._policy.extractor)
+        self._policy.shots = client.shots[key]
         self.said: list[Said] = [[] for _ in envs]
         super().begin(envs)
 

@@ -39,6 +39,7 @@ from openvima.scene.explanation import Explanation
 KEY_VARIABLE, URL_VARIABLE = "OPENAI_API_KEY", "OPENAI_BASE_URL"
 SEGMENTATION = "segmentation"
 _MOST_CHARACTERS = 20_000  # of an answer that are kept: its last ones
+_LEAST_SECRET = 12  # characters of a key that is kept out of texts
 _RETRIES = 12  # with pauses of up to 8 s, or what the server asks for: a minute and more
 _TIMEOUT_S, _CONNECT_S = 600.0, 10.0
 _OPTIONAL = ("response_format", "temperature")  # that servers may refuse, in the order of leaving them out
@@ -196,10 +197,12 @@ class ChatClient:
         self._openai = require_extra()
         self.model, self.config = model, config
         self.num_requests, self.num_tokens = 0, 0  # of this client, not of answers that were on disk
-        self._key = os.environ.get(KEY_VARIABLE, "")
+        key = os.environ.get(KEY_VARIABLE, "")
+        self._key = key if len(key) >= _LEAST_SECRET else ""  # servers of one's own take "none" or "EMPTY"
         self._client = self._openai.OpenAI(
-            base_url=config.base_url, api_key=self._key or "none", timeout=_TIMEOUT_S, max_retries=_RETRIES
+            base_url=config.base_url, api_key=key or "none", timeout=_TIMEOUT_S, max_retries=_RETRIES
         )
+        self.shots: dict[tuple[str, ...], tuple[Turn, ...]] = {}  # demonstrations, made once for all episodes
         self._lock = threading.Lock()
         self.is_stopped = False  # set to ask nothing more
         self._is_reached = False

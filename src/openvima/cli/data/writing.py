@@ -257,7 +257,6 @@ def export_chat(
     boxes: str = "",
     questions: int = 0,
     seed: int = 0,
-    force: bool = False,
 ) -> int:
     """Export demonstrations as conversations for the fine-tuning of a vision-language model.
 
@@ -279,7 +278,6 @@ def export_chat(
         questions: Auxiliary questions for each demonstration: where an object is, which there are, how two
             lie to each other, what was moved.
         seed: Of the choice of questions.
-        force: Replace the export that is in OUT.
 
     Returns:
         Exit status.
@@ -298,7 +296,6 @@ def export_chat(
         form=ChatFormat(points, view, enlarge),
         questions=questions,
         seed=seed,
-        force=force,
     )
     extractor = GROUND_TRUTH if boxes == SEGMENTATION else plugged_extractor(boxes) if boxes else None
     with progress_bar("export") as report:
