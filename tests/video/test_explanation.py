@@ -152,3 +152,15 @@ def test_an_explanation_that_cannot_be_drawn_is_refused(env, change: dict, messa
 
     with pytest.raises(PolicyError, match=message):
         PromptedRolloutPolicy(Explaining()).explainer()()
+
+
+def test_words_stand_below_the_table_with_their_points(env: TabletopEnv) -> None:
+    action = Action.planar((0.5, 0.3), (0.5, -0.3)).to_arrays()
+    said = "I see it there.\x1b[2J\n" + "and so on " * 200 + '\n{"pick": [800, 500], "place": [200, 500]}'
+    panel = draw_panel(env.scene, env.assets, Explanation(action, (), {}, words=said))
+    assert panel.shape == (HEIGHT, WIDTH, 3)
+    for pose, colour in (("pose0", PICK), ("pose1", PLACE)):
+        x, y = np.rint(ENLARGE * project(np.array([*action[f"{pose}_position"], 0.0]), TOP)).astype(int)
+        near = panel[y - 8 : y + 8, x - 8 : x + 8].reshape(-1, 3)
+        assert (near == colour).all(axis=1).any()
+    assert (panel[TOP.height * ENLARGE + 140 :, :] < 128).any()  # the last line, which holds the points

@@ -337,7 +337,7 @@ def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
     lines[:, 0, 1:] = rows.reshape(len(rows), -1)
     lines[:, 1:, 0] = 2
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # eight bits of red, green and blue
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines, 1)), (b"IEND", b""))
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 1)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         for kind, data in chunks
@@ -376,5 +376,6 @@ def _last_object(text: str, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _is_number(value: object) -> bool:
-    is_plain = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_plain and -_MOST < value < _MOST  # NaN and infinity are not
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return -_MOST < value < _MOST  # NaN and infinity are not

@@ -117,7 +117,7 @@ def summarise(episodes: Sequence[tuple[EpisodeOutcome, Said]]) -> dict[str, Any]
     for outcome, steps in episodes:
         if not outcome.success:
             found = (said["mistake"] for said in steps if said["mistake"])
-            mistake = next(found, {"kind": "another reason"})
+            mistake: dict[str, Any] = next(found, {"kind": "another reason"})
             groups.setdefault(mistake["kind"], []).append(mistake.get("by", 0.0))
     return {
         "requests": len(answers),
