@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from openvima.cli.main import main
+from openvima.cli.train import parse
 from openvima.errors import ConfigError
 from openvima.training import TrainingConfig
 from openvima.training.building import resolve
@@ -59,6 +60,25 @@ def test_every_preset_has_a_recipe_that_trains_it() -> None:
     assert default_recipe("vima-20m") == default_recipe(None) == "paper"
     with pytest.raises(ConfigError, match="Did you mean 'paper'"):
         recipe_settings("papper")
+
+
+@pytest.mark.parametrize(
+    ("options", "points", "weight", "pretraining"),
+    [
+        ([], True, 1.0, 1600),
+        (["--model.image-tokens", "object-perceiver", "--model.conditioning", "prefix"], None, 0.0, 1600),
+        (["--model.image-tokens=patches"], None, 0.0, 0),
+        (["--model.head", "autoregressive"], None, 1.0, 1600),
+        (["--init-from", "openvima-vima"], True, 1.0, 0),
+    ],
+)
+def test_a_recipe_leaves_out_what_other_parts_of_the_network_cannot_have(
+    options, points, weight, pretraining
+) -> None:
+    config = resolve(parse(["--data", "demos", "--out", "run", "--preset", "vima-nano", *options]))
+    assert (config.model.points, config.optimizer.pointing_loss_weight) == (points, weight)
+    assert config.pretraining.steps == pretraining
+    assert config.schedule.steps == recipe_settings("papers")["schedule.steps"]
 
 
 def test_options_take_precedence_over_the_file_and_the_file_over_the_recipe(trained, tmp_path) -> None:

@@ -29,8 +29,8 @@ Example: openvima train --data demos --preset nano --out run
 --recipe selects default settings: "paper" (as in the VIMA paper), "papers" (vima-nano on two cores),
 "papers-midas" and "papers-frames" (midas-nano; gato-nano and the like), "workstation" (one GPU, less data),
 "nano" (minutes on a few cores), "small" (the bundled openvima-small), "midas-pretrain", "midas-finetune" or
-"midas-in-context". The default is that of the preset, "nano" for your own learners, else "paper". --init-from
-disables the pretraining of recipe and file; set --pretraining.steps to pretrain anyway.
+"midas-in-context". The default is that of the preset, "nano" for your own learners, else "paper".
+--init-from disables the pretraining of recipe and file; set --pretraining.steps to pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
 --trust-code lets the file name code that is run, such as a learner or detector of your own.
@@ -60,6 +60,9 @@ COMMON = (
     "runtime.device",
     "runtime.processes",
 )
+
+# Options that change the defaults of others.
+_DECIDING = ("preset", "init_from", "schedule.steps", "schedule.epochs", "model.image_tokens", "model.head")
 
 
 def run(words: Sequence[str]) -> int:
@@ -99,16 +102,17 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
     first.add_argument("--help-all", action="store_true")
     chosen, rest = first.parse_known_args(list(words))
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name, option in {"preset": "", "init_from": "", "steps": "schedule.", "epochs": "schedule."}.items():
-        peek.add_argument(f"--{option}{name.replace('_', '-')}", f"--{option}{name}", dest=name)
-    known, _ = peek.parse_known_args(rest)
+    for name in _DECIDING:
+        peek.add_argument(f"--{name.replace('_', '-')}", f"--{name}", dest=name)
+    known = vars(peek.parse_known_args(rest)[0])
     file = read_settings(chosen.config, trust_code=chosen.trust_code) if chosen.config else {}
-    preset = known.preset or file.get("preset")
+    preset = known.pop("preset") or file.get("preset")
     settings = override(recipe_settings(chosen.recipe or default_recipe(preset or "nano")), file)
-    if known.steps and not known.epochs:
+    steps, epochs = known.pop("schedule.steps"), known.pop("schedule.epochs")
+    if steps and not epochs:
         settings["schedule.epochs"] = None
-    if known.init_from not in (None, "None"):
-        settings = override(settings, {"init_from": known.init_from})
+    given = {name: value for name, value in known.items() if value not in (None, "None")}
+    settings = override(settings, given)
     if preset:
         settings["preset"] = preset  # so that the defaults are consistent before it is parsed again
     settings.setdefault("runtime.workers", num_cpus())

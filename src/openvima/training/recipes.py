@@ -233,8 +233,17 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     """Override settings by others.
 
     Steps replace epochs. `init_from` comes with a trained crop encoder, so it resets pretraining to the
-    default of the preset, which is then none, unless the others set it as well.
+    default of the preset, which is then none, unless the others set it as well. Settings of the recipe
+    `papers` that other image tokens or another head cannot have are dropped.
     """
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     pretraining = {"pretraining.steps": None} if others.get("init_from") else {}
-    return {**settings, **length, **pretraining, **others}
+    tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
+    if tokens != "objects" or others.get("model.head") == "autoregressive":
+        unfit = {"model.points"}
+    if tokens != "objects":
+        unfit |= {"optimizer.pointing_loss_weight"}
+    if tokens not in ("objects", "object-perceiver"):
+        unfit |= _PAPERS.keys() - _PAPERS_FRAMES.keys()
+    fit = {name: value for name, value in settings.items() if name not in unfit}
+    return {**fit, **length, **pretraining, **others}
