@@ -1,4 +1,4 @@
-"""What a wheel holds besides code."""
+"""What a wheel holds, and what works without extras."""
 
 import shutil
 import zipfile
@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 import openvima
+from openvima.errors import MissingExtraError
+from openvima.imports import import_extra, lacks_memory
 
 ROOT = Path(__file__).parents[1]
 POLICY_FILES = {
@@ -73,3 +75,39 @@ def test_the_policies_in_the_package_are_small_and_whole(name, most_bytes) -> No
     assert {file.relative_to(policy.folder).as_posix() for file in files} == POLICY_FILES
     assert sum(file.stat().st_size for file in files) <= most_bytes
     assert "TODO" not in policy.model_card.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("code", "kind", "message"),
+    [
+        (None, MissingExtraError, "^install it$"),
+        ("import odd_package_within", MissingExtraError, "cannot be imported .*odd_package_within"),
+        (
+            "raise ImportError('no symbol x')",
+            MissingExtraError,
+            r"cannot be imported \(no symbol x\); install it",
+        ),
+        (
+            "raise ImportError('failed to map segment from shared object')",
+            MemoryError,
+            "cannot be loaded",
+        ),
+        ("raise OSError(12, 'Cannot allocate memory')", MemoryError, "cannot be loaded"),
+    ],
+)
+def test_only_a_missing_package_is_called_missing(
+    code: str | None, kind: type[Exception], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    if code is not None:
+        (tmp_path / "odd_package.py").write_text(code)
+    with pytest.raises(kind, match=message):
+        import_extra("odd_package", "install it")
+
+
+def test_lack_of_memory_is_found_in_the_causes_of_an_exception() -> None:
+    error = ValueError("no such library")
+    error.__cause__ = OSError("a.so: failed to map segment from shared object")
+    assert lacks_memory(error)
+    assert not lacks_memory(ImportError("failed to map segment from shared object: Operation not permitted"))
+    assert not lacks_memory(ValueError("memory"))

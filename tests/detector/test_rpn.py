@@ -1,13 +1,39 @@
-"""Proposals: the best boxes of all levels, with NMS per level."""
+"""Boxes: proposals of the network, overlaps, alignment."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from torch.nn import functional as F
 
 import naive
-from openvima.detector.boxes import decode_boxes
-from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, RegionProposalNetwork
+from openvima.detector.boxes import (
+    box_iou,
+    cell_anchors,
+    clip_boxes,
+    decode_boxes,
+    encode_boxes,
+    level_anchors,
+    match,
+    nms,
+    pyramid_anchors,
+    subsample,
+)
+from openvima.detector.config import small
+from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, MaskHead, RegionProposalNetwork
+from openvima.detector.roi_align import (
+    align_levels,
+    box_levels,
+    crop_masks,
+    is_cpu_inference,
+    normalise,
+    paste_masks,
+    pyramid_align,
+    rectify_and_pool,
+    roi_align,
+)
 
 HEIGHT, WIDTH = 64, 96
 
@@ -53,3 +79,320 @@ def test_boxes_of_different_levels_do_not_suppress_each_other(tiny):
     given = AnchorPredictions([anchors, anchors], scores, [torch.zeros(1, 2, 4)] * 2)
     (proposed,) = propose(tiny, given)
     assert torch.equal(proposed, torch.cat([anchors, anchors]))
+
+
+ROI_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
+
+
+def random_boxes(count: int, seed: int = 0) -> torch.Tensor:
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(0, 60, (count, 2))
+    return torch.from_numpy(np.concatenate([low, low + rng.uniform(1, 40, (count, 2))], axis=1))
+
+
+def test_iou_of_small_boxes():
+    boxes = torch.tensor([[0.0, 0, 2, 2], [1, 1, 3, 3], [2, 0, 4, 2], [0, 0, 2, 1], [5, 5, 5, 9]])
+    expected = [1, 1 / 7, 0, 1 / 2, 0]
+    assert box_iou(boxes[:1], boxes)[0].tolist() == pytest.approx(expected)
+
+
+def test_iou_agrees_with_the_naive_twin():
+    first, second = random_boxes(30), random_boxes(20, 1)
+    expected = [[naive.box_iou(a, b) for b in second.tolist()] for a in first.tolist()]
+    assert np.allclose(box_iou(first, second), expected, atol=1e-12)
+
+
+def test_regression_targets_of_a_small_case():
+    reference, box = torch.tensor([10.0, 20, 30, 60]), torch.tensor([20.0, 10, 60, 50])
+    # centres (20, 40) and (40, 30), sizes (20, 40) and (40, 40)
+    expected = [20 / 20, -10 / 40, math.log(2), 0.0]
+    assert encode_boxes(box, reference, (1.0, 1.0, 1.0, 1.0)).tolist() == pytest.approx(expected)
+    weighted = [10.0, -2.5, 5 * math.log(2), 0.0]
+    assert encode_boxes(box, reference, ROI_WEIGHTS).tolist() == pytest.approx(weighted)
+
+
+def test_coding_agrees_with_the_naive_twin_and_is_undone_by_decoding():
+    boxes, references = random_boxes(50), random_boxes(50, 1)
+    deltas = encode_boxes(boxes, references, ROI_WEIGHTS)
+    pairs = zip(boxes.tolist(), references.tolist(), strict=True)
+    assert np.allclose(deltas, [naive.encode(a, b, ROI_WEIGHTS) for a, b in pairs], atol=1e-9)
+    assert torch.allclose(decode_boxes(deltas, references, ROI_WEIGHTS, height=200, width=200), boxes)
+
+
+def test_the_growth_of_a_box_is_limited():
+    deltas, box = torch.tensor([0.0, 0, 500, 0]), torch.tensor([600.0, 0, 616, 16])
+    grown = decode_boxes(deltas, box, (1.0,) * 4, height=2000, width=2000)
+    assert float(grown[2] - grown[0]) == pytest.approx(1000)
+
+
+def test_decoded_boxes_are_clipped_to_the_image():
+    deltas, box = torch.tensor([[0.0, 0, 1, 0]]), torch.tensor([[0.0, 2, 16, 18]])
+    assert decode_boxes(deltas, box, (1.0,) * 4, height=10, width=20).tolist() == [[0, 2, 20, 10]]
+
+
+def test_boxes_are_clipped_to_the_image():
+    assert clip_boxes(torch.tensor([[-3.0, 2, 40, 50]]), height=20, width=30).tolist() == [[0, 2, 30, 20]]
+
+
+def test_of_three_boxes_in_a_chain_the_middle_one_goes():
+    # The second overlaps both others by more than a third; it goes, and the third one stays.
+    boxes = torch.tensor([[0.0, 0, 10, 10], [4, 0, 14, 10], [8, 0, 18, 10]])
+    assert nms(boxes, torch.tensor([0.9, 0.8, 0.7]), 0.3).tolist() == [0, 2]
+    assert nms(boxes, torch.tensor([0.8, 0.9, 0.7]), 0.3).tolist() == [1]
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.1, 0.3, 0.5, 0.7])
+@pytest.mark.parametrize("seed", range(5))
+def test_nms_agrees_with_the_naive_twin(limit, seed):
+    rng = np.random.default_rng(seed)
+    boxes = random_boxes(80, seed)
+    scores = rng.integers(0, 20, 80) / 20  # with ties
+    kept = nms(boxes, torch.from_numpy(scores), limit)
+    assert kept.tolist() == naive.nms(boxes.tolist(), scores.tolist(), limit, [0] * 80)
+
+
+def test_nms_acts_in_each_group_alone_and_drops_boxes_without_area():
+    boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 10], [0, 0, 10, 10], [5, 5, 5, 9]])
+    scores, groups = torch.tensor([0.7, 0.8, 0.9, 1.0]), torch.tensor([0, 1, 0, 1])
+    assert nms(boxes, scores, 0.5, groups).tolist() == [2, 1]
+
+
+def test_nms_of_no_boxes_is_empty():
+    assert nms(torch.zeros(0, 4), torch.zeros(0), 0.5).tolist() == []
+
+
+def test_the_anchors_of_a_cell_have_one_area_and_three_shapes():
+    # sizes 8 · √2 by 8 / √2, 8 by 8, 8 / √2 by 8 · √2
+    long, short = 4 * 2**0.5, 2 * 2**0.5
+    expected = [[-long, -short, long, short], [-4, -4, 4, 4], [-short, -long, short, long]]
+    assert np.allclose(cell_anchors(8.0), expected)
+
+
+def test_the_anchors_of_a_level_agree_with_the_naive_twin():
+    made = level_anchors(20.0, stride=8, height=3, width=5)
+    assert np.allclose(made, naive.anchors(20.0, stride=8, height=3, width=5), atol=1e-5)
+
+
+def test_strides_double_from_level_to_level():
+    first, second = pyramid_anchors((16.0, 32.0), [(2, 4), (1, 2)], first_stride=4)
+    assert np.allclose(first, naive.anchors(16.0, stride=4, height=2, width=4), atol=1e-5)
+    assert np.allclose(second, naive.anchors(32.0, stride=8, height=1, width=2), atol=1e-5)
+
+
+OBJECTS = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60]])
+
+
+def test_boxes_are_foreground_background_or_ignored():
+    boxes = torch.tensor(
+        [[0.0, 0, 10, 8], [0, 0, 10, 5], [0, 0, 5, 4], [50, 50, 61, 60]]
+    )  # 0.8, 0.5, 0.2, 0.91
+    numbers, labels = match(boxes, OBJECTS, low=0.3, high=0.7)
+    assert labels.tolist() == [1, -1, 0, 1]
+    assert numbers.tolist() == [0, 0, 0, 1]
+
+
+def test_low_quality_matches_label_the_best_boxes_of_each_object():
+    boxes = torch.tensor([[0.0, 0, 10, 2], [0, 0, 2, 10], [0, 0, 1, 1], [50, 50, 60, 60]])
+    _, labels = match(boxes, OBJECTS, low=0.3, high=0.7, allow_low_quality=True)
+    assert labels.tolist() == [1, 1, 0, 1]
+
+
+def test_without_objects_everything_is_background():
+    numbers, labels = match(OBJECTS, torch.zeros(0, 4), low=0.3, high=0.7, allow_low_quality=True)
+    assert numbers.tolist() == labels.tolist() == [0, 0]
+
+
+def test_an_object_without_intersecting_box_matches_none():
+    _, labels = match(OBJECTS[:1], OBJECTS[1:], low=0.3, high=0.7, allow_low_quality=True)
+    assert labels.tolist() == [0]
+
+
+def test_boxes_are_sampled_with_a_fraction_of_foreground():
+    labels = torch.tensor([1] * 10 + [0] * 50 + [-1] * 5)
+    draw = lambda seed: subsample(  # noqa: E731
+        labels, count=20, positive_fraction=0.25, generator=torch.Generator().manual_seed(seed)
+    )
+    positive, negative = draw(0)
+    assert (labels[positive] == 1).all() and (labels[negative] == 0).all()
+    assert (len(positive), len(negative)) == (5, 15)
+    assert torch.equal(draw(0)[1], negative) and not torch.equal(draw(1)[1], negative)
+
+
+def test_background_replaces_missing_foreground():
+    labels = torch.tensor([1] + [0] * 50)
+    positive, negative = subsample(labels, count=20, positive_fraction=0.5, generator=torch.Generator())
+    assert (len(positive), len(negative)) == (1, 19)
+
+
+def ramp(height: int, width: int) -> torch.Tensor:
+    """Features that grow by 1 a column and by 10 a row."""
+    return (10.0 * torch.arange(height)[:, None] + torch.arange(width)).double()[None, None]
+
+
+def cut(features, boxes, *, size, stride=1.0, sampling_ratio=2, images=None) -> torch.Tensor:
+    boxes = torch.tensor(boxes, dtype=torch.float64)
+    images = torch.zeros(len(boxes), dtype=torch.int64) if images is None else torch.tensor(images)
+    return roi_align(features, boxes, images, size=size, stride=stride, sampling_ratio=sampling_ratio)
+
+
+def test_cells_of_a_ramp_have_the_values_at_their_centres():
+    # A box of 4 × 4 pixels in cells of 2 × 2; the centre of the first lies at pixel 2.5 in both directions.
+    (cells,) = cut(ramp(10, 10), [[2.0, 2, 6, 6]], size=2)
+    assert torch.allclose(cells[0], torch.tensor([[27.5, 29.5], [47.5, 49.5]], dtype=torch.float64))
+
+
+def test_one_cell_on_one_pixel_is_that_pixel():
+    (cells,) = cut(ramp(5, 5), [[3.0, 1, 4, 2]], size=1, sampling_ratio=1)
+    assert cells.item() == 13
+
+
+def test_samples_more_than_one_pixel_outside_are_zero():
+    features = torch.ones(1, 1, 4, 4, dtype=torch.float64)
+    (cells,) = cut(
+        features, [[-4.0, 0, 4, 4]], size=4, sampling_ratio=1
+    )  # columns of 2 at -3.5, -1.5, 0.5, 2.5
+    assert cells[0].tolist() == [[0, 0, 1, 1]] * 4
+
+
+@pytest.mark.parametrize("sampling_ratio", [0, 1, 2, 3])
+@pytest.mark.parametrize("stride", [1.0, 4.0])
+def test_it_agrees_with_the_naive_twin(sampling_ratio, stride):
+    rng = np.random.default_rng(int(10 * stride) + sampling_ratio)
+    features = torch.from_numpy(rng.normal(size=(2, 3, 9, 14)))
+    low = rng.uniform(-4, 10, (12, 2)) * stride
+    boxes = np.concatenate([low, low + rng.uniform(0.1, 16, (12, 2)) * stride], axis=1)
+    images = rng.integers(0, 2, 12)
+    cells = cut(
+        features, boxes.tolist(), size=3, stride=stride, sampling_ratio=sampling_ratio, images=images.tolist()
+    )
+    for number, (box, image) in enumerate(zip(boxes.tolist(), images.tolist(), strict=True)):
+        for channel in range(3):
+            plane = features[image, channel].numpy()
+            expected = naive.roi_align(
+                plane, tuple(box), size=3, stride=stride, sampling_ratio=sampling_ratio
+            )
+            assert np.allclose(cells[number, channel], expected, atol=1e-12)
+
+
+def test_its_gradient_is_that_of_finite_differences():
+    features = torch.randn(2, 2, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    boxes = [[0.3, 0.2, 3.9, 3.1], [1.0, 1.0, 4.6, 2.2]]
+    function = lambda x: cut(x, boxes, size=2, images=[0, 1])  # noqa: E731
+    assert torch.autograd.gradcheck(function, features.requires_grad_())
+
+
+def test_no_boxes_give_no_cells():
+    assert roi_align(
+        ramp(4, 4), torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), size=2, stride=1, sampling_ratio=2
+    ).shape == (0, 1, 2, 2)
+
+
+def test_the_pyramid_level_follows_from_the_size_of_a_box():
+    sides = torch.tensor([5.0, 23.9, 24, 47.9, 48, 96, 500])
+    boxes = torch.stack([sides * 0, sides * 0, sides, sides], dim=1)
+    levels = box_levels(boxes, 3, canonical_size=48, canonical_level=1)
+    assert levels.tolist() == [0, 0, 0, 0, 1, 2, 2]
+
+
+def test_pyramid_align_equals_roi_align_on_the_level_of_each_box():
+    levels = [torch.randn(1, 2, 32 // 2**k, 32 // 2**k, dtype=torch.float64) for k in range(3)]
+    boxes = torch.tensor([[0.0, 0, 100, 100], [3, 5, 20, 30], [10, 10, 70, 60]], dtype=torch.float64)
+    images = torch.zeros(3, dtype=torch.int64)
+    whole = pyramid_align(
+        levels, boxes, images, size=3, sampling_ratio=2, first_stride=4, canonical_size=48, canonical_level=1
+    )
+    for number, level in ((0, 2), (1, 0), (2, 1)):
+        one = boxes[number : number + 1]
+        (expected,) = roi_align(levels[level], one, images[:1], size=3, stride=4 * 2**level, sampling_ratio=2)
+        assert torch.equal(whole[number], expected)
+
+
+def test_pasted_masks_agree_with_the_naive_twin():
+    rng = np.random.default_rng(0)
+    probabilities = rng.uniform(0, 1, (6, 5, 5))
+    low = rng.uniform(-4, 20, (6, 2))
+    boxes = np.concatenate([low, low + rng.uniform(0.5, 15, (6, 2))], axis=1)
+    pasted = paste_masks(torch.from_numpy(probabilities), torch.from_numpy(boxes), height=24, width=30)
+    for number, box in enumerate(boxes.tolist()):
+        expected = naive.paste(probabilities[number], tuple(box), height=24, width=30)
+        assert np.array_equal(pasted[number].numpy(), expected)
+
+
+def test_cropping_and_pasting_keeps_a_mask():
+    mask = torch.zeros(1, 40, 50, dtype=torch.bool)
+    mask[0, 10:30, 5:15] = True
+    mask[0, 20:30, 5:35] = True
+    box = torch.tensor([[5.0, 10, 35, 30]])
+    cells = crop_masks(mask, box, size=28)
+    again = paste_masks(cells.float(), box, height=40, width=50)
+    assert (again & mask).sum() / (again | mask).sum() > 0.95
+
+
+LEVELS = {"canonical_size": 48, "canonical_level": 1}
+
+
+def test_they_take_the_place_of_those_for_training_only_without_gradients():
+    assert not is_cpu_inference(torch.zeros(1))
+    with torch.no_grad():
+        assert is_cpu_inference(torch.zeros(1))
+        assert not is_cpu_inference(torch.zeros(1, device="meta"))
+
+
+def test_pixels_are_normalised_and_padded():
+    pixels = torch.arange(2 * 3 * 5 * 7).view(2, 3, 5, 7).to(torch.uint8)
+    mean, std = torch.tensor([10.0, 20, 30]), torch.tensor([2.0, 3, 7])
+    expected = F.pad((pixels - mean.view(3, 1, 1)) / std.view(3, 1, 1), (0, 1, 0, 3))
+    assert torch.equal(normalise(pixels, mean, std, height=8, width=8), expected)
+
+
+@pytest.mark.parametrize(("height", "width"), [(6, 10), (5, 7), (1, 1), (2, 3)])
+def test_pooling_equals_relu_and_max_pooling(height, width):
+    x = torch.randn(2, 3, height, width, generator=torch.Generator().manual_seed(0))
+    for given in (x, x.to(memory_format=torch.channels_last)):
+        assert torch.equal(rectify_and_pool(given), F.max_pool2d(F.relu(x), 3, stride=2, padding=1))
+
+
+@pytest.mark.parametrize("sampling_ratio", [0, 1, 2, 3])
+def test_aligned_features_agree_with_the_naive_twin(sampling_ratio):
+    rng = np.random.default_rng(sampling_ratio)
+    levels = [torch.from_numpy(rng.normal(size=(2, 3, 16 // 2**k, 24 // 2**k))) for k in range(3)]
+    low = rng.uniform(-20, 80, (20, 2))
+    boxes = torch.from_numpy(np.concatenate([low, low + rng.uniform(0.1, 120, (20, 2))], axis=1))
+    images, indices = torch.arange(20) % 2, torch.arange(20) % 3
+    cells = align_levels(
+        levels, boxes, images, indices, size=3, sampling_ratio=sampling_ratio, first_stride=4
+    )
+    for number, (box, image, level) in enumerate(zip(boxes, images, indices, strict=True)):
+        for channel in range(3):
+            expected = naive.roi_align(
+                levels[level][image, channel].numpy(),
+                tuple(box.tolist()),
+                size=3,
+                stride=4 * 2 ** int(level),
+                sampling_ratio=sampling_ratio,
+            )
+            assert np.allclose(cells[number, channel], expected, atol=1e-12)
+
+
+def test_aligned_features_are_those_of_training():
+    generator = torch.Generator().manual_seed(0)
+    levels = [torch.randn(2, 4, 32 // 2**k, 64 // 2**k, generator=generator) for k in range(3)]
+    low = 100 * torch.rand(9, 2, generator=generator)
+    boxes = torch.cat([low, low + 100 * torch.rand(9, 2, generator=generator)], dim=1)
+    sizes = {"size": 7, "sampling_ratio": 2, "first_stride": 4}
+    trained = pyramid_align(levels, boxes, torch.arange(9) % 2, **sizes, **LEVELS)
+    with torch.no_grad():
+        assert torch.allclose(
+            pyramid_align(levels, boxes, torch.arange(9) % 2, **sizes, **LEVELS), trained, atol=1e-5
+        )
+        assert pyramid_align(levels, boxes[:0], torch.arange(0), **sizes, **LEVELS).shape == (0, 4, 7, 7)
+
+
+def test_mask_logits_are_those_of_training():
+    torch.manual_seed(0)
+    head = MaskHead(small())
+    torch.nn.init.normal_(head.deconv.bias)
+    features = torch.randn(3, 32, 14, 14)
+    with torch.no_grad():
+        inference = head(features)
+    assert torch.allclose(inference, head(features), atol=1e-6)

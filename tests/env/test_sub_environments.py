@@ -1,12 +1,22 @@
-"""Batches of infos are those of Gymnasium."""
+"""Sub-environments: their infos, and episodes prepared ahead."""
 
+import zlib
+from collections.abc import Callable
 from typing import Any  # infos are nested dictionaries
 
+import gymnasium
 import numpy as np
-from gymnasium.vector import VectorEnv
+import pytest
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import create_empty_array
 
-from openvima.env.sub_environments import batch_infos
-from task_cases import full_repr
+import openvima
+from openvima.env import TabletopEnv, stack_actions
+from openvima.env.sub_environments import SubEnvironments, batch_infos
+from openvima.errors import ConfigError, SamplingError
+from openvima.scene import RenderedPrompt
+from openvima.tasks import list_tasks, sample_episode
+from task_cases import full_repr, random_action
 
 
 class Gathering(VectorEnv):
@@ -45,3 +55,189 @@ def test_infos_are_joined_as_gymnasium_does() -> None:
 
 def dtypes(batch: dict[str, Any]) -> dict[str, Any]:
     return {key: dtypes(value) if isinstance(value, dict) else value.dtype for key, value in batch.items()}
+
+
+SLOW_TASKS = [pytest.param(task, marks=pytest.mark.slow) for task in list_tasks() if task != "rotate"]
+
+
+def digest(value: Any) -> Any:
+    """The bytes of all arrays, and the full text of all else."""
+    if isinstance(value, dict):
+        return {key: digest(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [digest(entry) for entry in value]
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        return value.shape, value.dtype.str, zlib.crc32(value.tobytes())
+    return full_repr(value.tolist() if isinstance(value, np.ndarray) else value)
+
+
+def images_of(prompt: RenderedPrompt) -> list[Any]:
+    return [digest([image.rgb, image.segm, image.objects]) for image in prompt.images.values()]
+
+
+def start_of(env: TabletopEnv, **arguments: Any) -> Any:
+    """All that is seen of an episode's start and of its first step."""
+    start = env.reset(**arguments)
+    drawn = env.np_random.bit_generator.state
+    action = env.oracle_decision().action if env.control == "primitives" else env.oracle_command()
+    return digest([start, images_of(env.prompt), drawn, env.episode, env.step(action)])
+
+
+@pytest.mark.parametrize("task", ["rotate", *SLOW_TASKS])
+def test_a_prepared_episode_has_the_same_bytes(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = start_of(TabletopEnv(task), seed=5)
+    env = TabletopEnv(task)
+    env.reset(seed=3)
+    env.prepare(5)
+    monkeypatch.delattr("openvima.env.tabletop.sample_episode")  # the reset needs no other
+    assert start_of(env, seed=5) == expected
+
+
+def test_the_seed_that_a_reset_draws_is_foreseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    env, other = TabletopEnv("rotate"), TabletopEnv("rotate")
+    other.reset(seed=3)
+    expected = [start_of(other) for _ in range(2)]
+    env.reset(seed=3)
+    env.prepare()
+    with monkeypatch.context() as patch:
+        patch.delattr("openvima.env.tabletop.sample_episode")
+        assert start_of(env) == expected[0]
+    assert start_of(env) == expected[1]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"level": "L1"},
+        {"domain": "eval"},
+        {"prompts": "text"},
+        {"compat": True},
+        {"control": "end_effector"},
+        {"task_options": {"num_distractors": 2}},
+    ],
+)
+def test_settings_that_change_after_the_preparation_count(change: dict[str, Any]) -> None:
+    env, expected = TabletopEnv("rotate"), TabletopEnv("rotate")
+    env.prepare(5)
+    for each in (env, expected):
+        for name, value in change.items():
+            setattr(each, name, value)
+    assert start_of(env, seed=5) == start_of(expected, seed=5)
+
+
+def test_a_reset_to_another_episode_discards_the_prepared_one() -> None:
+    env, expected = TabletopEnv("rotate"), TabletopEnv("rotate")
+    episode = sample_episode("twist", seed=8)
+    for arguments in ({"seed": 6}, {"options": {"episode": episode}}, {"seed": 5}):
+        env.prepare(5)
+        assert start_of(env, **arguments) == start_of(expected, **arguments)
+
+
+def test_an_episode_is_prepared_while_another_is_running() -> None:
+    env, expected = TabletopEnv("rotate"), TabletopEnv("rotate")
+    for each in (env, expected):
+        each.reset(seed=3)
+    env.prepare(5)
+    action = env.oracle_decision().action
+    assert digest(env.step(action)) == digest(expected.step(action))
+
+
+def test_what_cannot_be_prepared_raises_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise SamplingError("no place for the target")
+
+    env = TabletopEnv("rotate")
+    env.reset(seed=3)
+    with pytest.raises(ConfigError, match="seed is -1"):
+        env.prepare(-1)
+    with monkeypatch.context() as patch:
+        patch.setattr("openvima.env.tabletop.sample_episode", fail)
+        with pytest.raises(SamplingError):
+            env.prepare(5)
+    assert env.episode.seed == 3
+    assert start_of(env, seed=5) == start_of(TabletopEnv("rotate"), seed=5)
+
+
+class Recorder(gymnasium.Env):
+    """Lasts `length` steps, and records what it is asked to do."""
+
+    observation_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, length: int, calls: list[tuple[int, str]], index: int) -> None:
+        self.length, self.num_steps, self.record = length, 0, lambda name: calls.append((index, name))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[int, dict]:
+        self.record("reset")
+        self.num_steps = 0
+        return 0, {}
+
+    def step(self, action: object) -> tuple[int, float, bool, bool, dict]:
+        self.num_steps += 1
+        return 1, 0.0, self.num_steps == self.length, False, {}
+
+    def prepare(self) -> None:
+        self.record("prepare")
+        raise SamplingError("a reset will report it")
+
+
+def recorders(mode: AutoresetMode) -> tuple[SubEnvironments, Callable[[], list[tuple[int, str]]]]:
+    """Three environments, of which the last one ends first, and what prepares all that can be."""
+    calls: list[tuple[int, str]] = []
+    envs = [Recorder(length, calls, index) for index, length in enumerate([9, 9, 1])]
+    played = SubEnvironments(envs, mode, create_empty_array(Recorder.observation_space, 3))
+
+    def prepared() -> list[tuple[int, str]]:
+        calls.clear()
+        while played.prepare():
+            pass
+        return list(calls)
+
+    return played, prepared
+
+
+def test_each_is_prepared_once_and_first_what_the_next_step_resets() -> None:
+    played, prepared = recorders(AutoresetMode.NEXT_STEP)
+    assert prepared() == []  # no episode has begun
+    played.reset([None, None, None], None)
+    played.step(np.zeros(3))
+    assert prepared() == [(2, "prepare"), (0, "prepare"), (1, "prepare")]
+    assert prepared() == []
+    played.step(np.zeros(3))
+    assert prepared() == [(2, "prepare")]
+
+
+@pytest.mark.parametrize(
+    ("mode", "expected"), [(AutoresetMode.NEXT_STEP, [(2, "prepare")]), (AutoresetMode.DISABLED, [])]
+)
+def test_resets_with_seeds_are_not_expected_to_be_followed_by_others(
+    mode: AutoresetMode, expected: list[tuple[int, str]]
+) -> None:
+    played, prepared = recorders(mode)
+    played.reset([1, 2, 3], None)
+    assert prepared() == []
+    played.step(np.zeros(3))
+    assert prepared() == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [None, range(9)])
+def test_workers_that_prepare_play_the_episodes_of_one_process(seeds: range | None) -> None:
+    def play(num_workers: int) -> list[Any]:
+        tasks = ["rotate", "visual_manipulation", "sweep_without_exceeding"]
+        envs = openvima.make_vec(tasks, num_workers=num_workers, seeds=seeds)
+        rng, seen = np.random.default_rng(0), []
+        for seed in (1, [7, 8, None], None):
+            seen.append(digest(envs.reset(seed=seed)))
+            for step in range(8):
+                if num_workers and step % 2:
+                    envs.call("prepare")  # besides what workers do on their own
+                if step == 4:
+                    envs.set_attr("prompts", "text" if seed is None else "mixed")
+                actions = [random_action(rng, scene) for scene in envs.get_attr("scene")]
+                seen.append(digest(envs.step(stack_actions(actions))))
+                seen.append([images_of(prompt) for prompt in envs.get_attr("prompt")])
+        envs.close()
+        return seen
+
+    assert play(2) == play(0)

@@ -1,7 +1,11 @@
-"""The label raster: axes, cells, stacking and stamping."""
+"""Label images and glTF files."""
+
+import io
 
 import numpy as np
+import pytest
 
+from openvima.catalog.packs import load_assets
 from openvima.render import CELL_M, LABEL_SHAPE, cell_centres, empty_labels, label_raster, stamp
 from openvima.scene import Placement, Pose, Scene
 from sim_cases import BoxAssets
@@ -65,3 +69,16 @@ def test_what_is_above_the_ceiling_or_below_the_sheet_or_off_the_table_does_not_
         boxed(7, Pose.planar(1.2, 0.0, z=0.01)),
     ]
     assert not label_raster(placements, ASSETS).any()
+
+
+def test_an_object_keeps_vertices_normals_and_texture() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    from openvima.render.gltf import object_glb
+
+    assets, size, scale = load_assets(), (0.05, 0.05, 0.05), (1.0, 1.0, 1.0)
+    read = trimesh.load(io.BytesIO(object_glb(assets, "block", "red swirl", size, scale)), file_type="glb")
+    (mesh,) = read.geometry.values()
+    drawn = assets.geometry("block", size, scale).visual
+    assert np.allclose(mesh.triangles, drawn.vertices)
+    assert np.allclose(mesh.vertex_normals[mesh.faces], drawn.normals, atol=1e-6)
+    assert np.array_equal(np.asarray(mesh.visual.material.baseColorTexture), assets.texture("red swirl"))

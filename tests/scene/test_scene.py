@@ -1,9 +1,32 @@
-"""Scenes hold objects by their ids."""
+"""Records of a scene: poses, placements, prompts, goals, explanations."""
 
+import math
+
+import numpy as np
 import pytest
+from hypothesis import given
 
-from openvima.errors import SceneError
-from openvima.scene import Placement, Pose, Scene, in_workspace
+from openvima.errors import PromptError, SceneError
+from openvima.scene import (
+    AtPose,
+    InZone,
+    NeverTouches,
+    ObjectImage,
+    Placement,
+    Pose,
+    Prompt,
+    PromptImage,
+    RenderedPrompt,
+    Scene,
+    Tolerance,
+    Zone,
+    angle_difference,
+    block_points,
+    in_workspace,
+)
+from openvima.scene.explanation import Explanation, ObjectProbability, PlaceProbability
+from openvima.scene.scene import normalised
+from strategies import angles, flat_poses, poses, vectors
 
 
 def placed(object_id: int, x: float = 0.5) -> Placement:
@@ -36,3 +59,191 @@ def test_moving_one_object_leaves_the_others_and_the_old_scene_alone() -> None:
 )
 def test_the_workspace_includes_its_border(x: float, y: float, inside: bool) -> None:
     assert in_workspace(Pose.planar(x, y)) is inside
+
+
+def assert_close(a: Pose, b: Pose) -> None:
+    np.testing.assert_allclose(a.position, b.position, atol=1e-9)
+    np.testing.assert_allclose(a.matrix(), b.matrix(), atol=1e-9)  # q and −q are the same rotation
+
+
+@given(poses)
+def test_a_pose_times_its_inverse_is_the_identity(pose: Pose) -> None:
+    assert_close(pose @ pose.inverse(), Pose((0.0, 0.0, 0.0)))
+    assert_close(pose.inverse() @ pose, Pose((0.0, 0.0, 0.0)))
+
+
+@given(poses, poses, vectors)
+@pytest.mark.slow
+def test_chained_poses_map_points_one_after_the_other(a: Pose, b: Pose, point: tuple[float, ...]) -> None:
+    np.testing.assert_allclose((a @ b).transform(np.array(point)), a.transform(b.transform(point)), atol=1e-9)
+
+
+@given(poses)
+def test_the_rotation_matrix_is_orthonormal_and_right_handed(pose: Pose) -> None:
+    matrix = pose.matrix()
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+
+
+@given(flat_poses, angles)
+def test_turning_on_the_spot_adds_to_the_heading_and_keeps_the_place(pose: Pose, turn: float) -> None:
+    turned = pose.rotated(turn)
+    assert turned.position == pose.position
+    assert angle_difference(turned.yaw_rad, pose.yaw_rad + turn) < 1e-9
+
+
+def test_the_heading_is_counter_clockwise_seen_from_above() -> None:
+    x_axis = Pose.planar(0, 0, math.pi / 2).transform(np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(x_axis, [0, 1, 0], atol=1e-12)
+
+
+def test_the_heading_of_a_tilted_body_is_that_of_the_static_zxy_angles() -> None:
+    # R = Ry(0.3) Rx(-0.2) Rz(0.7), written out by hand.
+    about_y = Pose((0, 0, 0), (0.0, math.sin(0.15), 0.0, math.cos(0.15)))
+    about_x = Pose((0, 0, 0), (math.sin(-0.1), 0.0, 0.0, math.cos(-0.1)))
+    assert (about_y @ about_x @ Pose.planar(0, 0, 0.7)).yaw_rad == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize(
+    ("a_deg", "b_deg", "period_deg", "expected_deg"),
+    [
+        (0, 350, 360, 10),
+        (-179, 179, 360, 2),
+        (0, 80, 90, 10),
+        (0, 180, 360, 180),
+        (10, 130, 120, 0),
+        (0, 77, 0, 0),
+    ],
+)
+def test_angles_differ_by_the_shorter_way_round(
+    a_deg: float, b_deg: float, period_deg: float, expected_deg: float
+) -> None:
+    difference = angle_difference(*(math.radians(v) for v in (a_deg, b_deg, period_deg)))
+    assert math.degrees(difference) == pytest.approx(expected_deg, abs=1e-9)
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (math.inf, 0, 0, 1)])
+def test_a_quaternion_without_direction_is_refused(quaternion: tuple[float, float, float, float]) -> None:
+    with pytest.raises(SceneError, match="no direction"):
+        normalised(quaternion)
+
+
+IMAGE = ObjectImage(Placement(5, "block", "red", (0.07, 0.07, 0.07), Pose.planar(0.5, 0.0)))
+
+
+def rendered(name: str) -> PromptImage:
+    nothing = np.zeros((3, 128, 256), np.uint8)
+    return PromptImage(name, "object", {"top": nothing}, {"top": nothing[0]}, ())
+
+
+def test_words_and_numbers_enter_the_text_and_images_keep_their_place() -> None:
+    prompt = Prompt.parse("Put {det} {b} into {a}, {angle} times.", det="any", angle=3, a=IMAGE, b=IMAGE)
+    assert prompt.text == "Put any {b} into {a}, 3 times."
+    assert [name for name, _ in prompt.images] == ["b", "a"]  # in reading order
+
+
+def test_a_placeholder_that_occurs_twice_has_one_image() -> None:
+    prompt = Prompt.parse("First {a}, then {b}, then {a}.", a=IMAGE, b=IMAGE)
+    assert [name for name, _ in prompt.images] == ["a", "b"]
+
+
+@pytest.mark.parametrize("fills", [{}, {"a": IMAGE, "b": IMAGE}])
+def test_slots_and_fills_must_be_the_same(fills: dict[str, ObjectImage]) -> None:
+    with pytest.raises(PromptError, match="slots"):
+        Prompt.parse("Look at {a}.", **fills)
+
+
+def test_a_rendered_prompt_reads_as_an_interleaved_sequence() -> None:
+    a, b = rendered("a"), rendered("b")
+    prompt = RenderedPrompt("Put the {a} into the {b}.", {"a": a, "b": b})
+    assert prompt.sequence() == ["Put the", a, "into the", b, "."]
+
+
+def test_a_rendered_prompt_without_an_image_is_refused() -> None:
+    with pytest.raises(PromptError, match="names images"):
+        RenderedPrompt("Put the {a}.", {}).sequence()
+
+
+BLOCK_SIZE = (0.03, 0.03, 0.03)
+
+
+def scene_with_block(pose: Pose) -> Scene:
+    return Scene((Placement(4, "small block", "red", BLOCK_SIZE, pose),), "spatula")
+
+
+@pytest.mark.parametrize(("distance", "met"), [(0.0, True), (0.0999, True), (0.1, False), (0.1001, False)])
+def test_the_position_tolerance_is_strict(distance: float, met: bool) -> None:
+    tolerance = Tolerance(position_m=0.1)
+    assert tolerance.accepts(Pose.planar(distance, 0.0), Pose.planar(0.0, 0.0)) is met
+
+
+@pytest.mark.parametrize(("error_deg", "met"), [(0, True), (14.5, True), (-14.5, True), (15.5, False)])
+def test_the_yaw_tolerance_holds_across_the_wrap(error_deg: float, met: bool) -> None:
+    tolerance = Tolerance(position_m=0.1, yaw_rad=math.radians(15))
+    target = Pose.planar(0, 0, math.radians(178))
+    assert tolerance.accepts(target.rotated(math.radians(error_deg)), target) is met
+
+
+def test_height_does_not_count() -> None:
+    assert Tolerance(0.1).accepts(Pose.planar(0, 0, z=0.5), Pose.planar(0, 0))
+
+
+def test_symmetric_shapes_match_at_any_of_their_headings() -> None:
+    goal = AtPose(4, Pose.planar(0.5, 0), Tolerance(0.1, math.radians(15)), symmetry_rad=math.pi / 2)
+    assert goal.is_met(scene_with_block(Pose.planar(0.5, 0, math.radians(80))))
+    assert not goal.is_met(scene_with_block(Pose.planar(0.5, 0, math.radians(45))))
+
+
+def test_a_block_is_eight_points_that_miss_its_upper_edges() -> None:
+    points = block_points(Pose.planar(0.5, 0.1, z=0.014))
+    assert len(points) == 8
+    assert min(x for x, _, _ in points) == pytest.approx(0.485)
+    assert max(x for x, _, _ in points) == pytest.approx(0.505)
+    assert max(z for _, _, z in points) == pytest.approx(0.019)
+
+
+@pytest.mark.parametrize(
+    ("x", "inside"), [(0.5, True), (0.5451, False), (0.5449, True), (0.4651, True), (0.4649, False)]
+)
+def test_a_block_is_in_a_zone_only_with_all_its_points(x: float, inside: bool) -> None:
+    goal = InZone(4, Zone(0.5, 0.0, 0.1, 0.1))  # x from 0.45 to 0.55; points from x − 0.015 to x + 0.005
+    assert goal.is_met(scene_with_block(Pose.planar(x, 0.0))) is inside
+
+
+@pytest.mark.parametrize(("x", "touches"), [(0.5349, True), (0.5351, False)])
+def test_a_block_touches_a_line_with_one_point(x: float, touches: bool) -> None:
+    line = NeverTouches((4,), Zone(0.5, 0.0, 0.04, 0.3), "line")
+    assert line.is_met(scene_with_block(Pose.planar(x, 0.0))) is not touches
+
+
+def test_a_zone_ends_below_a_height_of_30_centimetres() -> None:
+    zone = Zone(0.5, 0.0, 0.1, 0.1)
+    assert zone.contains((0.5, 0.0, 0.299))
+    assert not zone.contains((0.5, 0.0, 0.3))
+
+
+def explained(picks: list[float], places: list[tuple[float, float]]) -> Explanation:
+    """Build an explanation of pick probabilities and of pairs of x and probability of places."""
+    return Explanation(
+        {},
+        (),
+        {},
+        tuple(ObjectProbability(number, {}, (0.5, 0.0), p) for number, p in enumerate(picks)),
+        tuple(PlaceProbability("grid", (x, 0.0), p) for x, p in places),
+    )
+
+
+def test_candidates_at_one_place_count_together() -> None:
+    places = explained([1.0], [(0.3, 0.3), (0.5, 0.4), (0.31, 0.3)]).distinct_places()
+    assert [round(place.probability, 6) for place in places] == [0.6, 0.4]
+    assert places[0].position == (0.3, 0.0)
+
+
+def test_the_second_choice_is_another_place_or_another_object() -> None:
+    picked, place, probability = explained([0.9, 0.1], [(0.3, 0.6), (0.5, 0.4)]).second_choice() or (0, 0, 0)
+    assert picked.object_id == 0 and place.position == (0.5, 0.0)  # type: ignore[union-attr]
+    assert probability == pytest.approx(0.36)
+    picked, place, probability = explained([0.6, 0.4], [(0.3, 1.0)]).second_choice() or (0, 0, 0)
+    assert picked.object_id == 1 and place is None  # type: ignore[union-attr]
+    assert probability == pytest.approx(0.4)
+    assert explained([1.0], [(0.3, 1.0)]).second_choice() is None

@@ -1,6 +1,9 @@
-"""Free places, sizes, crowding, redraws; what a sampled episode promises whatever the task."""
+"""Sampling of starts and its seeds."""
 
 import collections
+import itertools
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -25,10 +28,12 @@ from openvima.scene import (
     in_workspace,
 )
 from openvima.tasks import (
+    DOMAINS,
     TableSampler,
     advance,
     begin,
     list_tasks,
+    make_rng,
     register_task,
     registry,
     sample_episode,
@@ -344,3 +349,52 @@ def test_wrong_arguments_are_refused_by_name() -> None:
         sample_episode("rotate", seed=0, num_distractors=9)
     with pytest.raises(ConfigError, match="seed is -1"):
         sample_episode("rotate", seed=-1)
+
+
+def first_draw(*key: object, attempt: int = 0) -> int:
+    return int(make_rng(*key, attempt=attempt).integers(2**63))  # type: ignore[arg-type]  # keys are built below
+
+
+@given(seeds)
+def test_equal_keys_give_equal_draws(seed: int) -> None:
+    key = ("train", "rotate", "L1", seed, "scene")
+    assert first_draw(*key) == first_draw(*key)
+
+
+def test_no_two_keys_share_a_stream() -> None:
+    keys = itertools.product(DOMAINS, ("rotate", "twist"), ("train", "L1"), range(50), ("scene", "oracle"))
+    draws = [first_draw(*key) for key in keys]
+    draws += [first_draw("user", "rotate", "train", 0, "scene", attempt=attempt) for attempt in range(1, 50)]
+    assert len(set(draws)) == len(draws)
+
+
+def test_large_seeds_do_not_wrap_onto_small_ones() -> None:
+    assert first_draw("user", "rotate", "train", 2**32, "scene") != first_draw(
+        "user", "rotate", "train", 0, "scene"
+    )
+
+
+def test_names_hash_alike_in_another_process() -> None:
+    code = (
+        "from openvima.tasks import make_rng; "
+        "print(make_rng('eval', 'rotate', 'L2', 7, 'scene').integers(2**63))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(result.stdout) == first_draw("eval", "rotate", "L2", 7, "scene")
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 1.5, "7", None, True])
+def test_a_seed_that_is_no_natural_number_is_refused(seed: object) -> None:
+    with pytest.raises(ConfigError, match=r"seed is .*give an integer from 0"):
+        first_draw("user", "rotate", "train", seed, "scene")
+
+
+def test_numpy_integers_are_seeds_too() -> None:
+    assert first_draw("user", "rotate", "train", np.int64(7), "scene") == first_draw(
+        "user", "rotate", "train", 7, "scene"
+    )
+
+
+def test_an_unknown_domain_is_refused_with_a_suggestion() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'train'"):
+        first_draw("trian", "rotate", "train", 0, "scene")

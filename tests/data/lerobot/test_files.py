@@ -1,0 +1,249 @@
+"""The files of an export: features, tables, statistics, videos."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from openvima.data import Demonstration, lerobot_files
+from openvima.data.lerobot_files import (
+    DATA_PATH,
+    QUANTILES,
+    FileNumber,
+    NumberedTable,
+    NumberedVideo,
+    PixelFormat,
+    count_pixels,
+    pixel_statistics,
+    value_statistics,
+)
+from openvima.data.lerobot_frames import FrameLayout, action_from_row, frame_layout
+from openvima.env import TabletopEnv
+from openvima.errors import ActionError
+from openvima.scene import END_EFFECTORS, Action
+from openvima.scene.action import ToolCommand
+
+
+@pytest.mark.parametrize("has_joints", [True, False])
+def test_an_observation_is_encoded_as_the_frame_of_the_export(
+    demos: list[Demonstration], has_joints: bool
+) -> None:
+    layout = FrameLayout(3, has_joints)
+    for demo in demos:
+        pictures, values = layout.pictures(demo), layout.values(demo)
+        for step in range(demo.num_steps):
+            observation = {
+                "rgb": {view: images[step] for view, images in demo.rgb.items()},
+                "joints": demo.joint_paths[step][0],
+                "ee": END_EFFECTORS.index(demo.end_effector),
+            }
+            frame = layout.frame(observation, demo.prompt)
+            np.testing.assert_array_equal(frame["agent_pos"], values["observation.state"][step])
+            assert [f"observation.images.{name}" for name in frame["pixels"]] == list(layout.video_keys)
+            for key, images in pictures.items():
+                shown = frame["pixels"][key.rpartition(".")[2]]
+                np.testing.assert_array_equal(np.moveaxis(shown, -1, 0), images[min(step, len(images) - 1)])
+            row = values["action"][step]
+            for key, array in demo.actions[step].to_arrays().items():
+                np.testing.assert_allclose(action_from_row(row)[key], array, atol=1e-6)
+
+
+def test_an_environment_observes_what_an_export_contains() -> None:
+    env = TabletopEnv("rotate", domain="user", modalities=("rgb", "joints"))
+    observation, _ = env.reset(seed=1)
+    frame = FrameLayout(1, True).frame(observation, env.prompt)
+    np.testing.assert_array_equal(frame["agent_pos"], [*env.joints, 0])
+    assert frame["pixels"]["prompt_0_top"].shape == (128, 256, 3)
+
+
+def test_a_row_beyond_the_bounds_is_brought_back_and_one_that_is_none_is_refused() -> None:
+    row = np.array([0.9, -0.7, 0, 0, 3, 4, 0.5, 0.1, 0, 0, 0, 0], np.float32)
+    action = Action.from_arrays(action_from_row(row))
+    assert action.pose0_position == (0.75, -0.5)
+    assert action.pose0_rotation == pytest.approx((0, 0, 0.6, 0.8))
+    for bad in (np.nan, np.inf):
+        row[0] = bad
+        with pytest.raises(ActionError, match="must be finite"):
+            Action.from_arrays(action_from_row(row))
+    with pytest.raises(ActionError, match=r"shape \(11,\)"):
+        action_from_row(row[:11])
+    with pytest.raises(ActionError, match="dtype int64; it must be 12 floating-point numbers"):
+        action_from_row(np.zeros(12, np.int64))
+
+
+def test_a_row_of_commands_is_one_for_the_environment() -> None:
+    layout = frame_layout("end_effector", 0, True)
+    assert layout.action_names == ("dx", "dy", "dz", "dyaw", "tool")
+    row = np.array([0.5, 0, 0, 0, 0.7], np.float64)
+    assert ToolCommand.from_array(layout.action(row)).dx == pytest.approx(0.05)
+    for bad in (row[:4], row.astype(int), np.zeros((1, 5))):
+        with pytest.raises(ActionError, match="5 floating-point numbers: dx, dy, dz, dyaw, tool"):
+            layout.action(bad)
+    assert frame_layout("primitives", 0, False).state_names == ("end_effector",)
+
+
+def test_a_chunk_is_full_after_a_thousand_files() -> None:
+    assert FileNumber(0, 998).next() == FileNumber(0, 999)
+    assert FileNumber(0, 999).next() == FileNumber(1, 0)
+
+
+@pytest.mark.parametrize("group_bytes", [1000, 10**6])
+def test_files_stay_below_their_limit_and_hold_all_rows_in_order(tmp_path: Path, group_bytes: int) -> None:
+    limit, numbers = 20_000, []
+    with NumberedTable(tmp_path, DATA_PATH, limit_bytes=limit, group_bytes=group_bytes) as table:
+        for start in range(0, 10_000, 50):
+            numbers.append(table.write(pa.table({"x": pa.array(range(start, start + 50))})))
+    files = sorted(tmp_path.rglob("*.parquet"))
+    assert len(files) > 2
+    assert numbers == sorted(numbers, key=lambda n: n.file)
+    assert pq.read_table(files[0])["x"].to_pylist()[-1] == 50 * numbers.count(FileNumber(0, 0)) - 1
+    joined = pa.concat_tables([pq.read_table(file) for file in files])
+    assert joined["x"].to_pylist() == list(range(10_000))
+    assert all(file.stat().st_size < limit for file in files)
+
+
+def test_rows_written_together_share_a_row_group(tmp_path: Path) -> None:
+    with NumberedTable(tmp_path, DATA_PATH, limit_bytes=10**6, group_bytes=500) as table:
+        for start in range(0, 300, 30):
+            table.write(pa.table({"x": pa.array(range(start, start + 30))}))
+    file = pq.ParquetFile(next(tmp_path.rglob("*.parquet")))
+    sizes = [file.metadata.row_group(n).num_rows for n in range(file.num_row_groups)]
+    assert len(sizes) > 1
+    assert all(size % 30 == 0 for size in sizes)
+
+
+def smallest_not_exceeded_by(values: np.ndarray, share: float) -> float:
+    """The definition of a quantile, taken literally."""
+    return min(v for v in values if np.mean(values <= v) >= share)
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 100])
+def test_numbers_get_the_statistics_of_numpy(length: int) -> None:
+    values = np.random.default_rng(length).normal(size=(length, 2)).astype(np.float32)
+    found = value_statistics(values)
+    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(found[name], getattr(np, name)(values.astype(np.float64), axis=0))
+    for name, share in QUANTILES.items():
+        expected = [smallest_not_exceeded_by(column, share) for column in values.T]
+        np.testing.assert_array_equal(found[name], expected)
+    assert found["count"].tolist() == [length]
+
+
+def test_the_extremes_of_truth_values_are_truth_values() -> None:
+    found = value_statistics(np.array([False, False, True]))
+    assert (found["min"].tolist(), found["max"].tolist()) == ([False], [True])
+    assert found["mean"] == pytest.approx(1 / 3)
+
+
+def test_pictures_get_the_statistics_of_their_pixels_by_channel() -> None:
+    pictures = np.random.default_rng(0).integers(20, 200, (3, 3, 4, 8), dtype=np.uint8)
+    found = pixel_statistics(count_pixels(pictures, 3), 3)
+    for channel in range(3):
+        pixels = pictures[:, channel].reshape(-1) / 255
+        for name in ("min", "max", "mean", "std"):
+            assert found[name][channel, 0, 0] == pytest.approx(getattr(np, name)(pixels), abs=1e-12)
+        for name, share in QUANTILES.items():
+            assert found[name][channel, 0, 0] == smallest_not_exceeded_by(pixels, share)
+    assert found["mean"].shape == (3, 1, 1)
+    assert found["count"].tolist() == [3]
+
+
+def test_one_picture_counts_for_each_frame_that_shows_it() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (1, 3, 4, 8), dtype=np.uint8)
+    often = np.repeat(picture, 5, axis=0)
+    np.testing.assert_array_equal(count_pixels(picture, 5), count_pixels(often, 5))
+
+
+LARGE = 10**9
+
+
+def pictures(number: int, seed: int = 0) -> np.ndarray:
+    """Pictures of coloured blocks with noise on them, shape (number, 3, 128, 256), uint8."""
+    rng = np.random.default_rng(seed)
+    blocks = rng.integers(0, 240, (number, 3, 16, 32), dtype=np.uint8).repeat(8, axis=2).repeat(8, axis=3)
+    return blocks + rng.integers(0, 16, blocks.shape, dtype=np.uint8)
+
+
+def write(folder: Path, episodes: list[np.ndarray], *, fps: int = 1, pixels: PixelFormat = "yuv444p") -> Path:
+    with NumberedVideo(folder, "eye", fps=fps, pixels=pixels, limit_bytes=LARGE) as video:
+        for episode in episodes:
+            video.write(episode, num_frames=len(episode))
+    return folder / "videos/eye/chunk-000/file-000.mp4"
+
+
+@pytest.mark.parametrize("fps", [1, 16])
+@pytest.mark.parametrize("lengths", [[1], [2, 1, 4]])
+def test_frames_lie_at_exact_times_and_an_episode_begins_with_a_key_frame(
+    tmp_path: Path, fps: int, lengths: list[int]
+) -> None:
+    path = write(tmp_path, [pictures(n, seed) for seed, n in enumerate(lengths)], fps=fps)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = list(container.decode(stream))
+        assert [frame.time for frame in frames] == [index / fps for index in range(sum(lengths))]
+        assert stream.frames == len(frames)
+        assert stream.duration is not None
+        assert stream.time_base is not None
+        assert stream.duration * stream.time_base * fps == len(frames)
+        assert stream.average_rate == fps
+    starts = np.cumsum([0, *lengths[:-1]])
+    assert all(frames[start].key_frame for start in starts)
+
+
+def test_colours_survive_within_two_levels(tmp_path: Path) -> None:
+    shown = pictures(5)
+    path = write(tmp_path, [shown])
+    with av.open(str(path)) as container:
+        read = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+    assert np.abs(np.moveaxis(read, -1, 1).astype(int) - shown).max() <= 2
+
+
+def test_what_browsers_play_has_half_the_resolution_of_colours(tmp_path: Path) -> None:
+    path = write(tmp_path, [pictures(2)], pixels="yuv420p")
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.pix_fmt == "yuv420p"
+
+
+def test_one_picture_is_shown_for_the_whole_episode(tmp_path: Path) -> None:
+    with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video:
+        video.write(pictures(1), num_frames=4)
+    with av.open(str(tmp_path / "videos/eye/chunk-000/file-000.mp4")) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(frames) == 4
+    assert all((frame == frames[0]).all() for frame in frames)
+
+
+def test_files_stay_below_their_limit(tmp_path: Path) -> None:
+    limit, places = 400_000, []
+    with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=limit) as video:
+        for seed in range(9):
+            places.append(video.write(pictures(2, seed), num_frames=2))
+    files = sorted(tmp_path.rglob("*.mp4"))
+    assert len(files) > 2
+    assert all(file.stat().st_size < limit for file in files)
+    numbers = [number for number, _ in places]
+    assert numbers == sorted(numbers, key=lambda n: n.file)
+    for file_index, file in enumerate(files):
+        firsts = [first for number, first in places if number == FileNumber(0, file_index)]
+        with av.open(str(file)) as container:
+            assert container.streams.video[0].frames == 2 * len(firsts)
+        assert firsts == list(range(0, 2 * len(firsts), 2))
+
+
+def test_a_file_is_closed_after_so_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lerobot_files, "MAX_FRAMES", 4)
+    with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video:
+        places = [video.write(pictures(1), num_frames=3) for _ in range(3)]
+    assert [(number.file, first) for number, first in places] == [(0, 0), (0, 3), (1, 0)]
+
+
+def test_nothing_is_in_the_way_of_the_first_error(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ZeroDivisionError),
+        NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video,
+    ):
+        video.write(pictures(1), num_frames=1)
+        raise ZeroDivisionError
