@@ -296,7 +296,7 @@ def _checksum(scalars: tuple[object, ...], arrays: Iterable[np.ndarray]) -> int:
     """Return the xxh3 of a row, 64 bits."""
     digest = xxh3_64(repr(scalars).encode())
     for array in arrays:
-        digest.update(array)
+        digest.update(array)  # type: ignore[arg-type]  # it is a buffer
     return digest.intdigest()
 
 
