@@ -30,6 +30,8 @@ def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
         out,
         "--preset",
         preset,
+        "--recipe",
+        "nano",  # that of the preset begins with 1,600 steps of pretraining
         "--schedule.steps",
         STEPS,
         "--loader.batch-size",
