@@ -25,9 +25,16 @@ def test_tasks_breaks_no_placeholder_on_a_narrow_terminal(capsys, monkeypatch):
 def test_tasks_speaks_json(capsys):
     assert main(["tasks", "--json"]) == 0
     tasks = {task["name"]: task for task in json.loads(capsys.readouterr().out)}
-    assert tasks["rotate"]["levels"] == ["train", "L1", "L2", "L3"]
+    assert tasks["rotate"]["levels"] == ["train", "L1", "L2", "L3", "L5"]
     assert tasks["rotate"]["max_steps"] == tasks["rotate"]["oracle_max_steps"] + 2
     assert "{" in tasks["visual_manipulation"]["prompt"]
+
+
+def test_tasks_lists_those_of_a_level(capsys):
+    assert main(["tasks", "--level", "L4", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)) == 4
+    assert main(["tasks", "--level", "L9"]) == 2
+    assert "there is no level 'L9'" in capsys.readouterr().err
 
 
 def test_tasks_describes_the_options_of_a_task(capsys):

@@ -1,7 +1,8 @@
 """Objects and textures of each task at each generalization level.
 
 Training and L1 share their pools. L2 swaps the textures of the two roles, L3 has novel shapes and all
-textures, L4 novel tasks.
+textures, L4 novel tasks. Beyond the benchmark are L5, L3's objects and textures among clutter, and L8, tasks
+of six to twelve steps.
 
 Source: the partition files of VIMA-Bench, with its constructor defaults filled in where they pass nothing.
 """
@@ -12,9 +13,11 @@ from typing import Literal, get_args
 from openvima.catalog.textures import TEXTURES
 from openvima.errors import LevelError, UnknownTaskError, unknown_name
 
-Level = Literal["train", "L1", "L2", "L3", "L4"]
+Level = Literal["train", "L1", "L2", "L3", "L4", "L5", "L8"]
 
 LEVELS: tuple[Level, ...] = get_args(Level)
+PUBLISHED_LEVELS = LEVELS[:5]
+"""Those of the benchmark; what follows is beyond it, see docs/beyond_l4.md."""
 LEVEL_TITLES: dict[str, str] = {
     "L1": "placement_generalization",
     "L2": "combinatorial_generalization",
@@ -169,6 +172,16 @@ _L4: dict[str, _SetNames] = {
     "follow_motion": ("D_all_motion", "none", "T", "none"),
     "same_texture": ("D_all_texture", "B_all_texture", "T_first", "T_second"),
 }
+_L5: dict[str, _SetNames] = {
+    task: _L3.get(task, ("swept", "bounds", "T_first", "T_second")) for task in _TRAIN
+}
+_L8: dict[str, _SetNames] = {
+    "build_pattern": ("D_all_motion", "none", "T", "none"),
+    "imitate_then_undo": ("D_all_motion", "none", "T", "none"),
+    "reverse_order": ("D_all_motion", "none", "T", "none"),
+    "sort_by_shape": ("D_all_motion", "B_all", "T_first", "T_second"),
+    "sort_by_texture": ("D_all_motion", "B_all", "T_first", "T_second"),
+}
 
 
 def _pools(table: dict[str, _SetNames]) -> dict[str, Pool]:
@@ -178,10 +191,12 @@ def _pools(table: dict[str, _SetNames]) -> dict[str, Pool]:
     }
 
 
-_TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4)
+_TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4, _L5, _L8)
 _POOLS = {level: _pools(table) for level, table in zip(LEVELS, _TABLES, strict=True)}
 PUBLISHED_TASKS = (*_TRAIN, *_L4)
 """The 17 tasks of the benchmark."""
+PACKAGE_TASKS = tuple(dict.fromkeys(task for pools in _POOLS.values() for task in pools))
+"""Those and the tasks beyond it."""
 
 
 def tasks_at(level: str) -> tuple[str, ...]:
@@ -203,8 +218,8 @@ def levels_of(task: str) -> tuple[Level, ...]:
     Raises:
         UnknownTaskError: There is no such task.
     """
-    if task not in PUBLISHED_TASKS:
-        raise UnknownTaskError(unknown_name("task", task, PUBLISHED_TASKS))
+    if task not in PACKAGE_TASKS:
+        raise UnknownTaskError(unknown_name("task", task, PACKAGE_TASKS))
     return tuple(level for level in LEVELS if task in _POOLS[level])
 
 
@@ -212,8 +227,8 @@ def pool(task: str, level: str) -> Pool:
     """Return the objects and textures of a task at a level.
 
     Args:
-        task: Name of one of the 17 tasks.
-        level: "train", "L1", "L2", "L3" or "L4".
+        task: Name of a task of the package.
+        level: "train" or "L1" to "L8".
 
     Raises:
         UnknownTaskError: There is no such task.

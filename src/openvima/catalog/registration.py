@@ -12,7 +12,7 @@ import numpy as np
 from openvima.catalog.geometry import Geometry, Vector3, protect
 from openvima.catalog.mesh_files import Mesh, UserMesh, check_lengths, read_mesh
 from openvima.catalog.objects import OBJECTS, REGISTERED_OBJECTS, ObjectSpec, Profile
-from openvima.catalog.partitions import LEVELS, PUBLISHED_TASKS, Level, Pool
+from openvima.catalog.partitions import LEVELS, PACKAGE_TASKS, Level, Pool
 from openvima.catalog.textures import NEUTRAL_TEXTURE, REGISTERED_TEXTURES, TEXTURES, TextureSpec
 from openvima.errors import (
     AssetError,
@@ -238,7 +238,7 @@ def _check_pools(tasks: Sequence[str], levels: Sequence[Level], what: str) -> No
     if any(isinstance(names, str) or not isinstance(names, Collection) for names in (tasks, levels)):
         given = f"{echo(repr(tasks))} and {echo(repr(levels))}"
         raise ConfigError(f"tasks and levels of {what} are {given}; give lists of names.")
-    if published := [task for task in tasks if task in PUBLISHED_TASKS]:
+    if published := [task for task in tasks if task in PACKAGE_TASKS]:
         raise ConfigError(
             f"{what} cannot be added to the published task {published[0]!r}: every seed would give another "
             "episode. Use it in a task of your own."

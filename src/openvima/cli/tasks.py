@@ -21,6 +21,7 @@ def main(
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None,
     *,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    level: str | None = None,
     gallery: Path | None = None,
     assets: str = "procedural",
 ) -> int:
@@ -31,6 +32,7 @@ def main(
     Args:
         name: Task to describe, with its options for --task-options.
         as_json: Print JSON instead of a table.
+        level: List the tasks of this level only: train or L1 to L8.
         gallery: Write an HTML page with an image of each task into this folder.
         assets: Asset pack of the gallery: procedural, original, the folder of a checkout of VIMA-Bench, or
             FILE.py:FUNCTION, which registers assets of your own.
@@ -38,13 +40,14 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.tasks import list_tasks, task_spec
+    from openvima.tasks import task_spec
+    from openvima.tasks.registry import tasks_of
 
     if gallery is not None:
-        return _write_gallery(gallery, assets)
+        return _write_gallery(gallery, assets, level)
     if name is not None:
         return _describe(task_spec(name), as_json=as_json)
-    specs = [task_spec(name) for name in list_tasks()]
+    specs = [task_spec(name) for name in tasks_of(level)]
     if as_json:
         print(json.dumps([_record(spec) for spec in specs], indent=1, ensure_ascii=False))
         return 0
@@ -138,11 +141,11 @@ def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
     return f"{100 * solved / episodes:.2f}" if episodes else "–"
 
 
-def _write_gallery(folder: Path, assets: str) -> int:
+def _write_gallery(folder: Path, assets: str, level: str | None) -> int:
     from openvima.cli.terminal import progress_bar
     from openvima.env import EnvConfig
     from openvima.report.task_gallery import save_task_gallery
 
     with progress_bar("tasks") as report:
-        print(save_task_gallery(folder, env_config=EnvConfig(assets), report=report))
+        print(save_task_gallery(folder, env_config=EnvConfig(assets), level=level, report=report))
     return 0

@@ -43,7 +43,7 @@ class Demonstration:
 
     Args:
         task: Name of the task.
-        level: "train", "L1", "L2", "L3" or "L4".
+        level: "train" or "L1" to "L8".
         domain: Domain of the seed.
         seed: The episode's number.
         num_redraws: Rejected draws of the sampler before this episode.

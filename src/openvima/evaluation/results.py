@@ -62,7 +62,7 @@ class Row:
     Args:
         policy: Name of the policy in this evaluation.
         task: Name of the task.
-        level: "train", "L1", "L2", "L3" or "L4".
+        level: "train" or "L1" to "L8".
         oracle_max_steps: Steps within which the oracle must be done; the policy has two more.
         outcomes: One entry an episode, seeds ascending.
         ablation: Input ablation, see `openvima.evaluation.ablations`; empty for none.

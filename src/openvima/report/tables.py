@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+from openvima.catalog.partitions import PUBLISHED_LEVELS
 from openvima.errors import UnknownTaskError
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import LevelMean, Results
@@ -147,7 +148,7 @@ def family_name(family: str) -> str:
 
 def compared_levels(results: Results) -> list[str]:
     """Evaluated levels of L1 to L4, in this order."""
-    return sorted(level for level in results.levels() if level != "train")
+    return sorted(level for level in results.levels() if level in PUBLISHED_LEVELS[1:])
 
 
 def level_drop_table(results: Results, *, published: bool = True) -> Table | None:

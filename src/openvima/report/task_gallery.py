@@ -14,7 +14,8 @@ from openvima.evaluation.recording import save_episode_image
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from openvima.html import render_page, require_extra
-from openvima.tasks import list_tasks, task_spec
+from openvima.tasks import task_spec
+from openvima.tasks.registry import tasks_of
 from openvima.video.prompt_strip import INK, draw_prompt_strip, font
 from openvima.video.recorder import SceneRenderer
 
@@ -28,6 +29,7 @@ def save_task_gallery(
     folder: Path,
     *,
     env_config: EnvConfig = DEFAULT_ENV_CONFIG,
+    level: str | None = None,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Path:
     """Write a page with a solved episode of each task, its images, and all of them on one sheet.
@@ -35,6 +37,7 @@ def save_task_gallery(
     Args:
         folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
         env_config: Settings of the environments.
+        level: Show its tasks only; by default all, each at its first level.
         report: Called with tasks done, tasks in all, and the task's name.
 
     Returns:
@@ -42,10 +45,10 @@ def save_task_gallery(
     """
     require_extra()
     folder.mkdir(parents=True, exist_ok=True)
-    specs = [task_spec(name) for name in list_tasks()]
+    specs = [task_spec(name) for name in tasks_of(level)]
     panels = []
     for number, spec in enumerate(specs):
-        env = env_config.make(spec.name, spec.levels[0], domain="user")
+        env = env_config.make(spec.name, level or spec.levels[0], domain="user")
         solved = _first_solved(env)
         save_episode_image(env, folder / f"{spec.name}.png", seed=solved)
         panels.append(_panel(env, spec.name, solved))

@@ -19,6 +19,8 @@ LEVEL_NAMES = {
     "L2": "Combinatorial generalisation",
     "L3": "Novel objects",
     "L4": "Novel tasks",
+    "L5": "Clutter",
+    "L8": "Long horizon",
 }
 LEVEL_MEANINGS = {
     "train": "Objects, textures and tasks of the training set, on fresh seeds.",
@@ -26,6 +28,8 @@ LEVEL_MEANINGS = {
     "L2": "Training objects and textures in new combinations.",
     "L3": "New shapes, and textures from the whole catalogue.",
     "L4": "New kinds of prompts, with new objects and textures.",
+    "L5": "The training tasks with the objects of L3, among three to ten more with look-alikes.",
+    "L8": "Tasks of six to twelve steps, with all objects and textures.",
 }
 _ROLES = {
     "oracle": "Scripted solver with access to the scene: the upper bound.",

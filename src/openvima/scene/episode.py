@@ -73,7 +73,7 @@ class Episode:
 
     Args:
         task: Name of the task, such as "rotate".
-        level: "train", "L1", "L2", "L3" or "L4".
+        level: "train" or "L1" to "L8".
         domain: Domain of the seed: "train", "eval" or "user"; equal seeds of two domains are unrelated.
         seed: The episode's number.
         problem: The sampled problem.

@@ -8,7 +8,7 @@ import numpy as np
 from openvima.catalog import Assets
 from openvima.errors import OracleError, echo
 from openvima.scene import Action, AtPose, InZone, Pose, Problem, Scene
-from openvima.scene.goal import oracle_move
+from openvima.scene.goal import object_of, oracle_move
 from openvima.tasks.goals import Progress
 from openvima.tasks.sweeping import plan_sweep
 
@@ -66,9 +66,10 @@ def oracle_action(
     """
     require_goals(problem)
     goals = [problem.goals[index] for index in progress.open_goals]
+    done = {object_of(goal) for goal in problem.goals} - {object_of(goal) for goal in goals}
     if not goals:
         raise OracleError("all goals are met; the oracle has nothing left to do. Reset the environment.")
-    pending = [goal for goal in problem.prerequisites if not goal.is_met(scene)]
+    pending = [g for g in problem.prerequisites if g.object_id not in done and not g.is_met(scene)]
     first = (pending or goals)[0]
     goal = oracle_move(first, scene)
     if goal is None:

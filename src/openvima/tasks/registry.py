@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
-from openvima.catalog.partitions import PUBLISHED_TASKS
+from openvima.catalog.partitions import PACKAGE_TASKS, PUBLISHED_LEVELS
 from openvima.catalog.registration import with_registered
 from openvima.errors import (
     ConfigError,
@@ -131,8 +131,8 @@ def register_task(
         template: The prompt with its slots.
         oracle_max_steps: Step limit of the oracle.
         end_effector: Tool of the arm.
-        pools: Objects and textures at each level; by default those of the benchmark, which has its own tasks
-            only.
+        pools: Objects and textures at each level; by default those of the catalogue, which has tasks of the
+            package only.
         distractors_allowed: See `TaskSpec`.
 
     Returns:
@@ -150,7 +150,7 @@ def register_task(
         kind = f"end effector for task {name!r}:"
         raise ConfigError(unknown_name(kind, end_effector, END_EFFECTORS))
     check_steps(name, oracle_max_steps)
-    if not pools and name not in PUBLISHED_TASKS:
+    if not pools and name not in PACKAGE_TASKS:
         raise ConfigError(f"task {name!r} has no pools; give objects and textures of a level at least.")
     for level in pools or ():
         if level not in LEVELS:
@@ -237,14 +237,26 @@ def list_tasks() -> tuple[str, ...]:
     return tuple(sorted(_TASKS))
 
 
+def tasks_of(level: str | None) -> tuple[str, ...]:
+    """Names of the tasks that are defined at a level, in alphabetical order; of all for None.
+
+    Raises:
+        LevelError: There is no such level.
+    """
+    if level is not None and level not in LEVELS:
+        raise LevelError(unknown_name("level", level, LEVELS))
+    return tuple(task for task in list_tasks() if level is None or level in task_spec(task).levels)
+
+
 def held_out_tasks() -> tuple[str, ...]:
     """Names of the tasks that are undefined at level "train", which policies meet in evaluation only."""
     return tuple(task for task in list_tasks() if "train" not in task_spec(task).levels)
 
 
 def named_tasks(names: Sequence[str]) -> tuple[str, ...]:
-    """Replace "heldout" in a list of tasks by the names of these; drop repeated names."""
-    parts = (held_out_tasks() if name == HELD_OUT else (name,) for name in names)
+    """Replace "heldout" in a list of tasks by the names of those of L4; drop repeated names."""
+    held_out = [task for task in held_out_tasks() if set(task_spec(task).levels) & set(PUBLISHED_LEVELS)]
+    parts = (held_out if name == HELD_OUT else (name,) for name in names)
     return tuple(dict.fromkeys(itertools.chain.from_iterable(parts)))
 
 

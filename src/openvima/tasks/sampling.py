@@ -31,6 +31,7 @@ from openvima.scene.goal import (
     oracle_move,
     unmet_reason,
 )
+from openvima.tasks import clutter
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewrite
 from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, check_steps, list_tasks, task_spec
@@ -52,7 +53,7 @@ def make_rng(
     Args:
         domain: "train", "eval" or "user"; equal seeds of two domains give unrelated generators.
         task: Name of the task.
-        level: "train" or "L1" to "L4".
+        level: "train" or "L1" to "L8".
         seed: The episode's number, 0 … 2⁶³ − 1.
         purpose: Use of the draws, such as "scene", "ids" or "oracle"; purposes are independent.
         attempt: Number of the redraw, 0 for the first try.
@@ -215,7 +216,7 @@ def sample_episode(
 
     Args:
         task: Name of the task.
-        level: "train" or "L1" to "L4"; by default "train", or the only level of a task held out for L4.
+        level: "train" or "L1" to "L8"; by default "train", or the only level of a task held out for L4.
         seed: The episode's number, 0 … 2⁶³ − 1.
         domain: "train", "eval" or "user"; equal seeds of two domains give unrelated episodes.
         assets: Asset pack: "procedural", a folder with the original pack, or a pack already loaded.
@@ -254,6 +255,8 @@ def sample_episode(
         table = TableSampler(rng, pool, assets=pack, end_effector=spec.end_effector, compat=compat)
         try:
             problem = spec.sample(table, **options)
+            if level == clutter.LEVEL and isinstance(problem, Problem):
+                problem = clutter.add_clutter(table, problem, task)
         except SamplingError as error:
             reason = error
             continue
