@@ -1,8 +1,8 @@
 """Objects and textures of each task at each generalization level.
 
 Training and L1 share their pools. L2 swaps the textures of the two roles, L3 has novel shapes and all
-textures, L4 novel tasks. Beyond the benchmark are L5, L3's objects and textures among clutter, and L8, tasks
-of six to twelve steps.
+textures, L4 novel tasks. Beyond the benchmark are L5, L3's objects and textures among clutter, L6,
+compositions of instructions, and L8, tasks of six to twelve steps.
 
 Source: the partition files of VIMA-Bench, with its constructor defaults filled in where they pass nothing.
 """
@@ -13,7 +13,7 @@ from typing import Literal, get_args
 from openvima.catalog.textures import TEXTURES
 from openvima.errors import LevelError, UnknownTaskError, unknown_name
 
-Level = Literal["train", "L1", "L2", "L3", "L4", "L5", "L8"]
+Level = Literal["train", "L1", "L2", "L3", "L4", "L5", "L6", "L8"]
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 PUBLISHED_LEVELS = LEVELS[:5]
@@ -175,6 +175,13 @@ _L4: dict[str, _SetNames] = {
 _L5: dict[str, _SetNames] = {
     task: _L3.get(task, ("swept", "bounds", "T_first", "T_second")) for task in _TRAIN
 }
+_COMPOSITIONS = _names(
+    "put_then_put, put_then_rotate, rotate_then_put, rotate_then_rotate, gather_then_rotate, "
+    "gather_then_put, rearrange_then_put, rotate_then_put_it, put_then_put_it, put_then_restore, "
+    "put_then_neighbor, define_then_rotate_and_put, define_then_put_and_rotate, rotate_put_it_restore, "
+    "put_rotate_put, put_neighbor_rotate, gather_rotate_put_it, define_rotate_put_it_restore"
+)
+_L6: dict[str, _SetNames] = dict.fromkeys(_COMPOSITIONS, ("D_all_motion", "B_all", "T_first", "T_second"))
 _L8: dict[str, _SetNames] = {
     "build_pattern": ("D_all_motion", "none", "T", "none"),
     "imitate_then_undo": ("D_all_motion", "none", "T", "none"),
@@ -191,7 +198,7 @@ def _pools(table: dict[str, _SetNames]) -> dict[str, Pool]:
     }
 
 
-_TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4, _L5, _L8)
+_TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4, _L5, _L6, _L8)
 _POOLS = {level: _pools(table) for level, table in zip(LEVELS, _TABLES, strict=True)}
 PUBLISHED_TASKS = (*_TRAIN, *_L4)
 """The 17 tasks of the benchmark."""
@@ -228,7 +235,7 @@ def pool(task: str, level: str) -> Pool:
 
     Args:
         task: Name of a task of the package.
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
 
     Raises:
         UnknownTaskError: There is no such task.

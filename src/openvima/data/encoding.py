@@ -67,7 +67,7 @@ class ShardInfo:
 
     Args:
         task: Name of the task.
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
         domain: Domain of the seeds.
         number: Which shard of the task, from 0.
         shard_size: Episodes in a full shard; 0 where shards grow with their number.

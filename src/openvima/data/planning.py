@@ -54,7 +54,7 @@ class GenerateConfig:
         tasks: Names of the tasks; ("all",) means all that the level has, and with text prompts a
             text form; "heldout" the four that are held out for L4.
         episodes: Successful episodes of each task.
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
         start_seed: First seed.
         shard_size: Episodes in a file; None lets files grow with their number, from 4 episodes to 1,000.
         env_config: Settings of the environments.

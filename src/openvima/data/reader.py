@@ -280,7 +280,7 @@ class DemonstrationQuery:
 
     Args:
         task: Name of the task.
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
         object: Object of the catalogue that is on the table.
         texture: Texture on the table; together with `object`, of that object.
         min_steps: Fewest steps.

@@ -43,7 +43,7 @@ class Demonstration:
 
     Args:
         task: Name of the task.
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
         domain: Domain of the seed.
         seed: The episode's number.
         num_redraws: Rejected draws of the sampler before this episode.

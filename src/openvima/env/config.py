@@ -63,7 +63,7 @@ class EnvConfig:
 
         Args:
             task: Name of the task.
-            level: "train" or "L1" to "L8".
+            level: one of `openvima.catalog.LEVELS`.
             domain: Domain of the seeds.
             realtime: Record `frames` during each step.
 

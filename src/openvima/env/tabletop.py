@@ -114,7 +114,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
 
     Args:
         task: Name of the task, such as "rotate".
-        level: "train" or "L1" to "L8": generalization level. By default
+        level: one of `openvima.catalog.LEVELS`: generalization level. By default
             "train", or the only level of a task held out for L4.
         domain: "train", "eval" or "user"; equal seeds of two domains are unrelated.
         assets: "procedural", the folder of the original asset pack, MODULE:FUNCTION or FILE.py:FUNCTION that

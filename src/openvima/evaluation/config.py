@@ -59,7 +59,7 @@ class EvaluationConfig:
             folder, file or server.
         tasks: Names of tasks, or ("all",) for every task that the level holds, with text
             prompts every one that has a text form.
-        levels: From "train" and "L1" to "L8", see `openvima.catalog.LEVELS`.
+        levels: From `openvima.catalog.LEVELS`.
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
         workers: Processes; the results do not depend on their number. None means one, or as many as the Ray

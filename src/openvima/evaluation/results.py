@@ -62,7 +62,7 @@ class Row:
     Args:
         policy: Name of the policy in this evaluation.
         task: Name of the task.
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
         oracle_max_steps: Steps within which the oracle must be done; the policy has two more.
         outcomes: One entry an episode, seeds ascending.
         ablation: Input ablation, see `openvima.evaluation.ablations`; empty for none.

@@ -424,7 +424,7 @@ def score(
     Args:
         policies: Objects that implement the `Policy` protocol, by their names in the results.
         tasks: Names of tasks, or "all" for every task that the level holds.
-        levels: From "train" and "L1" to "L8", see `openvima.catalog.LEVELS`.
+        levels: From `openvima.catalog.LEVELS`.
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
         ablations: Input ablations, as in `EvaluationConfig`, except for "detected_boxes"; "noisy_boxes" for

@@ -30,6 +30,7 @@ def save_task_gallery(
     *,
     env_config: EnvConfig = DEFAULT_ENV_CONFIG,
     level: str | None = None,
+    tasks: Sequence[str] = (),
     report: Callable[[int, int, str], None] | None = None,
 ) -> Path:
     """Write a page with a solved episode of each task, its images, and all of them on one sheet.
@@ -38,6 +39,7 @@ def save_task_gallery(
         folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
         env_config: Settings of the environments.
         level: Show its tasks only; by default all, each at its first level.
+        tasks: Names of tasks to show instead.
         report: Called with tasks done, tasks in all, and the task's name.
 
     Returns:
@@ -45,7 +47,7 @@ def save_task_gallery(
     """
     require_extra()
     folder.mkdir(parents=True, exist_ok=True)
-    specs = [task_spec(name) for name in tasks_of(level)]
+    specs = [task_spec(name) for name in tasks or tasks_of(level)]
     panels = []
     for number, spec in enumerate(specs):
         env = env_config.make(spec.name, level or spec.levels[0], domain="user")

@@ -20,6 +20,7 @@ LEVEL_NAMES = {
     "L3": "Novel objects",
     "L4": "Novel tasks",
     "L5": "Clutter",
+    "L6": "Composition",
     "L8": "Long horizon",
 }
 LEVEL_MEANINGS = {
@@ -29,6 +30,7 @@ LEVEL_MEANINGS = {
     "L3": "New shapes, and textures from the whole catalogue.",
     "L4": "New kinds of prompts, with new objects and textures.",
     "L5": "The training tasks with the objects of L3, among three to ten more with look-alikes.",
+    "L6": "Two and three instructions of trained tasks in one prompt.",
     "L8": "Tasks of six to twelve steps, with all objects and textures.",
 }
 _ROLES = {

@@ -73,7 +73,7 @@ class Episode:
 
     Args:
         task: Name of the task, such as "rotate".
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
         domain: Domain of the seed: "train", "eval" or "user"; equal seeds of two domains are unrelated.
         seed: The episode's number.
         problem: The sampled problem.

@@ -120,6 +120,7 @@ def register_task(
     end_effector: EndEffector = "suction",
     pools: Mapping[Level, Pool] | None = None,
     distractors_allowed: bool = False,
+    summary: str | None = None,
 ) -> Callable[[SampleFunction], SampleFunction]:
     """Register a task; decorates its `sample` function.
 
@@ -134,6 +135,7 @@ def register_task(
         pools: Objects and textures at each level; by default those of the catalogue, which has tasks of the
             package only.
         distractors_allowed: See `TaskSpec`.
+        summary: One sentence; by default the first line of the module's docstring.
 
     Returns:
         The decorator, which returns the function unchanged.
@@ -170,7 +172,7 @@ def register_task(
             end_effector=end_effector,
             pools=pools or {level: pool(name, level) for level in levels_of(name)},
             oracle_max_steps=oracle_max_steps,
-            summary=_summary(sample),
+            summary=summary or _summary(sample),
             sample=sample,
             distractors_allowed=distractors_allowed,
         )

@@ -53,7 +53,7 @@ def make_rng(
     Args:
         domain: "train", "eval" or "user"; equal seeds of two domains give unrelated generators.
         task: Name of the task.
-        level: "train" or "L1" to "L8".
+        level: one of `openvima.catalog.LEVELS`.
         seed: The episode's number, 0 … 2⁶³ − 1.
         purpose: Use of the draws, such as "scene", "ids" or "oracle"; purposes are independent.
         attempt: Number of the redraw, 0 for the first try.
@@ -216,7 +216,7 @@ def sample_episode(
 
     Args:
         task: Name of the task.
-        level: "train" or "L1" to "L8"; by default "train", or the only level of a task held out for L4.
+        level: One of `openvima.catalog.LEVELS`; by default the first of the task.
         seed: The episode's number, 0 … 2⁶³ − 1.
         domain: "train", "eval" or "user"; equal seeds of two domains give unrelated episodes.
         assets: Asset pack: "procedural", a folder with the original pack, or a pack already loaded.
