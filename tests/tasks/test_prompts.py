@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.errors import ConfigError, PromptError
 from openvima.scene import (
     ObjectImage,
@@ -24,7 +25,7 @@ from prompts import is_understood
 
 SCENES_ONLY = {"follow_order", "rearrange", "rearrange_then_restore", "scene_understanding", "twist"}
 COMPARING = {"novel_adj", "novel_adj_and_noun"}  # by height in half of the episodes
-WITH_TEXT = sorted(set(list_tasks()) - SCENES_ONLY)
+WITH_TEXT = sorted(set(PUBLISHED_TASKS) - SCENES_ONLY)
 NUM_EPISODES = 10
 PAGE = Path(__file__).parents[2] / "docs" / "prompts.md"
 
