@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from openvima.catalog.packs import load_assets
+from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.catalog.random_pack import RandomAppearanceAssets
 from openvima.errors import ConfigError
 from openvima.evaluation.prompt_ablations import held_out_phrasings
@@ -17,7 +18,7 @@ from openvima.policies.pointer.words import Attributes
 from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer, split_words
 from openvima.scene import Placement, Pose
 from openvima.scene.prompt import PLACEHOLDER
-from openvima.tasks import list_tasks, task_spec
+from openvima.tasks import task_spec
 from openvima.tasks.prompts import training_paraphrases
 from openvima.training import TrainingConfig, train
 from openvima.training.building import resolve
@@ -204,7 +205,7 @@ def test_captions_are_no_prompt_of_a_task():
 
 def test_only_prompts_that_compare_by_attributes_name_them():
     words = {word for names in WORDS.values() for word in names}
-    texts = {task: [task_spec(task).template] for task in list_tasks()}
+    texts = {task: [task_spec(task).template] for task in PUBLISHED_TASKS}
     for phrasings in (training_paraphrases(), held_out_phrasings()):
         for task, more in phrasings.items():
             texts[task] += more
