@@ -5,7 +5,6 @@ import pytest
 from openvima.catalog.objects import OBJECTS
 from openvima.catalog.partitions import (
     LEVEL_TITLES,
-    LEVELS,
     OBJECT_SETS,
     PUBLISHED_LEVELS,
     TEXTURE_SETS,
@@ -21,7 +20,7 @@ def test_levels_hold_13_13_13_12_and_4_tasks_and_clutter_the_trained_ones():
     assert [len(tasks_at(level)) for level in PUBLISHED_LEVELS] == [13, 13, 13, 12, 4]
     assert tasks_at("L5") == tasks_at("train")
     assert all(pool(task, "L5") == pool(task, "L3") for task in tasks_at("L3"))
-    assert len({task for level in LEVELS for task in tasks_at(level)}) == 17
+    assert len({task for level in PUBLISHED_LEVELS for task in tasks_at(level)}) == 17
 
 
 def test_sets_hold_known_names_once():
