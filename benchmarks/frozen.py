@@ -88,7 +88,12 @@ def batches(_: argparse.Namespace) -> dict[str, dict[str, str]]:
     for preset in RECIPES:
         totals: dict[str, Any] = {}
         with watched_batches() as seen:
-            train(preset, "--schedule.steps=10", "--pretraining.steps=0")
+            train(
+                preset,
+                "--schedule.steps=10",
+                "--pretraining.steps=0",
+                "--pretraining.finetune-crop-encoder=True",
+            )
             for batch in seen:
                 for path, value in leaves(batch):
                     totals.setdefault(path, hashlib.sha256()).update(_bytes(value))
