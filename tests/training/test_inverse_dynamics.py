@@ -149,6 +149,8 @@ def test_init_from_loads_the_weights_of_another_run(data, tmp_path) -> None:
         str(data),
         "--preset",
         "midas-nano",
+        "--recipe",
+        "nano",
         "--schedule.steps",
         "1",
         "--loader.batch-size",
