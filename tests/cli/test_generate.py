@@ -40,8 +40,8 @@ def test_parts_of_a_job_array_tell_whether_the_data_set_is_finished(
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--shard-range", "3"], "shard_range is '3'; it must be a:b"),
-        (["--shard-range", "9:10"], "shard_range is 9:10, but shards are numbered from 0 to 1"),
+        (["--shard-range", "3"], "--shard-range is '3'; it must be a:b"),
+        (["--shard-range", "9:10"], "--shard-range is 9:10, but shards are numbered from 0 to 1"),
         (["--shard-range", "0:1", "--force"], "exclude each other"),
         (["--address", "head:6379"], "only 'ray' takes one"),
     ],

@@ -248,7 +248,7 @@ def main(
         return 0
     if workers is None and jobs.engine == "processes" and network.device == "cpu":
         config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
-    print_left_out(config.tasks, environment.prompts)
+    print_left_out(config.tasks, environment.prompts, config.levels)
     selection = VideoSelection(recording.videos, parse_list(recording.record_video))
     if recording.record_video and not recording.report:
         raise ConfigError("--record-video needs the report; drop --no-report.")

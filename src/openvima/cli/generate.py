@@ -91,7 +91,7 @@ def main(
         shard_range=parse_shard_range(shard_range),
         force=force,
     )
-    print_left_out(config.tasks, prompts)
+    print_left_out(config.tasks, prompts, [level])
     if list_shards:
         for number, block in enumerate(plan(config)):
             print(f"{number}\t{block.path.name}\t{block.episodes}")

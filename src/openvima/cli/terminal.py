@@ -324,12 +324,13 @@ def table_console() -> "Console":
     return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=PIPE_WIDTH)
 
 
-def print_left_out(tasks: Sequence[str], prompts: str) -> None:
-    """Say on stderr which of all tasks a run leaves out, since their prompts have no text form."""
-    from openvima.tasks.registry import list_tasks
+def print_left_out(tasks: Sequence[str], prompts: str, levels: Sequence[str]) -> None:
+    """Say on stderr which of all tasks at some levels a run leaves out: their prompts have no text form."""
+    from openvima.tasks.registry import tasks_of
     from openvima.tasks.sampling import takes_prompts
 
-    if "all" in tasks and (left_out := [task for task in list_tasks() if not takes_prompts(task, prompts)]):
+    present = sorted({task for level in levels for task in tasks_of(level)})
+    if "all" in tasks and (left_out := [task for task in present if not takes_prompts(task, prompts)]):
         print(f"Left out, since their prompts have no text form: {', '.join(left_out)}.", file=sys.stderr)
 
 
