@@ -238,10 +238,11 @@ shape (3 × max_prompt_images, 128 / shrink, 256 / shrink), zeros where there is
         shape = CAMERAS["top"].height // shrink, CAMERAS["top"].width // shrink
         images = {**dict.fromkeys(CAMERAS, 3), "prompt": 3 * max_prompt_images}
         num_words = NUM_BUCKETS + 1 + TOOL_SIZE * (self._base.control == END_EFFECTOR)
-        self.observation_space = spaces.Dict(
-            {name: spaces.Box(0, 255, (channels, *shape), np.uint8) for name, channels in images.items()}
-            | {"words": spaces.Box(-1, 1, (num_words,), np.float32)}
-        )
+        parts: dict[str, spaces.Space] = {
+            name: spaces.Box(0, 255, (channels, *shape), np.uint8) for name, channels in images.items()
+        }
+        parts["words"] = spaces.Box(-1, 1, (num_words,), np.float32)
+        self.observation_space = spaces.Dict(parts)
         self._prompt, self._words = np.zeros(0, np.uint8), np.zeros(0, np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:

@@ -1,7 +1,7 @@
 """Options that are settings of a config class: parsing, a short help, and their names in errors."""
 
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import fields, is_dataclass, make_dataclass
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -55,7 +55,7 @@ def _unchecked(default: Any, shown: Collection[str] | None, prefix: str = "") ->
     return make_dataclass(kind.__name__, settings, bases=(kind,), frozen=True, namespace=namespace)()
 
 
-def setting_names(command: Callable[..., Any], prefix: str = "") -> list[str]:
+def setting_names(command: Any, prefix: str = "") -> list[str]:
     """Return the names of what a command or a config takes, as Python has them, with those of sections."""
     names = []
     for name, hint in get_type_hints(command, include_extras=True).items():

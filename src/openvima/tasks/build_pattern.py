@@ -9,6 +9,7 @@ Source:   level L8 of openvima; not in the VIMA paper.
 """
 
 import math
+from collections.abc import Sequence
 
 from openvima.scene import (
     WORKSPACE_HIGH,
@@ -90,7 +91,7 @@ def sample(table: TableSampler, *, pattern: int | None = None, num_distractors: 
     )
 
 
-def _shifted(table: TableSampler, rows: list[str]) -> list[tuple[int, int]]:
+def _shifted(table: TableSampler, rows: Sequence[str]) -> list[tuple[int, int]]:
     """Draw where along the table a pattern is; return its cells, row by row."""
     shift = int(table.rng.integers(NUM_COLUMNS - len(rows[0]) + 1))
     return [(r, shift + c) for r, row in enumerate(rows) for c, mark in enumerate(row) if mark == "X"]

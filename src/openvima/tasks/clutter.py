@@ -64,7 +64,7 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
     bases = [scene[i] for i in {getattr(goal, "relative_to", None) for goal in goals} if i is not None]
     by_moved, by_base = MEANT_BY.get(task, ("look", "look"))
     forbidden = {(p.object, p.texture) for p in scene.placements}
-    meant = [
+    meant: list[tuple[Attribute, object]] = [
         *((by_moved, _OF[by_moved](p.object, p.texture)) for p in moved),
         *((by_base, _OF[by_base](p.object, p.texture)) for p in bases if p not in moved),
     ]

@@ -92,13 +92,13 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
                 f"augmentation.{name} is {getattr(augmentation, name)}, but preset {config.preset!r} takes "
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
-    weight, is_token_policy = config.optimizer.pointing_loss_weight, isinstance(sizes, TokenPolicyConfig)
-    if weight and not (is_token_policy and sizes.has_object_tokens):
+    weight = config.optimizer.pointing_loss_weight
+    if weight and not (isinstance(sizes, TokenPolicyConfig) and sizes.has_object_tokens):
         raise ConfigError(
             f"optimizer.pointing_loss_weight is {weight:g}, but preset {config.preset!r} has no token for "
             "each object, or picks among objects by itself; leave it out."
         )
-    if is_token_policy and sizes.points and not (weight or config.init_from):
+    if isinstance(sizes, TokenPolicyConfig) and sizes.points and not (weight or config.init_from):
         raise ConfigError(
             "model.points is True, but optimizer.pointing_loss_weight is 0, so nothing would teach the "
             "network to point; give a weight such as 1, or set model.points to False."

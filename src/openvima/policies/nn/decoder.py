@@ -139,6 +139,10 @@ class CausalDecoder(nn.Module):
         """
         raise NotImplementedError
 
+    def align(self) -> None:
+        """Let fresh attention to the prompt compare queries and keys by one matrix."""
+        raise NotImplementedError
+
     def forward(
         self,
         cache: KVCache,
@@ -244,8 +248,8 @@ class Decoder(CausalDecoder):
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
 
     def align(self) -> None:
-        """Let fresh attention to the prompt compare queries and keys by one matrix, in every block."""
-        for block in self.cross_blocks:
+        """Do so in every cross block."""
+        for block in (cast(CrossBlock, each) for each in self.cross_blocks):
             _align(block.query.weight, block.key_value.weight[: self.width])
 
     def _cross_attend(
@@ -273,8 +277,10 @@ class PrefixDecoder(CausalDecoder):
         return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP)[1]
 
     def align(self) -> None:
-        """Let fresh attention compare queries and keys by one matrix, in the first block."""
-        _align(*self.self_blocks[0].query_key_value.weight.split(self.width)[:2])
+        """Do so in the first block, whose attention reaches the history as well."""
+        block = cast(SelfBlock, self.self_blocks[0])
+        query_DD, key_DD, _ = block.query_key_value.weight.split(self.width)
+        _align(query_DD, key_DD)
 
 
 def build_decoder(config: AnyDecoderConfig) -> Decoder | PrefixDecoder:
