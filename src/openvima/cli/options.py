@@ -83,6 +83,8 @@ def name_options(message: str, settings: Collection[str]) -> str:
         rf"(?<![\w.(='\"`/-])({'|'.join(special)})(?![\w(='\"`/-]|\.\w)",
         rf"(?:^|(?<=[.;:] )|(?<=\bset )|(?<=\bleave ))({'|'.join(plain)})(?=,? (?:is|to|too|out)\b)",
     ]
-    for pattern in patterns:
+    for names, pattern in zip((special, plain), patterns, strict=True):
+        if not names:  # the pattern would match anywhere
+            continue
         message = re.sub(pattern, lambda found: f"--{found[1].replace('_', '-')}", message)
     return message
