@@ -33,9 +33,10 @@ def test_the_page_has_every_version_of_the_code() -> None:
         module = ".".join(file.relative_to(SOURCE).with_suffix("").parts)
         for node in ast.parse(file.read_text("utf-8")).body:
             if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
-                (target,) = (t.id for t in node.targets if isinstance(t, ast.Name))
-                if re.fullmatch(r"(\w+_)?(VERSION|SCHEMA|PROTOCOL)", target):
-                    found.add(f"{module}.{target}")
+                names = [target.id for target in node.targets if isinstance(target, ast.Name)]
+                found |= {
+                    f"{module}.{n}" for n in names if re.fullmatch(r"(\w+_)?(VERSION|SCHEMA|PROTOCOL)", n)
+                }
     assert found == set(PAGE)
 
 

@@ -1,6 +1,5 @@
 """Data sets with text prompts are read, verified, replayed, extended and batched like others."""
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -9,7 +8,6 @@ from openvima.data import Dataset, GenerateConfig, VerifyConfig, generate, verif
 from openvima.data.subsets import MergeConfig, merge
 from openvima.env import EnvConfig
 from openvima.errors import ConfigError, DatasetError
-from small_data_sets import edit_manifest
 
 TEXT = EnvConfig(prompts="text")
 SHARD = "rotate-train-00000.arrow"
@@ -55,13 +53,6 @@ def test_episodes_are_replayed_and_images_rendered_again(folders: tuple[Path, Pa
 def test_a_data_set_is_not_extended_with_other_prompts(folders: tuple[Path, Path]) -> None:
     with pytest.raises(DatasetError, match="prompts is text, asked for is multimodal"):
         generate(config(folders[0], EnvConfig()))
-
-
-def test_a_shard_of_other_prompts_is_found(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(folders[0], tmp_path / "mixed"))
-    edit_manifest(folder, lambda manifest: manifest["config"].pop("prompts"))
-    problems = verify(folder, VerifyConfig(replay=0)).problems
-    assert any("prompts is text, in the manifest multimodal" in str(problem) for problem in problems)
 
 
 def test_episodes_that_two_forms_leave_equal_are_merged_once(tmp_path: Path) -> None:

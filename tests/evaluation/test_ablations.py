@@ -69,7 +69,7 @@ def test_without_a_prompt_all_tasks_are_told_the_same():
 
 
 def test_images_of_another_episode_stand_in_the_words_of_this_one():
-    env, _ = begun("visual_manipulation")
+    env, _ = begun("visual_manipulation", level="L3")
     changed = ablate(env, "other_prompt_images").prompt
     assert changed.text == env.prompt.text
     assert list(changed.images) == list(env.prompt.images)

@@ -10,7 +10,7 @@ import pytest
 
 from openvima.catalog.textures import BASE_COLOURS
 from openvima.env import TabletopEnv
-from openvima.errors import ActionError, PolicyError, ServerError
+from openvima.errors import ActionError, PolicyError
 from openvima.evaluation import score
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
@@ -93,7 +93,7 @@ def test_actions_of_another_shape_end_the_evaluation(policy: Any, given: np.ndar
         serve_in_thread(policy) as url,
         RemotePolicy(url) as remote,
         pytest.raises(
-            ServerError, match=f"refuses: ActionError: the action has .* dtype int64; .* {numbers} fl"
+            PolicyError, match=f"refuses: ActionError: the action has .* dtype int64; .* {numbers} fl"
         ),
     ):
         score({"bad": remote}, **ROTATE, control=policy.control)

@@ -129,8 +129,6 @@ def test_a_manifest_of_others_names_no_file_outside(hub: LocalHub, demos: Path) 
 @pytest.mark.parametrize(
     "edit",
     [
-        lambda manifest: manifest["counts"].pop("episodes"),
-        lambda manifest: manifest["tasks"]["rotate"].update(steps="many"),
         lambda manifest: manifest["tasks"].update({"[/red]\x1b[2J": manifest["tasks"]["rotate"]}),
         lambda manifest: manifest.update(command="\x1b]0;owned\x07"),
     ],

@@ -1,6 +1,5 @@
 """Explanations drawn beside a video."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -136,22 +135,6 @@ def test_an_explained_episode_without_a_step_has_a_video_of_its_start(tmp_path: 
     assert (outcome.kind, outcome.steps) == (BAD_ACTION, 0)
     with av.open(str(path)) as container:
         assert next(container.decode(video=0)).width == 768
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"attention": {"pick": np.full(3, 1 / 3)}}, "3 weights of attention 'pick' to a prompt of 8 parts"),
-        ({"places": (PlaceProbability("moon", (0.5, 0.0), 1.0),)}, "kind 'moon'; allowed: in view, first"),
-    ],
-)
-def test_an_explanation_that_cannot_be_drawn_is_refused(env, change: dict, message: str) -> None:
-    class Explaining(RandomPolicy):
-        def explain(self):
-            return [replace(pointing(env), **change)]
-
-    with pytest.raises(PolicyError, match=message):
-        PromptedRolloutPolicy(Explaining()).explainer()()
 
 
 def test_words_stand_below_the_table_with_their_points(env: TabletopEnv) -> None:

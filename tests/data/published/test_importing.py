@@ -66,7 +66,7 @@ def test_an_import_tells_its_origin_and_what_was_broken(source: Path, imported: 
     assert json.loads((imported / "broken.json").read_text()) == [
         {
             "member": "same_profile/000007",
-            "reason": "obs.pkl: it is truncated or no pickle of data (pickle exhausted before seeing STOP).",
+            "reason": "obs.pkl: it is truncated or no pickle of data (Ran out of input).",
         }
     ]
 
