@@ -1,6 +1,7 @@
 """The studies of the package, which `studies.yaml` describes, and those of users."""
 
 import re
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping
 from importlib import resources
 from itertools import product
@@ -182,4 +183,5 @@ def _choices(value: Any, names: Mapping[str, Any]) -> Iterator[Mapping[str, Any]
     """Names with those that an entry of a list is repeated for, in all combinations."""
     repeated = _fill(value.get("for", {}), names) if isinstance(value, dict) else {}
     for values in product(*repeated.values()):
-        yield {**names, **dict(zip(repeated, values, strict=True))}
+        chosen = dict(zip(repeated, values, strict=True))
+        yield ChainMap(chosen, names)  # type: ignore[arg-type]  # names compute some values when asked
