@@ -120,7 +120,7 @@ _RANGES = {
 }
 _ORDERS = {"xy": "[x, y]", "yx": "[y, x]"}
 _NAMES = {"suction": ("pick", "place"), "spatula": ("from", "to")}
-_MOST_CHARACTERS = 20_000  # of an answer that are read: its last ones
+MOST_CHARACTERS = 20_000  # of an answer that are kept and read: its last ones
 _MOST_BRACES = 200  # of which an answer's object may begin at one
 _MOST = 1e9  # any number of an answer is smaller
 
@@ -172,7 +172,7 @@ class ChatFormat:
             observation: `rgb` and `ee`, and what the extractor needs.
             extractor: Finds the objects whose boxes are listed; None lists none.
         """
-        tool = _tool(observation)
+        tool = tool_in(observation)
         shown = "suction cup" if tool == "suction" else "spatula"
         parts: list[Part] = [f"You control a robot arm with a {shown} above a table. The task:"]
         parts += [part if isinstance(part, str) else self._picture(part) for part in prompt.sequence()]
@@ -344,7 +344,8 @@ def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
     )
 
 
-def _tool(observation: Mapping) -> str:
+def tool_in(observation: Mapping) -> str:
+    """Return the end effector of an observation, "suction" or "spatula"."""
     return END_EFFECTORS[int(observation["ee"])]
 
 
@@ -361,7 +362,7 @@ def _joined(parts: Sequence[Part]) -> tuple[Part, ...]:
 
 
 def _last_object(text: str, names: Sequence[str]) -> dict[str, Any]:
-    tail, decoder = text[-_MOST_CHARACTERS:], json.JSONDecoder()
+    tail, decoder = text[-MOST_CHARACTERS:], json.JSONDecoder()
     starts = [found.start() for found in re.finditer(r"\{", tail)][-_MOST_BRACES:]
     for start in reversed(starts):
         try:

@@ -8,6 +8,7 @@ objects and J images in all prompts, I image tokens of all prompts, M latents.
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -376,12 +377,17 @@ class TokenPolicy(PolicyNetwork):
         return latents_JME[image_S].transpose(0, 1).flatten(0, 1)
 
 
+@cache
+def _table_axes() -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the table point of the first pixel of the top view, which looks straight down, and its axes."""
+    origin, right, down = unproject(np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"])
+    return torch.from_numpy(origin), torch.from_numpy(np.stack([right - origin, down - origin]))
+
+
 def _points_from_above(history: HistoryBatch, num_tokens: int) -> torch.Tensor:
     """Return the table points under the boxes of the top view, (B, T, Q, 2), for the last N of Q tokens."""
     boxes_BTN4, mask_BTN = history.boxes_BTVN4[:, :, TOP], history.masks_BTVN[:, :, TOP]
-    corners = np.array([(0, 0), (1, 0), (0, 1)])
-    origin, right, down = unproject(corners, CAMERAS["top"])  # it looks straight down
-    axes = torch.from_numpy(np.stack([right - origin, down - origin])).to(boxes_BTN4.device)
-    points_BTN2 = torch.from_numpy(origin).to(axes) + boxes_BTN4[..., :2].to(axes) @ axes
+    origin, axes = (each.to(boxes_BTN4.device) for each in _table_axes())
+    points_BTN2 = origin + boxes_BTN4[..., :2].to(axes) @ axes
     points_BTN2 = points_BTN2.masked_fill(~mask_BTN[..., None], math.inf)
     return F.pad(points_BTN2, (0, 0, num_tokens - mask_BTN.shape[-1], 0), value=math.inf)

@@ -20,6 +20,7 @@ import numpy as np
 from openvima.atomic_io import atomic_write_file
 from openvima.data.chat import (
     DEFAULT_ENLARGE,
+    MOST_CHARACTERS,
     POINTS,
     ChatFormat,
     ChatView,
@@ -27,18 +28,18 @@ from openvima.data.chat import (
     Turn,
     content_of,
     family_of,
+    tool_in,
     wording_hash,
 )
 from openvima.errors import AnswerError, ConfigError, LimitReachedError, PolicyError, ServerError, echo
 from openvima.imports import import_extra
 from openvima.perception.objects import GROUND_TRUTH, ObjectExtractor
 from openvima.policies.base import Policy
-from openvima.scene import END_EFFECTORS, RenderedPrompt
+from openvima.scene import RenderedPrompt
 from openvima.scene.explanation import Explanation
 
 KEY_VARIABLE, URL_VARIABLE = "OPENAI_API_KEY", "OPENAI_BASE_URL"
 SEGMENTATION = "segmentation"
-_MOST_CHARACTERS = 20_000  # of an answer that are kept: its last ones
 _LEAST_SECRET = 12  # characters of a key that is kept out of texts
 _RETRIES = 12  # with pauses of up to 8 s, or what the server asks for: a minute and more
 _TIMEOUT_S, _CONNECT_S = 600.0, 10.0
@@ -318,7 +319,7 @@ class ChatClient:
         tokens_in, tokens_out = (count if isinstance(count, int) and count > 0 else 0 for count in counts)
         name = echo(str(_found(said, "model") or self.model))
         return Answer(
-            request, text[-_MOST_CHARACTERS:], name, tokens_in, tokens_out, round(seconds, 3), left_out
+            request, text[-MOST_CHARACTERS:], name, tokens_in, tokens_out, round(seconds, 3), left_out
         )
 
     def _refusal(self, error: Any, body: Mapping[str, Any] | None = None) -> ServerError:
@@ -421,7 +422,7 @@ class VlmPolicy(Policy):
         chat.answer = chat.action = None
         if observation is None:
             return None
-        tool = END_EFFECTORS[int(observation["ee"])]
+        tool = tool_in(observation)
         if chat.turns:
             chat.turns.append(self.format.next_turn(observation, self.extractor))
         else:

@@ -151,10 +151,6 @@ def _rotate_defined(made: Composition, n: int) -> Goals:
     return (rotation_goal(made.object, angle_deg, position_m=TOLERANCE.position_m),)
 
 
-def _put_defined(made: Composition, n: int) -> Goals:
-    return _put_it(made, n)
-
-
 def _restore(made: Composition, n: int) -> Goals:
     assert made.object
     return (AtPose(made.object.id, made.object.pose, TOLERANCE),)
@@ -215,7 +211,7 @@ INSTRUCTIONS: dict[str, tuple[str, Callable[[Composition, int], Goals]]] = {
     "gather": ("put all objects with the same texture as {base_N} into it", _gather),
     "neighbor": ("put the object that was previously at its {direction_N} into the same {base_M}", _neighbor),
     "put": ("put the {object_N} into the {base_N}", _put),
-    "put_defined": ("put the {name} into the {base_N}", _put_defined),
+    "put_defined": ("put the {name} into the {base_N}", _put_it),
     "put_it": ("put it into the {base_N}", _put_it),
     "rearrange": ("rearrange to this {scene_N}", _rearrange),
     "restore": ("restore it", _restore),

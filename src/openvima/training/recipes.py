@@ -99,10 +99,9 @@ _PAPERS: Mapping[str, Any] = {
     "augmentation.distractor_prob": 0.3,
 }
 _PAPERS_MIDAS: Mapping[str, Any] = {
-    **{
-        name: value for name, value in _PAPERS.items() if name != "model.points"
-    },  # its head is autoregressive
+    **_PAPERS,
     "preset": "midas-nano",
+    "model.points": None,  # its head is autoregressive
     "augmentation.inverse_dynamics_prob": 0.33,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from openvima.errors import ConfigError
-from openvima.policies.nn.actions import ActionTargets
+from openvima.policies.nn.actions import ActionTargets, at, rotate, yaw_between
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.candidates import PlaceCandidates
 from openvima.policies.pointer.config import CandidateHeadConfig
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, relative_yaw, rotate
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet
 from small_networks import object_set, pointer_prompt
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
@@ -136,7 +136,7 @@ def test_the_centre_goes_to_the_candidate_whatever_grasp_and_rotation(head, inpu
         head.yaw.bias[round(math.degrees(yaw) / 5)] = 50.0
     decided = head.decode(inputs)
     torch.testing.assert_close(decided[..., 0:2], inputs.grasps_BTN2[:, :, 0])
-    angle = relative_yaw(decided)
+    angle = yaw_between(decided)
     torch.testing.assert_close(angle, torch.full_like(angle, yaw))
     held = rotate(inputs.grasps_BTN2[:, :, 0] - inputs.positions_BTN2[:, :, 0], angle)
     goal = place_of(inputs, candidate)
@@ -500,14 +500,14 @@ def test_rotations_shown_in_the_prompt_are_copied(inputs):
     expected = torch.full((B, T), math.radians(-30), dtype=torch.float64)
     none = torch.zeros_like(inputs.rotations_BTNR)
     still = replace(shown, rotations_BTNR=none)
-    torch.testing.assert_close(relative_yaw(head.decode(still)), expected)
+    torch.testing.assert_close(yaw_between(head.decode(still)), expected)
     # So is that of the picked object to how the prompt shows it, and of no other object.
     with torch.no_grad():
         head.rotation_copy.weight.bias.fill_(-50.0)
     head.pick.forward = lambda inputs: torch.eye(N)[torch.full((B, T), 2)]
     turned = none.clone()
     turned[:, :, 2, 6] = turned[:, :, 1, 12] = 1.0
-    torch.testing.assert_close(relative_yaw(head.decode(replace(shown, rotations_BTNR=turned))), -expected)
+    torch.testing.assert_close(yaw_between(head.decode(replace(shown, rotations_BTNR=turned))), -expected)
 
 
 def test_with_a_kept_place_in_the_batch_the_chosen_one_is_still_that_of_its_own_episode(head, inputs):

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from openvima.errors import ConfigError
-from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets
+from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, at, carry, yaw_between
 from openvima.policies.pointer.config import ObjectHeadConfig
-from openvima.policies.pointer.inputs import HeadInputs, at, carry, relative_yaw, yaw_to_bin
+from openvima.policies.pointer.inputs import HeadInputs, yaw_to_bin
 from openvima.policies.pointer.object_head import ObjectPointerHead
 from openvima.scene import Action
 from small_networks import object_set, pointer_prompt
@@ -84,7 +84,7 @@ def test_it_picks_at_the_grasp_point_and_places_by_the_position(head, inputs):
     low, high = torch.tensor([0.25, -0.5]).double(), torch.tensor([0.75, 0.5]).double()
     torch.testing.assert_close(decided[..., 6:8], expected.clamp(low, high))
     torch.testing.assert_close(
-        relative_yaw(decided) % (2 * math.pi), yaw.argmax(-1).double() * (2 * math.pi / 72)
+        yaw_between(decided) % (2 * math.pi), yaw.argmax(-1).double() * (2 * math.pi / 72)
     )
 
 
@@ -198,7 +198,7 @@ def test_a_batch_without_any_target_has_no_loss_and_no_bad_gradient(head, inputs
 def test_rotations_of_actions_are_read_back(degrees):
     arrays = Action.planar((0.5, 0), (0.5, 0), math.radians(degrees)).to_arrays()
     action = torch.cat([torch.from_numpy(arrays[key]) for key in ACTION_PARTS])[None, None]
-    assert yaw_to_bin(relative_yaw(action), 72).item() == degrees // 5 % 72
+    assert yaw_to_bin(yaw_between(action), 72).item() == degrees // 5 % 72
 
 
 def test_an_object_held_elsewhere_still_goes_where_it_was_demonstrated():

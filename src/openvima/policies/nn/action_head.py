@@ -23,8 +23,10 @@ from openvima.policies.nn.actions import (
     ActionEncoder,
     ActionTargets,
     DecodingStrategy,
+    at,
     from_unit_range,
     greedy,
+    mask_scores,
     masked_mean,
     nll,
     to_unit_range,
@@ -59,8 +61,7 @@ class ObservationTokens:
 
     def query(self, outputs_BTQD: torch.Tensor) -> torch.Tensor:
         """Return the outputs from which actions are decoded, (B, T, D)."""
-        index_BT1D = self.query_BT[..., None, None].expand(-1, -1, 1, outputs_BTQD.shape[-1])
-        return outputs_BTQD.gather(2, index_BT1D).squeeze(2)
+        return at(outputs_BTQD, self.query_BT)
 
 
 def action_segment(tokens_BTQD: torch.Tensor, exists_BT: torch.Tensor) -> TokenSegment:
@@ -224,7 +225,7 @@ def point_at_objects(
     actions_BTC = actions_BTC.clone()
     for half, limit_m in ((0, math.inf), (1, _AT_OBJECT_M)):
         slot_BT = strategy(_score_objects(half, query_BTD, observations))
-        point_BT2 = points_BTQ2.gather(2, slot_BT[..., None, None].expand(-1, -1, 1, 2)).squeeze(2)
+        point_BT2 = at(points_BTQ2, slot_BT)
         decoded_BT12 = actions_BTC[..., None, _POSITIONS[half]].to(points_BTQ2)
         is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < limit_m)[..., None]
         actions_BTC[..., _POSITIONS[half]] = torch.where(is_near_BT1, point_BT2, decoded_BT12.squeeze(2)).to(
@@ -238,8 +239,7 @@ def _score_objects(half: int, query_BTD: torch.Tensor, observations: Observation
     query_BTE, keys_BTQE = query_BTD.chunk(2, -1)[half], observations.tokens_BTQD.chunk(2, -1)[half]
     scores_BTQ = torch.einsum("btqe,bte->btq", keys_BTQE, query_BTE) * query_BTE.shape[-1] ** -0.5
     assert observations.points_BTQ2 is not None
-    is_object_BTQ = observations.points_BTQ2[..., 0].isfinite()
-    return scores_BTQ.masked_fill(~is_object_BTQ, torch.finfo(scores_BTQ.dtype).min)
+    return mask_scores(scores_BTQ, observations.points_BTQ2[..., 0].isfinite())
 
 
 @torch.no_grad()

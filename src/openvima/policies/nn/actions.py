@@ -1,6 +1,6 @@
-"""Actions as vectors, their encoder and targets, and how a class is decoded from logits.
+"""Actions as vectors, their planar geometry, encoder and targets, and how a class is decoded from logits.
 
-Shape suffixes: B batch, T steps, N objects in view, C components of an action.
+Shape suffixes: B batch, T steps, N objects in view, C components of an action, X any width.
 """
 
 import math
@@ -38,6 +38,17 @@ class ActionEncoder(nn.Module):
         slices = ACTION_PARTS.values()
         parts = [layers(unit_actions[..., part]) for layers, part in zip(self.parts, slices, strict=True)]
         return self.out(torch.cat(parts, dim=-1))
+
+
+def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:
+    """Take the row of one slot at every step: (B, T, N, X) and (B, T) give (B, T, X)."""
+    index = slot_BT[..., None, None].expand(*slot_BT.shape, 1, values_BTNX.shape[-1])
+    return values_BTNX.gather(2, index).squeeze(2)
+
+
+def mask_scores(scores: torch.Tensor, exists: torch.Tensor) -> torch.Tensor:
+    """Give what does not exist the most negative finite score."""
+    return torch.where(exists, scores, torch.finfo(scores.dtype).min)
 
 
 # Decoding strategy: logits (B, ..., classes) to class indices (B, ...).
@@ -114,6 +125,30 @@ def yaw_between(actions: torch.Tensor) -> torch.Tensor:
     x, y, z, w = actions.unflatten(-1, (2, 6))[..., 2:].unbind(-1)
     yaws = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return yaws[..., 1] - yaws[..., 0]
+
+
+def carry(actions_BTC: torch.Tensor, grasp_BT2: torch.Tensor) -> torch.Tensor:
+    """Where a point of an object ends when the object moves as demonstrated.
+
+    The demonstrator may hold an object by another point than the policy would. The object moves rigidly, so
+    that place' = place + rotation · (grasp' − grasp).
+
+    Args:
+        actions_BTC: The demonstrated actions.
+        grasp_BT2: Points of the objects, metres.
+
+    Returns:
+        Their places, shape (B, T, 2), metres.
+    """
+    held_BT2 = grasp_BT2 - actions_BTC[..., ACTION_PARTS["pose0_position"]]
+    return actions_BTC[..., ACTION_PARTS["pose1_position"]] + rotate(held_BT2, yaw_between(actions_BTC))
+
+
+def rotate(vectors_BT2: torch.Tensor, yaw_BT: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors on the table by angles in radians, counter-clockwise seen from above."""
+    x, y = vectors_BT2.unbind(-1)
+    cosine, sine = torch.cos(yaw_BT), torch.sin(yaw_BT)
+    return torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
 
 
 @torch.no_grad()

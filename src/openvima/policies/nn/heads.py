@@ -41,6 +41,7 @@ from openvima.policies.nn.actions import (
     ActionEncoder,
     ActionTargets,
     DecodingStrategy,
+    at,
     from_unit_range,
     greedy,
     masked_mean,
@@ -270,7 +271,7 @@ class MixtureHead(ActionHead):
         """Return the mode of the component that the strategy chooses."""
         logits_BTK, means_BTKP, yaws_BTK2, _ = self._components(query_BTD)
         chosen_BT = strategy(logits_BTK)
-        return _actions(_of(means_BTKP, chosen_BT), _of(yaws_BTK2, chosen_BT))
+        return _actions(at(means_BTKP, chosen_BT), at(yaws_BTK2, chosen_BT))
 
     def _components(self, query_BTD: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Logits, means, unit vectors of the rotation, and logarithms of standard deviations."""
@@ -319,12 +320,6 @@ class RegressionHead(ActionHead):
     def _huber(self, values: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
         loss = F.huber_loss(values, targets, reduction="none", delta=self.huber_delta)
         return loss.sum(-1) / self.huber_delta
-
-
-def _of(values_BTKX: torch.Tensor, chosen_BT: torch.Tensor) -> torch.Tensor:
-    """Values of the chosen component, (B, T, X)."""
-    index = chosen_BT[..., None, None].expand(-1, -1, 1, values_BTKX.shape[-1])
-    return values_BTKX.gather(2, index).squeeze(2)
 
 
 def _planar(actions_BTC: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:

@@ -12,7 +12,18 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
+from openvima.policies.nn.actions import (
+    ActionTargets,
+    DecodingStrategy,
+    at,
+    carry,
+    greedy,
+    mask_scores,
+    masked_mean,
+    nll,
+    rotate,
+    yaw_between,
+)
 from openvima.policies.nn.layers import mlp
 from openvima.policies.nn.policy_network import Replay, StepTrace, normalize_weights
 from openvima.policies.pointer.candidates import (
@@ -29,15 +40,10 @@ from openvima.policies.pointer.inputs import (
     HeadInputs,
     PointerPrompt,
     accuracy,
-    at,
     bin_to_yaw,
-    carry,
-    mask_scores,
     offset_loss,
     pick_and_place,
     pointing_metrics,
-    relative_yaw,
-    rotate,
     yaw_to_bin,
 )
 from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
@@ -110,7 +116,7 @@ class CandidatePointerHead(nn.Module):
         points = at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, pick), candidates.positions_at(place)
         offset, yaw_logits = self.relate(inputs, candidates, pick, place, points)
         true_offset = goal - points[-1]
-        yaw = yaw_to_bin(relative_yaw(targets.actions_BTC), config.num_yaw_bins)
+        yaw = yaw_to_bin(yaw_between(targets.actions_BTC), config.num_yaw_bins)
         place_nll = place_logits.logsumexp(-1) - right_logits.logsumexp(-1)
         pick_appearance = self.pick.appearance_scores(inputs)
         grounding, is_grounded_BT = self.pick.grounding_nll(inputs, pick)

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.nn.actions import ActionTargets
-from openvima.policies.pointer.inputs import OFFSET_UNIT_M, HeadInputs, ObjectSet, at
+from openvima.policies.nn.actions import ActionTargets, at
+from openvima.policies.pointer.inputs import OFFSET_UNIT_M, HeadInputs, ObjectSet
 from openvima.scene.explanation import PLACE_KINDS
 
 NUM_GEOMETRY = 6

@@ -1,4 +1,4 @@
-"""What the heads of the pointer models read, and the planar geometry of their actions, losses and metrics.
+"""What the heads of the pointer models read, and how their actions are composed.
 
 Shape suffixes: B batch, T steps, N objects in view, L positions of the prompt, K objects of a set, D width, A
 width of appearance, P attributes, X width of all their projections, C components of an action, R bins of
@@ -122,17 +122,6 @@ class HeadInputs:
     attributes_BTNX: torch.Tensor | None = None
 
 
-def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:
-    """Take the row of one slot at every step: (B, T, N, X) and (B, T) give (B, T, X)."""
-    index = slot_BT[..., None, None].expand(*slot_BT.shape, 1, values_BTNX.shape[-1])
-    return values_BTNX.gather(2, index).squeeze(2)
-
-
-def mask_scores(scores: torch.Tensor, exists: torch.Tensor) -> torch.Tensor:
-    """Give what does not exist the most negative finite score."""
-    return torch.where(exists, scores, torch.finfo(scores.dtype).min)
-
-
 OFFSET_UNIT_M = 0.1  # offsets are predicted in decimetres, so that they are of the order of 1
 RIGHT_OFFSET_M = 0.02  # a place this near to the demonstrated one counts as right in the metrics
 
@@ -144,39 +133,6 @@ def pick_and_place(grasp_BT2: torch.Tensor, place_BT2: torch.Tensor, yaw_BT: tor
     half = yaw_BT / 2
     pose1 = [place_BT2, torch.stack([zero, zero, torch.sin(half), torch.cos(half)], dim=-1)]
     return from_unit_range(to_unit_range(torch.cat(pose0 + pose1, dim=-1)))
-
-
-def relative_yaw(actions_BTC: torch.Tensor) -> torch.Tensor:
-    """Yaw of pose1 relative to pose0 in radians, shape (B, T)."""
-    yaws = []
-    for start in (2, 8):
-        x, y, z, w = actions_BTC[..., start : start + 4].unbind(-1)
-        yaws.append(torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    return yaws[1] - yaws[0]
-
-
-def carry(actions_BTC: torch.Tensor, grasp_BT2: torch.Tensor) -> torch.Tensor:
-    """Where a point of an object ends when the object moves as demonstrated.
-
-    The demonstrator may hold an object by another point than the policy would. The object moves rigidly, so
-    that place' = place + rotation · (grasp' − grasp).
-
-    Args:
-        actions_BTC: The demonstrated actions.
-        grasp_BT2: Points of the objects, metres.
-
-    Returns:
-        Their places, shape (B, T, 2), metres.
-    """
-    held_BT2 = grasp_BT2 - actions_BTC[..., 0:2]
-    return actions_BTC[..., 6:8] + rotate(held_BT2, relative_yaw(actions_BTC))
-
-
-def rotate(vectors_BT2: torch.Tensor, yaw_BT: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors on the table by angles in radians, counter-clockwise seen from above."""
-    x, y = vectors_BT2.unbind(-1)
-    cosine, sine = torch.cos(yaw_BT), torch.sin(yaw_BT)
-    return torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
 
 
 def yaw_to_bin(yaw: torch.Tensor, num_bins: int) -> torch.Tensor:

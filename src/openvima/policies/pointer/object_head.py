@@ -9,21 +9,27 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
+from openvima.policies.nn.actions import (
+    ActionTargets,
+    DecodingStrategy,
+    at,
+    carry,
+    greedy,
+    mask_scores,
+    masked_mean,
+    nll,
+    yaw_between,
+)
 from openvima.policies.nn.layers import mlp
 from openvima.policies.nn.policy_network import Replay, StepTrace, normalize_weights
 from openvima.policies.pointer.config import ObjectHeadConfig
 from openvima.policies.pointer.inputs import (
     OFFSET_UNIT_M,
     HeadInputs,
-    at,
     bin_to_yaw,
-    carry,
-    mask_scores,
     offset_loss,
     pick_and_place,
     pointing_metrics,
-    relative_yaw,
     yaw_to_bin,
 )
 
@@ -59,7 +65,7 @@ class ObjectPointerHead(nn.Module):
         carried = carry(actions, at(inputs.grasps_BTN2, pick))
         true_place = torch.where(inputs.has_suction_BT[..., None], carried, actions[..., 6:8])
         true_offset = true_place - at(inputs.positions_BTN2, place)
-        yaw = yaw_to_bin(relative_yaw(actions), self.config.num_yaw_bins)
+        yaw = yaw_to_bin(yaw_between(actions), self.config.num_yaw_bins)
         losses = {
             "pick": masked_mean(nll(pick_logits, pick), has_pick),
             "place": masked_mean(nll(place_logits, place), has_place),

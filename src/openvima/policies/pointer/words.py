@@ -17,11 +17,12 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.batch import PromptBatch
+from openvima.policies.nn.actions import mask_scores
 from openvima.policies.nn.layers import mlp
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
 from openvima.policies.pointer.correspondence import ObjectFeatures
-from openvima.policies.pointer.inputs import PointerPrompt, mask_scores
+from openvima.policies.pointer.inputs import PointerPrompt
 
 _BOX_UNIT_PX = 32.0  # sides of boxes are of this order
 _HIDDEN_SIDE_PX = 24

@@ -17,7 +17,7 @@ from openvima.perception.boxes import box_iou
 from openvima.perception.objects import TOP
 from openvima.perception.preprocessing import ObjectTable
 from openvima.policies.batch import Batch, HistoryBatch
-from openvima.policies.nn.actions import ACTION_PARTS, yaw_between
+from openvima.policies.nn.actions import ACTION_PARTS, carry
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.tasks.registry import task_spec
 from openvima.training.augmentation.prompts import (
@@ -125,11 +125,8 @@ def centre_picks(episode: PreprocessedEpisode) -> PreprocessedEpisode:
     step = step[is_picked]
     points = unproject(episode.objects.grasps[is_picked, TOP], CAMERAS["top"])
     actions = episode.actions.copy()
-    shift = points - actions[step, PICK]
-    turn = np.exp(1j * yaw_between(torch.from_numpy(actions[step])).numpy())  # the object turns on its way
-    turned = turn * (shift[:, 0] + 1j * shift[:, 1])
+    actions[step, PLACE] = carry(torch.from_numpy(actions[step]), torch.from_numpy(points)).numpy()
     actions[step, PICK] = points
-    actions[step, PLACE] += np.stack([turned.real, turned.imag], axis=-1)
     return replace(episode, actions=actions)
 
 
