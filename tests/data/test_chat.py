@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from openvima.data.chat import POINTS, UNREADABLE, ChatFormat, demo_turns, family_of
+from openvima.data.chat import UNREADABLE, ChatFormat, demo_turns, family_of
+from openvima.data.chat_settings import POINTS
 from openvima.data.records import rollout_oracle
 from openvima.env import EnvConfig
 from openvima.errors import AnswerError, ConfigError

@@ -17,12 +17,13 @@ from tests.chat_server import ChatServer, chat_server, images_of, refused, text_
 
 from openvima.cli.main import main
 from openvima.data.chat import ChatFormat
+from openvima.data.chat_settings import VlmOptions
 from openvima.env import EnvConfig
 from openvima.errors import LimitReachedError, MissingExtraError, PolicyError, ServerError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 from openvima.evaluation.sources import PolicySource
 from openvima.policies.naming import PolicyRef
-from openvima.serving.chat import VlmConfig, VlmOptions
+from openvima.serving.chat import VlmConfig
 
 KEY = "sk-secret-of-a-test"
 SURE = '{"pick": [500, 500], "place": [600, 500], "rotate": 0}'

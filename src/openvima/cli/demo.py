@@ -5,8 +5,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from openvima.data.chat import ChatView
-from openvima.serving.chat import DEFAULT_OPTIONS, VlmOptions
+from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 
 def main(

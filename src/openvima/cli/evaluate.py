@@ -18,8 +18,7 @@ from openvima.cli.terminal import (
     print_table,
     progress_bar,
 )
-from openvima.data.chat import ChatView
-from openvima.serving.chat import DEFAULT_OPTIONS, VlmOptions
+from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from openvima.errors import AnswerError, ConfigError, echo, unknown_name
+from openvima.data.chat_settings import DEFAULT_ENLARGE, ChatView, Points, check_format
+from openvima.errors import AnswerError, echo
 from openvima.perception.objects import VIEWS, ObjectExtractor
 from openvima.render.camera import CAMERAS, View, channels_last, project, unproject
 from openvima.scene import END_EFFECTORS, Action, PromptImage, RenderedPrompt
@@ -28,12 +29,6 @@ from openvima.video.prompt_strip import cut_to_object
 
 if TYPE_CHECKING:
     from openvima.data.records import Demonstration
-
-Points = Literal["1000-xy", "1000-yx", "1-xy", "1-yx", "pixels-xy", "pixels-yx"]
-POINTS: tuple[Points, ...] = ("1000-xy", "1000-yx", "1-xy", "1-yx", "pixels-xy", "pixels-yx")
-ChatView = Literal["top", "front", "top+front", "front+top"]
-CHAT_VIEWS: tuple[ChatView, ...] = ("top", "front", "top+front", "front+top")
-DEFAULT_ENLARGE = 4
 
 Part = str | bytes  # a text, or an image as a PNG file
 Tokens = Callable[[int, int], int]  # of an image with that width and height in pixels
@@ -145,11 +140,7 @@ class ChatFormat:
     enlarge: int = DEFAULT_ENLARGE
 
     def __post_init__(self) -> None:
-        for name, allowed in (("points", POINTS), ("view", CHAT_VIEWS)):
-            if getattr(self, name) not in allowed:
-                raise ConfigError(unknown_name(f"choice of {name}", getattr(self, name), allowed))
-        if not 1 <= self.enlarge <= 16:
-            raise ConfigError(f"enlarge is {self.enlarge}; it must lie within 1 … 16.")
+        check_format(self.points, self.view, self.enlarge)
 
     @property
     def views(self) -> list[View]:

@@ -18,19 +18,8 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from openvima.atomic_io import atomic_write_file
-from openvima.data.chat import (
-    DEFAULT_ENLARGE,
-    MOST_CHARACTERS,
-    POINTS,
-    ChatFormat,
-    ChatView,
-    Points,
-    Turn,
-    content_of,
-    family_of,
-    tool_in,
-    wording_hash,
-)
+from openvima.data.chat import MOST_CHARACTERS, ChatFormat, Turn, content_of, family_of, tool_in, wording_hash
+from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 from openvima.errors import AnswerError, ConfigError, LimitReachedError, PolicyError, ServerError, echo
 from openvima.imports import import_extra
 from openvima.perception.objects import GROUND_TRUTH, ObjectExtractor
@@ -44,48 +33,6 @@ _LEAST_SECRET = 12  # characters of a key that is kept out of texts
 _RETRIES = 12  # with pauses of up to 8 s, or what the server asks for: a minute and more
 _TIMEOUT_S, _CONNECT_S = 600.0, 10.0
 _OPTIONAL = ("response_format", "temperature")  # that servers may refuse, in the order of leaving them out
-
-
-@dataclass(frozen=True, slots=True)
-class VlmOptions:
-    """How a vision-language model is asked.
-
-    Args:
-        points: How it writes points: largest number (1000, 1, or pixels) and order, such as 1000-xy.
-            Default: by the family of its name, such as 1000-yx for Gemini.
-        enlarge: Whole factor on images, without smoothing.
-        boxes: List boxes of the objects in the text: segmentation; detector, the bundled one, or what else
-            --boxes takes.
-        shots: Number of demonstrations of the same task, of domain train, before it; tasks that are held out
-            for L4 get none.
-        free_text: Ask for no JSON by a schema, so that models may think aloud before.
-        temperature: Of sampling, where the server takes one; a negative one leaves it to the server.
-        concurrency: Requests at a time.
-        max_requests: End with the finished part of the table after so many requests; 0: no limit.
-        max_tokens: The same for tokens, in and out; 0: no limit.
-
-    Raises:
-        ConfigError: A value is out of its range.
-    """
-
-    points: Points | None = None
-    enlarge: int = DEFAULT_ENLARGE
-    boxes: str = ""
-    shots: int = 0
-    free_text: bool = False
-    temperature: float = 0.0
-    concurrency: int = 16
-    max_requests: int = 0
-    max_tokens: int = 0
-
-    def __post_init__(self) -> None:
-        ChatFormat(self.points or POINTS[0], enlarge=self.enlarge)
-        for name, least in (("shots", 0), ("concurrency", 1), ("max_requests", 0), ("max_tokens", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"vlm.{name} is {getattr(self, name)}; it must be at least {least}.")
-
-
-DEFAULT_OPTIONS = VlmOptions()
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from openvima.cli.terminal import parse_list, parse_tasks, print_files, progress_bar
-from openvima.data.chat import DEFAULT_ENLARGE, ChatFormat, ChatView, Points
+from openvima.data.chat_settings import DEFAULT_ENLARGE, ChatView, Points
 
 Compression = Literal["lz4", "zstd"]
 
@@ -282,6 +282,7 @@ def export_chat(
     Returns:
         Exit status.
     """
+    from openvima.data.chat import ChatFormat
     from openvima.data.chat_export import ChatExportConfig
     from openvima.data.chat_export import export_chat as write_export
     from openvima.detector.plugins import plugged_extractor
