@@ -1,7 +1,7 @@
 """Clutter of level L5: up to ten more objects on the table, look-alikes among them.
 
 A task is sampled as at L3, then objects are added that its prompt does not mean. What a prompt means is
-told by `MEANT_BY`; an added object differs from all that are meant in that attribute, so that the prompt has
+in `MEANT_BY`; an added object differs from all that are meant in that attribute, so that the prompt has
 one reading as before. Two thirds share a shape or a texture with an object of the goals; the first is tall
 and stands, where there is room, between such an object and the front camera. Where six bases fill the table,
 objects lie in those that are not meant.
@@ -24,18 +24,18 @@ BASES = OBJECT_SETS["B_novel"]
 OBJECTS = (*OBJECT_SETS["D_novel"], *BASES)
 TEXTURES = TEXTURE_SETS["T"]
 
-Attribute = Literal["look", "shape", "texture", "profile"]
+Attribute = Literal["appearance", "shape", "texture", "profile"]
 MEANT_BY: dict[str, tuple[Attribute, Attribute]] = {
-    "scene_understanding": ("look", "texture"),
+    "scene_understanding": ("appearance", "texture"),
     "novel_adj": ("shape", "shape"),
     "novel_noun": ("shape", "shape"),
     "twist": ("texture", "texture"),
     "same_shape": ("profile", "profile"),
 }
-"""How prompts tell objects to move, and bases; elsewhere by their look: shape and texture."""
+"""How prompts tell objects to move, and bases; elsewhere by appearance: shape and texture."""
 
 _OF: dict[Attribute, Callable[[str, str], object]] = {
-    "look": lambda shape, texture: (shape, texture),
+    "appearance": lambda shape, texture: (shape, texture),
     "shape": lambda shape, texture: shape,
     "texture": lambda shape, texture: texture,
     "profile": lambda shape, texture: object_spec(shape).profile,
@@ -62,7 +62,7 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
     scene, goals = problem.scene, problem.goals
     moved = [scene[i] for i in dict.fromkeys(object_of(goal) for goal in goals) if i is not None]
     bases = [scene[i] for i in {getattr(goal, "relative_to", None) for goal in goals} if i is not None]
-    by_moved, by_base = MEANT_BY.get(task, ("look", "look"))
+    by_moved, by_base = MEANT_BY.get(task, ("appearance", "appearance"))
     forbidden = {(p.object, p.texture) for p in scene.placements}
     meant: list[tuple[Attribute, object]] = [
         *((by_moved, _OF[by_moved](p.object, p.texture)) for p in moved),

@@ -70,7 +70,7 @@ class Composition:
         fills: Slots of the prompt.
         object: The object that "it" refers to.
         base: The last base.
-        looks: Appearances that no other object may have.
+        appearances: Appearances that no other object may have.
         shapes, textures: Shapes that a definition means, and textures that an instruction gathers.
         places: Where objects are to go on the free table.
         directions: Object, step and neighbour that nothing may come between.
@@ -80,7 +80,7 @@ class Composition:
     fills: dict[str, ObjectImage | SceneImage | str | int] = field(default_factory=dict)
     object: Placement | None = None
     base: Placement | None = None
-    looks: set[tuple[str, str]] = field(default_factory=set)
+    appearances: set[tuple[str, str]] = field(default_factory=set)
     shapes: set[str] = field(default_factory=set)
     textures: set[str] = field(default_factory=set)
     places: list[Placement] = field(default_factory=list)
@@ -91,13 +91,14 @@ class Composition:
 
         def draw() -> tuple[str, str]:
             for _ in range(_TRIES):
-                look = self.table.choose(shapes), self.table.choose(textures)
-                if look not in self.looks and look[0] not in self.shapes and look[1] not in self.textures:
-                    return look
+                shape, texture = self.table.choose(shapes), self.table.choose(textures)
+                is_meant = shape in self.shapes or texture in self.textures
+                if not is_meant and (shape, texture) not in self.appearances:
+                    return shape, texture
             raise SamplingError(f"no appearance is left for the {what}.")
 
         new = self.table.place_one(what, draw, tries=_TRIES, apart_m=APART_M, reject=self._reaches_a_place)
-        self.looks.add((new.object, new.texture))
+        self.appearances.add((new.object, new.texture))
         return new
 
     def new_object(self, *, asymmetric: bool = False) -> Placement:
@@ -191,10 +192,14 @@ def _neighbor(made: Composition, n: int) -> Goals:
         along, across = offset(new, dragged, step)
         return not (0 < along < _NEIGHBOR_M + 0.06 and across < 0.05)
 
-    looks = [(s, t) for s in pool.dragged_objects for t in pool.dragged_textures if (s, t) not in made.looks]
-    look = table.choose(looks)
-    neighbor = table.place_one("neighbor", lambda: look, tries=200, apart_m=APART_M, reject=is_elsewhere)
-    made.looks.add(look)
+    appearances = [
+        (s, t) for s in pool.dragged_objects for t in pool.dragged_textures if (s, t) not in made.appearances
+    ]
+    appearance = table.choose(appearances)
+    neighbor = table.place_one(
+        "neighbor", lambda: appearance, tries=200, apart_m=APART_M, reject=is_elsewhere
+    )
+    made.appearances.add(appearance)
     made.directions.append((dragged, step, neighbor))
     made.fills[f"direction_{n}"] = direction
     return _into(neighbor, made.base)

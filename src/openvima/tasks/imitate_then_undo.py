@@ -43,9 +43,9 @@ def sample(table: TableSampler, *, num_frames: int = NUM_FRAMES, num_distractors
 
     def put(what: str) -> Placement:
         options = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
-        look = table.choose([look for look in options if look not in taken])
-        taken.add(look)
-        return table.place_one(what, lambda: look, tries=_TRIES, apart_m=APART_M)
+        appearance = table.choose([appearance for appearance in options if appearance not in taken])
+        taken.add(appearance)
+        return table.place_one(what, lambda: appearance, tries=_TRIES, apart_m=APART_M)
 
     objects = [put("object") for _ in range(NUM_OBJECTS)]
     distractors = [put("distractor") for _ in range(num_distractors)]

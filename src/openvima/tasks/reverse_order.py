@@ -39,19 +39,19 @@ def sample(table: TableSampler, *, num_objects: int = NUM_OBJECTS, num_distracto
     check_count("num_objects", num_objects, low=4, high=NUM_OBJECTS)
     check_count("num_distractors", num_distractors, high=3)
     pool = table.pool
-    appearances = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
-    drawn = table.rng.choice(len(appearances), num_objects + num_distractors, replace=False)
-    looks = [appearances[index] for index in drawn]
+    options = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
+    drawn = table.rng.choice(len(options), num_objects + num_distractors, replace=False)
+    appearances = [options[index] for index in drawn]
     places = [Pose.planar(ROW_X, (n - (num_objects - 1) / 2) * SPACING_M) for n in range(num_objects)]
     side = table.choose((-1, 1))  # of the row where the oracle puts objects aside
     row = [
         table.add(name, texture, size=table.sample_size(name), pose=pose)
-        for (name, texture), pose in zip(looks, places, strict=False)
+        for (name, texture), pose in zip(appearances, places, strict=False)
     ]
     beside = table.rng.permutation(num_objects)[:num_distractors].tolist()
     distractors = [
         table.add(name, texture, size=table.sample_size(name), pose=places[n].moved(dx=-side * ASIDE_M))
-        for (name, texture), n in zip(looks[num_objects:], beside, strict=True)
+        for (name, texture), n in zip(appearances[num_objects:], beside, strict=True)
     ]
 
     half = num_objects // 2

@@ -88,7 +88,7 @@ def sorting_problem(
     )
 
 
-def _put(table: TableSampler, look: Appearance, x: float, y: float, *, turns: int = 0) -> Placement:
+def _put(table: TableSampler, appearance: Appearance, x: float, y: float, *, turns: int = 0) -> Placement:
     """Add an object, turned by a multiple of 90 degrees so that it stays in its cell."""
     pose = Pose.planar(x, y, turns * math.pi / 2)
-    return table.add(*look, size=table.sample_size(look[0]), pose=pose)
+    return table.add(*appearance, size=table.sample_size(appearance[0]), pose=pose)
