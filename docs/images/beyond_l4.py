@@ -1,4 +1,4 @@
-"""Make beyond_l5.png, beyond_l6.png and beyond_l8.png beside this file: an episode of each level, solved."""
+"""Make beyond_l5.png to beyond_l8.png beside this file: an episode of each level, solved."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from openvima.evaluation.recording import save_episode_image
 SHOWN = {
     "L5": ("visual_manipulation", 2),
     "L6": ("define_rotate_put_it_restore", 1),
+    "L7": ("refer_by_relation", 8),
     "L8": ("sort_by_texture", 1),
 }
 

@@ -24,6 +24,7 @@ LEVELS = {
     "L4": "a task that is not trained",
     "L5": "the objects of L3 among clutter",
     "L6": "several instructions in one prompt",
+    "L7": "words for relations, superlatives, exceptions, numbers and alternatives",
     "L8": "six to twelve steps",
 }
 Score = tuple[int, int, tuple[float, float]]  # solved, episodes, 95 % interval

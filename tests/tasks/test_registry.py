@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from openvima.catalog import Level, Pool, levels_of, pool
-from openvima.catalog.partitions import PUBLISHED_TASKS
+from openvima.catalog.partitions import PUBLISHED_TASKS, tasks_at
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
 from openvima.tasks import list_tasks, register_task, registry, sample_episode, task_spec
 from openvima.tasks.registry import MAX_EPISODE_STEPS
@@ -58,7 +58,7 @@ def test_the_families_are_those_of_the_paper() -> None:
     }
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", sorted({*TASKS} - {*tasks_at("L7")}))  # a grammar makes those of L7
 def test_every_prompt_follows_the_template(task: str) -> None:
     spec = task_spec(task)
     for seed in range(5):

@@ -2,7 +2,7 @@
 
 Training and L1 share their pools. L2 swaps the textures of the two roles, L3 has novel shapes and all
 textures, L4 novel tasks. Beyond the benchmark are L5, L3's objects and textures among clutter, L6,
-compositions of instructions, and L8, tasks of six to twelve steps.
+compositions of instructions, L7, referring expressions, and L8, tasks of six to twelve steps.
 
 Source: the partition files of VIMA-Bench, with its constructor defaults filled in where they pass nothing.
 """
@@ -13,7 +13,7 @@ from typing import Literal, get_args
 from openvima.catalog.textures import TEXTURES
 from openvima.errors import LevelError, UnknownTaskError, unknown_name
 
-Level = Literal["train", "L1", "L2", "L3", "L4", "L5", "L6", "L8"]
+Level = Literal["train", "L1", "L2", "L3", "L4", "L5", "L6", "L7", "L8"]
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 PUBLISHED_LEVELS = LEVELS[:5]
@@ -54,6 +54,7 @@ OBJECT_SETS: dict[str, tuple[str, ...]] = {
     "D_all_motion": ("block", *_ALL_KIT),
     "D_all_minus_block": _ALL_KIT,
     "D_all_texture": ("shorter block", *_ALL_KIT),
+    "D_named": tuple(name for name in ("block", *_ALL_KIT) if name not in ("L-shaped block", "round")),
     "B_all": ("pan", "bowl", "frame", "square", "container", "pallet"),
     "B_all_texture": ("pan", "bowl", "container", "frame", "pallet", "square"),
     "swept": ("small block",),
@@ -182,6 +183,10 @@ _COMPOSITIONS = _names(
     "put_rotate_put, put_neighbor_rotate, gather_rotate_put_it, define_rotate_put_it_restore"
 )
 _L6: dict[str, _SetNames] = dict.fromkeys(_COMPOSITIONS, ("D_all_motion", "B_all", "T_first", "T_second"))
+_REFERRING = _names(
+    "refer_by_relation, refer_by_superlative, refer_by_exception, refer_by_number, refer_by_alternative"
+)
+_L7: dict[str, _SetNames] = dict.fromkeys(_REFERRING, ("D_named", "B_all", "T_first", "T_second"))
 _L8: dict[str, _SetNames] = {
     "build_pattern": ("D_all_motion", "none", "T", "none"),
     "imitate_then_undo": ("D_all_motion", "none", "T", "none"),
@@ -198,7 +203,7 @@ def _pools(table: dict[str, _SetNames]) -> dict[str, Pool]:
     }
 
 
-_TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4, _L5, _L6, _L8)
+_TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4, _L5, _L6, _L7, _L8)
 _POOLS = {level: _pools(table) for level, table in zip(LEVELS, _TABLES, strict=True)}
 PUBLISHED_TASKS = (*_TRAIN, *_L4)
 """The 17 tasks of the benchmark."""

@@ -38,7 +38,7 @@ def main(
         episode: YAML or JSON file of an episode, sampled or composed (see docs/compose.md).
         out: MP4 file to write.
         seed: Number of the episode.
-        level: train, L1 to L6 or L8; by default the task's first.
+        level: train, L1 to L8; by default the task's first.
         policy: oracle, openvima-small (bundled), random, untrained, untrained:PRESET (random weights), the
             folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
             a published file, OWNER/NAME[@REVISION] on the Hub, a policy server (ws://HOST:PORT), or a

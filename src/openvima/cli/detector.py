@@ -63,7 +63,7 @@ def evaluate(
     Args:
         detector: Run folder or checkpoint folder; by default the bundled detector.
         data: Folder of demonstrations; by default the oracle generates episodes of all tasks of the level.
-        level: train, L1 to L6 or L8, instead of --data; by default L3, with novel objects and textures.
+        level: train, L1 to L8, instead of --data; by default L3, with novel objects and textures.
         frames: Number of images, rounded up to pairs of views.
         held_out: Use only the demonstrations of --data that a training with this validation fraction holds
             out, such as 0.02; by default all.
@@ -116,7 +116,7 @@ def show(
         detector: Run folder or checkpoint folder; by default the bundled detector.
         out: PNG file to write.
         data: Folder of demonstrations; by default the oracle generates episodes of all tasks of the level.
-        level: train, L1 to L6 or L8, instead of --data; by default L3, with novel objects and textures.
+        level: train, L1 to L8, instead of --data; by default L3, with novel objects and textures.
         frames: Number of images, rounded up to pairs of views.
         prompt_prob: Probability of a prompt image instead of an observation.
         score: Least score of the detections that are drawn; by default all that a policy gets.

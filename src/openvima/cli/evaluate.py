@@ -186,7 +186,7 @@ def main(
             NAME=FILE.py:FUNCTION and so on give another name.
         tasks: Names of tasks with commas in between; all; or heldout, the four tasks of L4 that training
             does not see. A level that does not hold a task leaves it out.
-        levels: Levels with commas in between: train, L1 to L6, L8; from L5 on they are beyond the benchmark.
+        levels: Levels with commas in between: train, L1 to L8; from L5 on they are beyond the benchmark.
         episodes: Episodes for each policy, task and level; 200 as in published tables.
         seed: Number of the first episode; evaluation episodes never occur in training.
         workers: Processes; by default one for each CPU, fewer for less than two batches each, and one with

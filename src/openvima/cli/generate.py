@@ -43,7 +43,7 @@ def main(
         tasks: Names of tasks with commas between them, "all", or "heldout" for the four tasks of L4 that
             training does not see.
         episodes: Successful episodes of each task.
-        level: Which objects and textures may occur: train, L1 to L6 or L8.
+        level: Which objects and textures may occur: train, L1 to L8.
         workers: Number of processes; by default one, or all CPUs of the Ray cluster at --address.
         seed: First seed.
         shard_size: Episodes in a file; by default files grow with their number, from 4 episodes to 1000.

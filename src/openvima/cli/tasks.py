@@ -32,7 +32,7 @@ def main(
     Args:
         name: Task to describe, with its options for --task-options.
         as_json: Print JSON instead of a table.
-        level: List the tasks of this level only: train, L1 to L6 or L8.
+        level: List the tasks of this level only: train, L1 to L8.
         gallery: Write an HTML page with an image of each task into this folder.
         assets: Asset pack of the gallery: procedural, original, the folder of a checkout of VIMA-Bench, or
             FILE.py:FUNCTION, which registers assets of your own.

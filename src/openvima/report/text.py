@@ -21,6 +21,7 @@ LEVEL_NAMES = {
     "L4": "Novel tasks",
     "L5": "Clutter",
     "L6": "Composition",
+    "L7": "Language",
     "L8": "Long horizon",
 }
 LEVEL_MEANINGS = {
@@ -31,6 +32,7 @@ LEVEL_MEANINGS = {
     "L4": "New kinds of prompts, with new objects and textures.",
     "L5": "The training tasks with the objects of L3, among three to ten more with look-alikes.",
     "L6": "Two and three instructions of trained tasks in one prompt.",
+    "L7": "Referring expressions: relations, superlatives, exceptions, numbers and alternatives.",
     "L8": "Tasks of six to twelve steps, with all objects and textures.",
 }
 _ROLES = {
