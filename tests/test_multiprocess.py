@@ -95,9 +95,11 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     parent = subprocess.Popen(
         [sys.executable, str(script), *map(str, paths)], env=environment, stderr=subprocess.DEVNULL
     )
-    wait_until(lambda: all(path.exists() for path in paths))
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
+    try:
+        wait_until(lambda: all(path.exists() for path in paths))
+    finally:
+        parent.kill()
+        parent.wait()
     workers = [int(path.read_text()) for path in paths]
     try:
         wait_until(lambda: not any(is_alive(pid) for pid in workers))

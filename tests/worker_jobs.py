@@ -1,10 +1,12 @@
 """Work that tests give to other processes: jobs, and holders of locks."""
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -42,6 +44,13 @@ def note_pid_and_hang(path: Path, count: Callable[[int], None]) -> None:
     path.with_suffix(".part").write_text(str(os.getpid()))
     path.with_suffix(".part").rename(path)
     signal.pause()
+
+
+def forget_ray() -> None:
+    """Collect what Ray leaves: it does not wait for processes that it ends, and Python warns of them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        gc.collect()
 
 
 _SCRIPT = """

@@ -438,7 +438,9 @@ def _stop(ray: ModuleType, references: list[Any]) -> None:
 def _environment() -> dict[str, str]:
     """Environment of the workers: one thread each, and this package's variables."""
     own = {name: value for name, value in os.environ.items() if name.startswith("OPENVIMA_")}
-    return {**own, **WORKER_VARIABLES}
+    # Ray shares workers between equal environments. One that was cancelled may have stopped in the middle of
+    # an import or a compilation, so each call has workers of its own.
+    return {**own, **WORKER_VARIABLES, "OPENVIMA_CALL": str(time.time_ns())}
 
 
 def _first_line(error: Exception) -> str:

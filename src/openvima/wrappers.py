@@ -119,15 +119,15 @@ class FlatObservation(gymnasium.Wrapper):
 
     Args:
         env: An environment of the package, wrapped or not, that observes `rgb` and `segm`.
-        max_objects: Rows for objects on the table.
-        max_prompt_objects: Rows for objects in the prompt's images.
+        max_objects: Rows for objects on the table; no task has more than 18 by default.
+        max_prompt_objects: Rows for objects in the prompt's images; likewise.
 
     Raises:
         ConfigError: The environment does not observe `rgb` and `segm`, or a number of rows is no integer
             of at least 1.
     """
 
-    def __init__(self, env: gymnasium.Env, *, max_objects: int = 16, max_prompt_objects: int = 16) -> None:
+    def __init__(self, env: gymnasium.Env, *, max_objects: int = 18, max_prompt_objects: int = 18) -> None:
         super().__init__(env)
         self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
         if not {"rgb", "segm"} <= set(self._base.modalities):

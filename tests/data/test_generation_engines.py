@@ -24,16 +24,19 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def ray() -> Iterator[ModuleType]:
     """Ray with two processors on this machine."""
     ray = pytest.importorskip("ray")
-    ray.init(
-        address="local",
-        num_cpus=2,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level="ERROR",
-        runtime_env={"env_vars": {"PYTHONPATH": str(Path(worker_jobs.__file__).parent)}},
-    )
-    yield ray
-    ray.shutdown()
+    try:
+        ray.init(
+            address="local",
+            num_cpus=2,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level="ERROR",
+            runtime_env={"env_vars": {"PYTHONPATH": str(Path(worker_jobs.__file__).parent)}},
+        )
+        yield ray
+    finally:
+        ray.shutdown()
+        worker_jobs.forget_ray()
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """From nothing to a report on the command line, in small."""
 
 import json
-import signal
 import subprocess
 import sys
 import time
@@ -127,14 +126,17 @@ def test_a_killed_training_goes_on_and_is_scored_with_ablations(tmp_path: Path, 
     run("generate", "--tasks", TASKS, "--episodes", 4, "--out", demos)
     train = ["train", "--data", demos, "--preset", "vima-nano", "--out", trained, "--loader.batch-size", 2]
     train += ["--schedule.steps", 12, "--schedule.checkpoint-every", 1, "--runtime.threads", 1]
+    train += ["--recipe", "nano", "--pretraining.steps", 0]
     words = [sys.executable, "-m", "openvima", *(str(word) for word in train)]
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while not any(trained.glob("checkpoints/2-cloning-00000[2-9]")) and process.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    try:
+        while not any(trained.glob("checkpoints/2-cloning-00000[2-9]")) and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    finally:
+        process.kill()
+        process.wait()
     run(*train)
     lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == list(range(1, 13))

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
@@ -46,19 +46,33 @@ def build(env_fn: Callable[[], gymnasium.Env] = Faulty) -> AsyncTabletopEnvs:
     return AsyncTabletopEnvs([env_fn, env_fn], ActionValidator(2, mode), mode, num_workers=2)
 
 
-def start(folder: Path, script: str) -> subprocess.Popen:
-    """Run a script as the leader of a group of processes, as a terminal does."""
-    file = folder / "script.py"
-    file.write_text(script, encoding="utf-8")
-    return subprocess.Popen(
-        [sys.executable, str(file)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        # In the background of a shell the tests, and so the script, would ignore Ctrl-C.
-        preexec_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
-    )
+Start = Callable[[str], subprocess.Popen]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Run a script as the leader of a group of processes, as a terminal does; it ends with the test."""
+    processes: list[subprocess.Popen] = []
+
+    def run(script: str) -> subprocess.Popen:
+        file = tmp_path / "script.py"
+        file.write_text(script, encoding="utf-8")
+        process = subprocess.Popen(
+            [sys.executable, str(file)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            # In the background of a shell the tests, and so the script, would ignore Ctrl-C.
+            preexec_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+        )
+        processes.append(process)
+        return process
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.communicate()
 
 
 def is_running(pid: int) -> bool:
@@ -179,8 +193,8 @@ def test_closed_environments_leave_no_file_handles() -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_everything_with_one_traceback(tmp_path: Path) -> None:
-    process = start(tmp_path, SCRIPT + GUARD + "main()")
+def test_ctrl_c_ends_everything_with_one_traceback(start: Start) -> None:
+    process = start(SCRIPT + GUARD + "main()")
     assert process.stdout.readline() == "starting\n"
     workers = [int(pid) for pid in process.stdout.readline().split()]
     assert len(workers) == 2
@@ -193,8 +207,8 @@ def test_ctrl_c_ends_everything_with_one_traceback(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_leave_ctrl_c_to_their_parent_from_the_first_moment_on(tmp_path: Path) -> None:
-    process = start(tmp_path, SCRIPT + GUARD + "main()")
+def test_workers_leave_ctrl_c_to_their_parent_from_the_first_moment_on(start: Start) -> None:
+    process = start(SCRIPT + GUARD + "main()")
     process.stdout.readline()
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     while not select.select([process.stdout], [], [], 0.005)[0]:  # until all have started
@@ -212,8 +226,8 @@ def test_workers_leave_ctrl_c_to_their_parent_from_the_first_moment_on(tmp_path:
     wait_until_gone(workers)
 
 
-def test_ctrl_c_while_workers_start_ends_them(tmp_path: Path) -> None:
-    process = start(tmp_path, SCRIPT + GUARD + "main()")
+def test_ctrl_c_while_workers_start_ends_them(start: Start) -> None:
+    process = start(SCRIPT + GUARD + "main()")
     process.stdout.readline()
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     while len(pids := children.read_text(encoding="utf-8").split()) < 3:  # a third one counts resources
@@ -226,8 +240,8 @@ def test_ctrl_c_while_workers_start_ends_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
-    process = start(tmp_path, SCRIPT + GUARD + "main()")
+def test_workers_do_not_outlive_their_parent(start: Start) -> None:
+    process = start(SCRIPT + GUARD + "main()")
     process.stdout.readline()
     workers = [int(pid) for pid in process.stdout.readline().split()]
     process.kill()
@@ -237,8 +251,8 @@ def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_script_without_a_guard_gets_a_hint(tmp_path: Path) -> None:
-    process = start(tmp_path, SCRIPT + "main()")
+def test_a_script_without_a_guard_gets_a_hint(start: Start) -> None:
+    process = start(SCRIPT + "main()")
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 1
     assert "WorkerError: the worker of sub-environment" in errors

@@ -7,6 +7,7 @@ import pytest
 
 from openvima.errors import ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
+from worker_jobs import forget_ray
 
 pytest.importorskip("torch")
 
@@ -37,7 +38,10 @@ def test_ray_gives_the_same_bytes_and_is_stopped(
 ) -> None:
     ray = pytest.importorskip("ray")
     monkeypatch.chdir(tmp_path)
-    path = evaluate(replace(NETWORK, out=Path("here"), workers=2, engine="ray"))
+    try:
+        path = evaluate(replace(NETWORK, out=Path("here"), workers=2, engine="ray"))
+    finally:
+        forget_ray()
     assert path.read_bytes() == whole.read_bytes()
     assert not ray.is_initialized()
 

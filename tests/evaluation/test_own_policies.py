@@ -3,7 +3,6 @@
 import json
 import sys
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -185,14 +184,6 @@ def test_weights_of_torch_modules_are_hashed_by_value():
     assert parameters_hash(Held(1)) == parameters_hash(Held(1)) != parameters_hash(Held(2))
     assert parameters_hash(Held(1).network) is not None
     assert parameters_hash(RandomPolicy()) is None
-
-
-@pytest.mark.slow
-def test_ray_workers_load_the_same_code(file):
-    pytest.importorskip("ray")
-    config = EvaluationConfig((f"mine={file}:make",), **CELLS, batch=1, out=Path("one"))
-    one = evaluate(config).read_bytes()
-    assert evaluate(replace(config, workers=2, engine="ray", out=Path("ray"))).read_bytes() == one
 
 
 READER = """
