@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from openvima import compilation
-from openvima.catalog.procedural import cached_array
 from openvima.errors import ConfigError
 from openvima.input_files import as_path, cache_dir
 
@@ -94,12 +93,6 @@ def test_functions_are_not_cached_where_others_write(homeless, double, tmp_path,
         monkeypatch.setattr(tempfile, "gettempdir", lambda: (_ for _ in ()).throw(FileNotFoundError()))
     assert double() == 42
     assert indices(tmp_path) == []
-
-
-def test_a_user_without_a_home_has_a_cache(homeless: Path) -> None:
-    for _ in range(2):
-        assert cached_array("group", "key", lambda: __import__("numpy").arange(3)).tolist() == [0, 1, 2]
-    assert [file.name for file in homeless.rglob("*.npy")] == ["key.npy"]
 
 
 def test_a_home_that_is_not_known_is_named(homeless: Path) -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.catalog.images import draw_texture, hash_numbers, value_noise
 from openvima.catalog.objects import OBJECTS, object_spec
+from openvima.catalog.procedural import procedural_assets
+from openvima.catalog.random_pack import hash_numbers, value_noise
 from openvima.catalog.textures import TEXTURES, texture_spec
 from openvima.errors import UnknownObjectError, UnknownTextureError
 
@@ -113,7 +114,7 @@ MEAN_TOLERANCE = 15  # levels of 255, per channel
 
 @pytest.fixture(scope="module")
 def images():
-    return {name: draw_texture(name) for name in TEXTURES}
+    return {name: procedural_assets().texture(name) for name in TEXTURES}
 
 
 def digests(images):
@@ -133,12 +134,12 @@ def test_no_two_textures_look_the_same(images):
 
 
 def test_textures_are_the_same_bits_as_when_they_were_recorded(images):
-    # After a deliberate change: PYTHONPATH=tests/catalog python -c "import test_images; test_images.record()"
+    # After a deliberate change call `record`.
     assert digests(images) == json.loads(DIGESTS.read_text())
 
 
 def record():
-    current = digests({name: draw_texture(name) for name in TEXTURES})
+    current = digests({name: procedural_assets().texture(name) for name in TEXTURES})
     DIGESTS.write_text(json.dumps(current, indent=1) + "\n")
 
 

@@ -1,18 +1,14 @@
 """Choosing an asset pack, what it remembers, and the cache on disk."""
 
-import re
 import subprocess
 import sys
-from pathlib import Path
 
-import numpy as np
 import pytest
 
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
-from openvima.catalog.procedural import _DRAWING_MODULES, ProceduralAssets, cached_array
+from openvima.catalog.procedural import ProceduralAssets
 from openvima.errors import AssetError, UnknownTextureError
-from openvima.input_files import cache_dir
 
 SIZE = (0.16, 0.16, 0.05)
 
@@ -75,74 +71,6 @@ def test_objects_of_one_size_share_their_shape():
 def test_an_unknown_texture_is_refused():
     with pytest.raises(UnknownTextureError, match="Did you mean 'tiger'"):
         ProceduralAssets().texture("tigre")
-
-
-def test_pictures_are_read_back_from_the_cache_unchanged():
-    drawn = ProceduralAssets().texture("magma")
-    (file,) = cache_dir().rglob("magma.npy")
-    assert np.array_equal(np.load(file), drawn)
-    assert np.array_equal(ProceduralAssets().texture("magma"), drawn)
-
-
-def test_every_module_that_decides_on_a_picture_counts_for_the_cache():
-    counted = {module.__name__ for module in _DRAWING_MODULES}
-    for module in _DRAWING_MODULES:
-        code = Path(str(module.__file__)).read_text(encoding="utf-8")
-        assert set(re.findall(r"^from (openvima\.catalog\.\w+) import", code, re.MULTILINE)) <= counted
-
-
-def test_a_cached_array_is_built_once():
-    builds = []
-
-    def build():
-        builds.append(1)
-        return np.arange(6, dtype=np.uint8)
-
-    first, second = cached_array("group", "key", build), cached_array("group", "key", build)
-    assert np.array_equal(first, second) and len(builds) == 1
-
-
-def test_a_truncated_cache_file_is_replaced():
-    path = cache_dir() / "group" / "key.npy"
-    cached_array("group", "key", lambda: np.arange(100))
-    path.write_bytes(path.read_bytes()[:200])
-    assert np.array_equal(cached_array("group", "key", lambda: np.arange(100)), np.arange(100))
-    assert len(np.load(path)) == 100
-
-
-@pytest.mark.parametrize("place", [-1, -20, 200])
-def test_a_cache_file_with_a_changed_byte_is_replaced(place, caplog):
-    path = cache_dir() / "group" / "key.npy"
-    cached_array("group", "key", lambda: np.arange(100))
-    content = bytearray(path.read_bytes())
-    content[place] ^= 1
-    path.write_bytes(content)
-    assert np.array_equal(cached_array("group", "key", lambda: np.arange(100)), np.arange(100))
-    assert "its checksum is wrong" in caplog.text
-    caplog.clear()
-    cached_array("group", "key", lambda: np.arange(100))
-    assert caplog.text == ""
-
-
-def test_a_damaged_picture_of_the_procedural_pack_is_drawn_again():
-    drawn = ProceduralAssets().texture("tiles")
-    (file,) = cache_dir().rglob("tiles.npy")
-    content = bytearray(file.read_bytes())
-    content[1000] ^= 255
-    file.write_bytes(content)
-    assert np.array_equal(ProceduralAssets().texture("tiles"), drawn)
-
-
-def test_a_cache_that_cannot_be_written_is_done_without(monkeypatch, tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("a file where the folder should be")
-    monkeypatch.setenv("OPENVIMA_CACHE", str(blocked))
-    assert np.array_equal(cached_array("group", "key", lambda: np.arange(3)), np.arange(3))
-
-
-def test_the_cache_leaves_no_partial_files():
-    cached_array("group", "key", lambda: np.arange(3))
-    assert [path.name for path in (cache_dir() / "group").iterdir()] == ["key.npy"]
 
 
 def test_shapes_and_textures_are_equal_in_another_process():

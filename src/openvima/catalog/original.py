@@ -4,6 +4,7 @@ Files come from a checkout, or from the archive of an import in the cache. Every
 hash, so that an incomplete or different pack is reported.
 """
 
+import contextlib
 import hashlib
 import io
 import json
@@ -23,7 +24,6 @@ from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vec
 from openvima.catalog.mesh_files import ObjMesh, parse_obj
 from openvima.catalog.meshes import scale_geometry
 from openvima.catalog.objects import REGISTERED_OBJECTS, ObjectSpec, object_spec
-from openvima.catalog.procedural import cached_array
 from openvima.catalog.registration import registered_geometry, registered_texture
 from openvima.catalog.textures import REGISTERED_TEXTURES, TextureSpec, texture_spec
 from openvima.errors import AssetError
@@ -415,7 +415,7 @@ def _mesh(files: PackFiles, relative_path: str) -> ObjMesh:
     def parsed() -> np.ndarray:
         return parse_obj(content.decode("utf-8", errors="replace"), relative_path).to_array()
 
-    return ObjMesh.from_array(cached_array(_MESH_GROUP, _cache_key(relative_path), parsed))
+    return ObjMesh.from_array(_cached(_MESH_GROUP, relative_path, parsed))
 
 
 @lru_cache(maxsize=128)
@@ -434,11 +434,20 @@ def _protected_texture(files: PackFiles, texture_name: str) -> np.ndarray:
 
 def _image(files: PackFiles, relative_path: str) -> np.ndarray:
     content = files.read(relative_path)
-    return cached_array(_IMAGE_GROUP, _cache_key(relative_path), lambda: _decode(content, relative_path))
+    return _cached(_IMAGE_GROUP, relative_path, lambda: _decode(content, relative_path))
 
 
-def _cache_key(relative_path: str) -> str:
-    return known_hashes()[relative_path][:32]
+def _cached(group: str, relative_path: str, decode: Callable[[], np.ndarray]) -> np.ndarray:
+    """Read what a file decodes to from the cache, or decode and store it; damaged entries are replaced."""
+    path = cache_dir() / group / f"{known_hashes()[relative_path][:32]}.npy"
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        return np.load(path, allow_pickle=False)
+    array = decode()
+    with contextlib.suppress(OSError):  # without write access it is decoded each time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as file:
+            np.save(file, array, allow_pickle=False)
+    return array
 
 
 def _decode(content: bytes, relative_path: str) -> np.ndarray:
