@@ -1,11 +1,14 @@
-"""Outlines of the 18 kit objects, seen from above, and their triangulation by ear clipping.
+"""Outlines of the 18 kit objects (outlines.json), seen from above, and their triangulation by ear clipping.
 
 Outlines have x to the right and y up, in metres at the size in use. Letters stand upright (+y up). Unlike in
 the original pack this holds for the T, too: rotations are always relative, so it only affects the appearance.
 """
 
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -124,7 +127,10 @@ def _is_ear(points: list[Point], polygon: list[int], corners: tuple[int, int, in
 
 Loop = list[tuple[float, float]]
 
-_MICROMETRES = 6  # rounding to decimals makes the coordinates equal bits with any mathematics library
+
+@cache
+def _outlines() -> dict[str, list[Loop]]:
+    return json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
 
 
 def outline(object_name: str) -> tuple[np.ndarray, ...]:
@@ -143,14 +149,9 @@ def outline(object_name: str) -> tuple[np.ndarray, ...]:
         >>> [len(loop) for loop in outline("letter A")]
         [8, 3]
     """
-    if object_name not in _OUTLINES:
-        raise AssetError(f"{object_name!r} has no outline; there is one for {', '.join(_OUTLINES)}.")
-    loops = [np.round(np.array(loop, dtype=np.float64), _MICROMETRES) for loop in _OUTLINES[object_name]()]
-    wanted = [1.0, *([-1.0] * (len(loops) - 1))]
-    return tuple(
-        loop if signed_area(loop) * sign > 0 else loop[::-1].copy()
-        for loop, sign in zip(loops, wanted, strict=True)
-    )
+    if object_name not in _outlines():
+        raise AssetError(f"{object_name!r} has no outline; there is one for {', '.join(_outlines())}.")
+    return tuple(np.array(loop, np.float64) for loop in _outlines()[object_name])
 
 
 def regular_polygon(
@@ -173,197 +174,3 @@ def arc(
     """Return points on an arc of an upright ellipse, both ends included."""
     angles = np.deg2rad(np.linspace(degrees[0], degrees[1], num_points))
     return [(centre[0] + radii[0] * math.cos(a), centre[1] + radii[1] * math.sin(a)) for a in angles]
-
-
-def _mirror(right_half: Sequence[tuple[float, float]]) -> Loop:
-    """Close a right half, listed from bottom to top, by its mirror image; points on the axis stay single."""
-    return [*right_half, *[(-x, y) for x, y in reversed(right_half) if x != 0]]
-
-
-def _letter_a() -> list[Loop]:
-    x, y, apex, leg = 0.0449, 0.05126, 0.0086, 0.0213
-    bar_low, bar_high = -0.022, -0.004
-    slope = (x - apex) / (2 * y)  # how far a leg moves inwards per metre of height
-
-    def inner(height: float) -> float:
-        return x - leg - slope * (height + y)
-
-    notch = [(inner(bar_low), bar_low), (x - leg, -y)]
-    top = (x - leg) / slope - y
-    return [
-        _mirror([*notch, (x, -y), (apex, y)]),
-        [(inner(bar_high), bar_high), (0.0, top), (-inner(bar_high), bar_high)],
-    ]
-
-
-def _letter_e() -> list[Loop]:
-    x, y, spine, arm = 0.02876, 0.05107, 0.0211, 0.0199
-    inside, middle = spine - x, 0.0264
-    return [
-        [
-            (-x, -y),
-            (x, -y),
-            (x, arm - y),
-            (inside, arm - y),
-            (inside, -0.0079),
-            (middle, -0.0079),
-            (middle, 0.0120),
-            (inside, 0.0120),
-            (inside, y - arm),
-            (x, y - arm),
-            (x, y),
-            (-x, y),
-        ]
-    ]
-
-
-def _letter_g() -> list[Loop]:
-    x, y, stroke = 0.04083, 0.05238, 0.0216
-    centre, outer = (0.005, 0.0), (0.04583, y)
-    inner = (outer[0] - stroke, outer[1] - stroke)
-    bar_low, bar_high = -0.0125, 0.0065
-    spur = x - stroke + 0.001
-    low_end = math.degrees(math.acos((x - centre[0]) / outer[0]))
-    inner_low = math.degrees(math.acos((spur - centre[0]) / inner[0]))
-    return [
-        [
-            *arc(centre, outer, (39, 360 - low_end), 24),
-            (x, bar_high),
-            (0.0, bar_high),
-            (0.0, bar_low),
-            (spur, bar_low),
-            *arc(centre, inner, (360 - inner_low, 39), 18),
-        ]
-    ]
-
-
-def _letter_m() -> list[Loop]:
-    x, y, stem = 0.04589, 0.04823, 0.0202
-    notch, shoulder, point = -0.013, 0.027, 0.007
-    armpit = 0.0122
-    right = [
-        (point, -y),
-        (x - stem, armpit),
-        (x - stem, -y),
-        (x, -y),
-        (x, y),
-        (x - shoulder, y),
-        (0.0, notch),
-    ]
-    return [_mirror(right)]
-
-
-def _letter_r() -> list[Loop]:
-    x, y, stem = 0.03646, 0.05107, 0.0205
-    left, inside = -x, stem - x
-    bowl_low, bowl_right, counter_low, counter_high = -0.0105, 0.0330, 0.0085, 0.0330
-    bowl = (bowl_low + y) / 2, (y - bowl_low) / 2  # middle and half height
-    counter = (counter_low + counter_high) / 2, (counter_high - counter_low) / 2
-    outer_arc = arc((bowl_right - bowl[1], bowl[0]), (bowl[1], bowl[1]), (-62, 90), 12)
-    counter_arc = arc((0.0005, counter[0]), (0.0125, counter[1]), (-90, 90), 8)
-    return [
-        [
-            (left, -y),
-            (inside, -y),
-            (inside, bowl_low),
-            (-0.0085, bowl_low),
-            (x - 0.0232, -y),
-            (x, -y),
-            *outer_arc,
-            (left, y),
-        ],
-        [(inside, counter_low), *counter_arc, (inside, counter_high)],
-    ]
-
-
-def _letter_t() -> list[Loop]:
-    half, width = 0.054, 0.0324
-    bar = half - width
-    return [_mirror([(width / 2, -half), (width / 2, bar), (half, bar), (half, half)])]
-
-
-def _letter_v() -> list[Loop]:
-    x, y, foot, leg = 0.04226, 0.05107, 0.0078, 0.0218
-    slope = (x - foot) / (2 * y)
-    return [_mirror([(foot, -y), (x, y), (x - leg, y), (0.0, y - (x - leg) / slope)])]
-
-
-def _cross() -> list[Loop]:
-    a, b = 0.024, 0.048
-    return [
-        [
-            (a, -b),
-            (a, -a),
-            (b, -a),
-            (b, a),
-            (a, a),
-            (a, b),
-            (-a, b),
-            (-a, a),
-            (-b, a),
-            (-b, -a),
-            (-a, -a),
-            (-a, -b),
-        ]
-    ]
-
-
-def _flower() -> list[Loop]:
-    radius = 0.027
-    petals = []
-    for heading in (0, 90, 180, 270):
-        centre = (radius * math.cos(math.radians(heading)), radius * math.sin(math.radians(heading)))
-        petals += arc(centre, (radius, radius), (heading - 90, heading + 90), 11)[:-1]
-    return [petals]
-
-
-def _heart() -> list[Loop]:
-    x, y, radius = 0.05172, 0.0475, 0.02785
-    centre = (x - radius, y - radius)
-    bulge = (x, -0.0105)  # control point of the flank, from the tip to where the lobe is widest
-    flank = [
-        (
-            2 * t * (1 - t) * bulge[0] + t * t * x,
-            (1 - t) ** 2 * -y + 2 * t * (1 - t) * bulge[1] + t * t * centre[1],
-        )
-        for t in np.linspace(0, 1, 8)[:-1]
-    ]
-    notch_deg = math.degrees(math.acos(-centre[0] / radius))
-    lobe = arc(centre, (radius, radius), (0, notch_deg), 13)
-    lobe[-1] = (0.0, lobe[-1][1])
-    return [_mirror([*flank, *lobe])]
-
-
-def _l_shaped_block() -> list[Loop]:
-    half, width = 0.048, 0.0288
-    inside = width - half
-    return [[(-half, -half), (half, -half), (half, inside), (inside, inside), (inside, half), (-half, half)]]
-
-
-def _star() -> list[Loop]:
-    centre = (-0.0055, 0.0)
-    tips = regular_polygon(5, 0.0572, centre=centre)
-    hollows = regular_polygon(5, 0.0286, first_rad=math.pi / 5, centre=centre)
-    return [[corner for pair in zip(tips, hollows, strict=True) for corner in pair]]
-
-
-_OUTLINES: dict[str, Callable[[], list[Loop]]] = {
-    "letter A": _letter_a,
-    "letter E": _letter_e,
-    "letter G": _letter_g,
-    "letter M": _letter_m,
-    "letter R": _letter_r,
-    "letter T": _letter_t,
-    "letter V": _letter_v,
-    "cross": _cross,
-    "diamond": lambda: [[(0.06, 0.0), (0.0, 0.048), (-0.06, 0.0), (0.0, -0.048)]],
-    "triangle": lambda: [[(0.0, -0.048), (0.048, 0.048), (-0.048, 0.048)]],
-    "flower": _flower,
-    "heart": _heart,
-    "hexagon": lambda: [regular_polygon(6, 0.054, first_rad=math.pi / 2)],
-    "pentagon": lambda: [regular_polygon(5, 0.0541, first_rad=-math.pi / 2, centre=(0.0, 0.0052))],
-    "L-shaped block": _l_shaped_block,
-    "ring": lambda: [regular_polygon(32, 0.048), regular_polygon(16, 0.0205)],
-    "round": lambda: [regular_polygon(40, 0.048)],
-    "star": _star,
-}
