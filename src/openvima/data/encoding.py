@@ -5,7 +5,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any, Literal, get_origin
 
@@ -113,6 +113,16 @@ class ShardInfo:
     def env_config(self) -> EnvConfig:
         """Settings of the environments; assets by their recorded name."""
         return EnvConfig(**{name: getattr(self, name) for name in ENV_SETTINGS})
+
+    def differences(self, asked: "ShardInfo") -> list[str]:
+        """Say how the settings and versions of a data set differ from those asked for."""
+        there, here = ({**asdict(info), **info.versions} for info in (self, asked))
+        names = [name for name in here if name not in ("task", "number", "versions")]
+        return [
+            f"{name} is {there.get(name) or 'none'}, asked for is {here[name] or 'none'}"
+            for name in names
+            if there.get(name) != here[name]
+        ]
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""

@@ -34,7 +34,7 @@ from openvima.data.reader import read_manifest
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.data.shard import Shard, ShardWriter, list_spans
 from openvima.env import TabletopEnv
-from openvima.env.config import ENV_SETTINGS, EnvConfig
+from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.multiprocess import Counts, imap_with_progress
 
@@ -66,7 +66,7 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
     wanted = {block.path.name: block for block in blocks}
     for path in sorted(config.out.glob("*.arrow")):
         shard = Shard(path)
-        problems = _compare(shard.info, blocks[0].info)
+        problems = shard.info.differences(blocks[0].info)
         block = wanted.get(path.name)
         if block is None and not problems:
             problems = [_explain_surplus(shard.info, config)]
@@ -106,17 +106,6 @@ def _explain_surplus(found: ShardInfo, config: GenerateConfig) -> str:
     if found.task in config.resolved_tasks():
         return f"it has episodes beyond the {config.episodes} a task that are asked for"
     return f"its task {found.task} is not asked for"
-
-
-def _compare(found: ShardInfo, asked: ShardInfo) -> list[str]:
-    names = ("level", "domain", "shard_size", "first_seed", *ENV_SETTINGS, "compression", "images")
-    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
-    pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
-    return [
-        f"{name} is {str(there) or 'none'}, asked for is {str(here) or 'none'}"
-        for name, there, here in pairs
-        if there != here
-    ]
 
 
 def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:

@@ -2,11 +2,12 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 from openvima.atomic_io import NO_SPACE, atomic_write_file, folder_lock
 from openvima.data.encoding import ShardInfo
@@ -25,7 +26,7 @@ from openvima.data.records import Demonstration
 from openvima.data.shard import Shard, ShardWriter
 from openvima.errors import ConfigError, DatasetError, MemberError, unknown_name
 from openvima.input_files import as_path, names_of, settle
-from openvima.multiprocess import MAX_WORKERS, Counts, Report, imap_with_progress
+from openvima.multiprocess import Report, check_workers, imap_unordered
 from openvima.tasks import list_tasks, task_spec
 
 __all__ = ["Broken", "EpisodeKey", "ImportConfig", "PublishedData", "import_published"]
@@ -103,22 +104,7 @@ class EpisodePlace:
     place: Any
 
 
-class Source(Protocol):
-    """An archive, or folders."""
-
-    path: Path
-
-    def digest(self) -> str:
-        """Return 32 hexadecimal digits that stand for the content."""
-        ...
-
-    def episodes(self) -> Mapping[str, Any]:
-        """Return the folders of all episodes, and their places."""
-        ...
-
-    def files(self, place: Any) -> Mapping[str, bytes]:
-        """Return the files of an episode."""
-        ...
+Source = EpisodeFolders | ZipArchive
 
 
 class PublishedData(Sequence[Demonstration]):
@@ -163,7 +149,10 @@ class PublishedData(Sequence[Demonstration]):
             raise DatasetError(
                 f"{self.path} holds no episodes; give vima.zip, or the folder it was unpacked to."
             )
-        self._index_of: dict[EpisodeKey, int] = {}
+
+    @cached_property
+    def _place_of(self) -> dict[EpisodeKey, EpisodePlace]:
+        return {place.key: place for place in self.places}
 
     @property
     def keys(self) -> tuple[EpisodeKey, ...]:
@@ -191,14 +180,12 @@ class PublishedData(Sequence[Demonstration]):
             DatasetError: There is no such episode.
             MemberError: It is broken; the message names archive, file and reason.
         """
-        if not self._index_of:
-            self._index_of = {place.key: index for index, place in enumerate(self.places)}
         key = EpisodeKey(current_task(task) or task, episode_id)
-        if key not in self._index_of:
+        if key not in self._place_of:
             raise DatasetError(
                 f"{self.path} has no episode {task}/{episode_id}; its ids have gaps, see `keys`."
             )
-        return self._read(self.places[self._index_of[key]])
+        return self._read(self._place_of[key])
 
     def demonstrations(
         self, task: str | None = None, on_broken: Callable[[Broken], None] | None = None
@@ -220,7 +207,7 @@ class PublishedData(Sequence[Demonstration]):
                 on_broken(found)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopen, (self.path, self.tasks, self.split)
+        return partial(PublishedData, tasks=self.tasks, split=self.split), (self.path,)
 
     def _read(self, place: EpisodePlace) -> Demonstration:
         found = read_place(self._source, place)
@@ -250,10 +237,6 @@ def read_place(source: Source, place: EpisodePlace) -> Demonstration | Broken:
         return read_demonstration(source.files(place.place), task=place.key.task, folder=place.folder)
     except MemberError as error:
         return Broken(place.folder, str(error))
-
-
-def _reopen(path: Path, tasks: tuple[str, ...] | None, split: str) -> PublishedData:
-    return PublishedData(path, tasks=tasks, split=split)
 
 
 def _sort_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]]:
@@ -293,7 +276,6 @@ def _select_tasks(places: Sequence[EpisodePlace], tasks: Sequence[str], path: Pa
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set
 SHARD_SIZE = 1000  # episodes read; broken ones leave their shard smaller
-_NUM_PROBES = 3  # episodes of each task
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,19 +306,10 @@ class ImportConfig:
 
     def __post_init__(self) -> None:
         settle(self, paths=("source", "out"), names=("tasks",))
-        problems = [
-            f"{name} is {value}; it must lie within 1 … {most:,}."
-            for name, value, most in (
-                ("episodes", self.episodes, 10**7),
-                ("shard_size", self.shard_size, 10**6),
-                ("workers", self.workers, MAX_WORKERS),
-            )
-            if value is not None and not 1 <= value <= most
-        ]
-        if not self.tasks:
-            problems.append("tasks is empty; name some, or 'all'.")
-        if problems:
-            raise ConfigError(" ".join(problems))
+        check_workers(self.workers)
+        for name in ("episodes", "shard_size"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ConfigError(f"{name} is {value}; it must be at least 1.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -378,7 +351,6 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
     tasks = None if config.tasks == ("all",) else config.tasks
     data = PublishedData(config.source, tasks=tasks, split=config.split)
     blocks = plan(config, data)
-    _probe(blocks)
     with folder_lock(config.out):
         _import(config, data, blocks, report)
     return config.out
@@ -395,10 +367,9 @@ def _import(
     try:
         if missing:
             (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
-        watch = _watch(report, blocks, missing)
-        for block, found in imap_with_progress(
-            write_block, missing, config.workers, num_counts=2, watch=watch
-        ):
+        total, left = (sum(len(block.places) for block in part) for part in (blocks, missing))
+        watch = report and (lambda done: report(total - left + done, total, ""))
+        for block, found in imap_unordered(write_block, missing, config.workers, report=watch):
             broken[block.path] = found
     except OSError as error:
         if error.errno not in NO_SPACE:
@@ -434,49 +405,26 @@ def plan(config: ImportConfig, data: PublishedData) -> list[Block]:
     return blocks
 
 
-def write_block(block: Block, count: Callable[..., None]) -> list[Broken]:
+def write_block(block: Block, count: Callable[[int], None]) -> list[Broken]:
     """Write one shard.
 
     Args:
         block: What to write.
-        count: Called with the number of episodes read so far, and how many of them were broken.
+        count: Called with the number of episodes read so far.
 
     Returns:
         The episodes that it lacks because they are broken.
     """
-    broken = []
+    broken, source = [], open_source(block.source)
     with ShardWriter(block.path, block.info) as writer:
-        for number, found in enumerate(_read(block.source, block.places), start=1):
+        for number, place in enumerate(block.places, start=1):
+            found = read_place(source, place)
             if isinstance(found, Broken):
                 broken.append(found)
             else:
                 writer.write(found)
-            count(number, len(broken))
+            count(number)
     return broken
-
-
-def _read(path: Path, places: Sequence[EpisodePlace]) -> Iterator[Any]:
-    source: Source = open_source(path)
-    return (read_place(source, place) for place in places)
-
-
-def _probe(blocks: Sequence[Block]) -> None:
-    """Read a few episodes of each task, so that a source of another form fails at once.
-
-    Raises:
-        DatasetError: None of them can be read.
-    """
-    first = None
-    for block in blocks:
-        if block.info.number == 0:
-            for found in _read(block.source, block.places[:_NUM_PROBES]):
-                if not isinstance(found, Broken):
-                    return
-                first = first or found
-    assert first is not None  # there is at least one block
-    raise DatasetError(
-        f"none of the first episodes in {blocks[0].source} can be read. {first.member}: {first.reason}"
-    )
 
 
 def _find_broken(block: Block) -> list[Broken] | None:
@@ -494,8 +442,8 @@ def _find_broken(block: Block) -> list[Broken] | None:
             f"{block.path} holds episodes that were not asked for, such as {min(others)}. "
             "Give its settings, another folder, or --force to delete it."
         )
-    missing = [place for place in block.places if place.folder not in present]
-    found = list(_read(block.source, missing))
+    source = open_source(block.source)
+    found = [read_place(source, place) for place in block.places if place.folder not in present]
     return found if all(isinstance(entry, Broken) for entry in found) else None
 
 
@@ -506,11 +454,7 @@ def _check_folder(folder: Path, blocks: Sequence[Block]) -> None:
         if path.name not in wanted:
             problem = f"it is not among the {len(blocks)} shards that were asked for"
         else:
-            found, asked = Shard(path).info, wanted[path.name].info
-            names = [name for name in ShardInfo.__slots__ if getattr(found, name) != getattr(asked, name)]
-            problem = "; ".join(
-                f"{n} is {getattr(found, n)}, asked for is {getattr(asked, n)}" for n in names
-            )
+            problem = "; ".join(Shard(path).info.differences(wanted[path.name].info))
         if problem:
             raise DatasetError(
                 f"{path} belongs to another data set: {problem}. "
@@ -550,19 +494,3 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
         versions=info.versions,
         licence=LICENCE,
     )
-
-
-def _watch(
-    report: Report | None, blocks: Sequence[Block], missing: Sequence[Block]
-) -> Callable[[Counts], None] | None:
-    if report is None:
-        return None
-    total = sum(len(block.places) for block in blocks)
-    before = total - sum(len(block.places) for block in missing)
-
-    def watch(counts: Counts) -> None:
-        num_broken = sum(row[1] for row in counts)
-        report(before + sum(row[0] for row in counts), total, f"{num_broken} broken" if num_broken else "")
-
-    watch([])
-    return watch

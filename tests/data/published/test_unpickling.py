@@ -16,14 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import published_data
-from openvima.data.published_episode import (
-    STAND_INS,
-    Global,
-    Record,
-    as_array,
-    as_plain,
-    read_pickle,
-)
+from openvima.data.published_episode import Inert, as_array, read_pickle
 from openvima.errors import MemberError
 
 PROTO = b"\x80\x04"
@@ -73,33 +66,33 @@ def test_arrays_that_cannot_be_written_come_back() -> None:
     assert np.array_equal(as_array(read_pickle(pickle.dumps(array, 5))), array)
 
 
-@pytest.mark.parametrize("package", ["numpy.core", "numpy._core"])
 @pytest.mark.parametrize(
-    ("args", "fault"),
+    ("args", "is_sound"),
     [
-        ((b"abc", (10**12,), "C"), "do not fit"),
-        ((b"abc", (-1, 5), "C"), "do not fit"),
-        ((b"abc", (3,), "X"), "do not fit"),
-        ((b"abc", (3,), None), None),
-        ((b"abc", (3,), "K", (1,)), "do not fit"),
-        ((b"abc", (3,), "K", (0, 0)), "do not fit"),
-        ((b"abc", (3,), "K", (0,), 1), "do not fit"),
-        ((b"abc", (3,), "K"), None),
-        ((b"abc",), "do not fit"),
-        ((b"abc", 3), "do not fit"),
-        (("text", (4,), "C"), "do not fit"),
-        (([1, 2], (2,), "C"), "do not fit"),
+        ((b"abc", (10**12,), "C"), False),
+        ((b"abc", (-1, 5), "C"), False),
+        ((b"abc", (3,), "X"), False),
+        ((b"abc", (3,), None), True),
+        ((b"abc", (3,), "K", (1,)), False),
+        ((b"abc", (3,), "K", (0, 0)), False),
+        ((b"abc", (3,), "K", (0,), 1), False),
+        ((b"abc", (3,), "K"), True),
+        ((b"abc",), False),
+        (("text", (4,), "C"), False),
+        (([1, 2], (2,), "C"), False),
     ],
 )
-def test_arrays_of_protocol_5_fit_their_bytes(package: str, args: tuple, fault: str | None) -> None:
+def test_arrays_of_protocol_5_fit_their_bytes(args: tuple, is_sound: bool) -> None:
     content, *rest = args
-    made = read_pickle(pickle.dumps((content, Calls(np.dtype, "u1", False, True), *rest), 5))
-    array = STAND_INS[f"{package}.numeric._frombuffer"](*made)
-    if fault is None:
-        assert as_array(array).tolist() == [*b"abc"]
+    sink = io.BytesIO()
+    pickle.Pickler(sink, 5).dump((content, Calls(np.dtype, "u1", False, True), *rest))
+    made = sink.getvalue().removeprefix(b"\x80\x05").removesuffix(b".")
+    pickled = b"\x80\x05" + named("numpy.core.numeric", "_frombuffer") + made + b"R."
+    if is_sound:
+        assert as_array(read_pickle(pickled)).tolist() == [*b"abc"]
         return
-    with pytest.raises(MemberError, match=fault):
-        as_array(array)
+    with pytest.raises(MemberError, match="no pickle of data"):
+        read_pickle(pickled)
 
 
 @pytest.mark.parametrize("opcode", [b"\x97", b"\x98"])
@@ -111,12 +104,8 @@ def test_buffers_outside_of_the_pickle_are_refused(opcode: bytes) -> None:
 def test_bytes_that_can_be_written_are_data_and_no_tool() -> None:
     content = b"\x96" + struct.pack("<Q", 3) + b"abc"
     assert read_pickle(b"\x80\x05" + content + b".") == bytearray(b"abc")
-    for use, fault in (
-        (b")R", "not callable"),
-        (b"}Nsb", "no pickle of data"),
-        (b")\x81", "no pickle of data"),
-    ):
-        with pytest.raises(MemberError, match=fault):
+    for use in (b")R", b"}Nsb", b")\x81"):
+        with pytest.raises(MemberError, match="no pickle of data"):
             read_pickle(b"\x80\x05" + content + use + b".")
     with pytest.raises(MemberError, match="truncated"):
         read_pickle(b"\x80\x05\x96" + b"\xff" * 8 + b"abc.")
@@ -124,26 +113,18 @@ def test_bytes_that_can_be_written_are_data_and_no_tool() -> None:
 
 @pytest.mark.parametrize("number", [np.int64(-3), np.float32(0.5), np.bool_(True), np.uint8(9)])
 def test_numbers_of_numpy_come_back(number: np.generic) -> None:
-    value = as_plain(read_pickle(pickle.dumps(number, 4)))
+    value = read_pickle(pickle.dumps(number, 4))
     assert value == number
     assert type(value) is type(number.item())
 
 
-def test_objects_stay_records() -> None:
+def test_objects_become_inert() -> None:
     episode = published_data.MadeEpisode()
     for generation in (published_data.PUBLISHED, published_data.TODAY):
-        home = f"{generation.package}.tasks.components.encyclopedia"
         fields = read_pickle(published_data.pickled(episode.trajectory(generation)))
         info = fields["obj_id_to_info"][5]
-        assert info["obj_size_range"].name == f"{home}.definitions.SizeRange"
-        assert info["obj_size_range"].args == ((0.1, 0.1, 0.02), (0.2, 0.1, 0.02))
-        assert info["obj_profile"].args == (-1,)
-        assert info["obj_replace_fn"].args == (Global(f"{home}.replace_fns._kit_obj_common"),)
-        assert info["obj_replace_fn"].state[2] == {"fname": "a.obj"}
-    old = read_pickle(published_data.pickled(episode.trajectory(published_data.PUBLISHED)))
-    assert [node.state["_val"] for node in old["modalities"].state["_content"]] == ["rgb", "segm"]
-    with pytest.raises(TypeError):
-        old["modalities"]()
+        for name in ("obj_size_range", "obj_profile", "obj_replace_fn"):
+            assert type(info[name]) is Inert
 
 
 def test_both_protocols_hold_the_same_objects() -> None:
@@ -204,7 +185,9 @@ def attack(touch: str) -> dict[str, bytes]:
 def test_hostile_pickles_are_refused_and_nothing_runs(kind: str, tmp_path: Path) -> None:
     marker = tmp_path / "marker"
     content = attack(f"touch {marker}")[kind]
-    with pytest.raises(MemberError, match=r"nothing was run|no pickle of data") as error:
+    with pytest.raises(
+        MemberError, match=r"nothing was run|no pickle of data|only numbers are read"
+    ) as error:
         read_pickle(content)
     assert not marker.exists()
     if kind != "NEWOBJ":  # the shell that it starts would outlive the test
@@ -228,35 +211,24 @@ def test_functions_that_other_code_has_registered_are_refused(tmp_path: Path) ->
         copyreg.remove_extension("os", "system", 7)
 
 
-SIZE_RANGE = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRange") + b")\x81"
-REPLACE = named("vimasim.tasks.components.encyclopedia.replace_fns", "_kit_obj_common")
+SIZE_RANGE = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRange")
 
 
 @pytest.mark.parametrize(
     ("content", "fault"),
     [
-        (REPLACE + b")R", r"calls \S+\._kit_obj_common"),
-        (named("functools", "partial") + REPLACE + b"\x85R)R", "'partial' object is not callable"),
-        (SIZE_RANGE + b")R", "'SizeRange' object is not callable"),
-        (named("typing", "Any") + b")R", "calls typing.Any"),
-        (named("numpy", "ndarray") + b"K\x05\x85R", "calls numpy.ndarray"),
-        (named("builtins", "list") + b")R", "calls builtins.list"),
+        (SIZE_RANGE + b")\x81)R", "'Inert' object is not callable"),
         (text("os") + b")R", "'str' object is not callable"),
-        (REPLACE + b"}" + text("__code__") + b"Nsb", "changes .*_kit_obj_common"),
         (b"]" + b"}" + text("append") + b"Nsb", "'list' object has no attribute"),
         (named("numpy", "load"), "names numpy.load,"),
         (named("functools", "partial.__class__"), "names functools.partial.__class__,"),
         (named("numpy", "ndarray.tofile"), "names numpy.ndarray.tofile,"),
-        (
-            named("vimasim.tasks.components.encyclopedia.definitions", "os.system"),
-            "names vimasim.*os.system,",
-        ),
         (named("builtins", "getattr"), "names builtins.getattr,"),
         (b"Pid\n", "no pickle of data"),
         (b"Nq\x00Q", "no pickle of data"),
         (b"\x97", "no pickle of data"),
         (b"\xff", "no pickle of data"),
-        (SIZE_RANGE + b"(K\x01e", "'SizeRange' object has no attribute 'append'"),
+        (SIZE_RANGE + b")\x81(K\x01e", "'Inert' object has no attribute 'append'"),
     ],
 )
 def test_what_no_published_file_does_is_refused(content: bytes, fault: str) -> None:
@@ -264,15 +236,13 @@ def test_what_no_published_file_does_is_refused(content: bytes, fault: str) -> N
         read_pickle(PROTO + content + b".")
 
 
-def test_the_state_of_an_object_changes_nothing_but_its_record() -> None:
+def test_what_an_object_is_given_changes_nothing() -> None:
     state = {"__class__": 1, "__setattr__": 2, "__dict__": 3, "name": "os.system", "args": (4,)}
     content = pickle.dumps(state, 4).removeprefix(PROTO).removesuffix(b".")
-    record = read_pickle(PROTO + SIZE_RANGE + content + b"b.")
-    assert isinstance(record, Record)
-    assert type(record) is STAND_INS[record.name]
-    assert record.name.endswith("SizeRange")
-    assert record.args == ()
-    assert record.state == state
+    for made in (b")\x81", b")R", b"(K\x01tR"):
+        found = read_pickle(PROTO + SIZE_RANGE + made + content + b"b.")
+        assert type(found) is Inert
+        assert vars(found) == {}
 
 
 def array_pickle(shape: object, dtype: str, content: object) -> bytes:
@@ -290,35 +260,32 @@ def array_pickle(shape: object, dtype: str, content: object) -> bytes:
 @pytest.mark.parametrize(
     ("shape", "dtype", "content", "fault"),
     [
-        ((10**12,), "u1", b"abc", "do not fit"),
-        ((10**30,), "u1", b"abc", "do not fit"),
-        ((-1, 5), "u1", b"abc", "do not fit"),
-        ((2.5,), "u1", b"ab", "do not fit"),
-        (("x",), "u1", b"ab", "do not fit"),
-        ((1,) * 100, "u1", b"a", "do not fit"),
-        ((1,), "O8", [None], "do not fit|only numbers"),
+        ((10**12,), "u1", b"abc", "no pickle of data"),
+        ((10**30,), "u1", b"abc", "no pickle of data"),
+        ((-1, 5), "u1", b"abc", "no pickle of data"),
+        ((2.5,), "u1", b"ab", "no pickle of data"),
+        (("x",), "u1", b"ab", "no pickle of data"),
+        ((1,) * 100, "u1", b"a", "no pickle of data"),
+        ((1,), "O8", [None], "only numbers"),
         ((1,), "O8", b"12345678", "type 'O8'; only numbers"),
         ((1,), "V8", b"12345678", "type 'V8'; only numbers"),
         ((1,), "M8", b"12345678", "type 'M8'; only numbers"),
-        ((1,), "u1", "text", "do not fit"),
-        ((1,), "u1", [1], "do not fit"),
-        ((3,), "f8", b"abc", "do not fit"),
+        ((1,), "u1", "text", "no pickle of data"),
+        ((1,), "u1", [1], "no pickle of data"),
+        ((3,), "f8", b"abc", "no pickle of data"),
     ],
 )
 def test_arrays_are_never_larger_than_their_bytes(
     shape: object, dtype: str, content: object, fault: str
 ) -> None:
-    value = read_pickle(array_pickle(shape, dtype, content))
     with pytest.raises(MemberError, match=fault):
-        as_array(value)
+        read_pickle(array_pickle(shape, dtype, content))
 
 
 def test_other_things_are_no_arrays() -> None:
-    for value in (None, [], "x", {}, STAND_INS["numpy.core.multiarray._reconstruct"]()):
+    for value in (None, [], "x", {}, Inert()):
         with pytest.raises(MemberError, match="where an array should be"):
             as_array(value)
-    with pytest.raises(MemberError, match="do not fit"):
-        as_plain(STAND_INS["numpy.core.multiarray.scalar"](1, 2, 3))
 
 
 def test_no_beginning_of_a_pickle_reads_as_whole() -> None:
@@ -350,11 +317,9 @@ def test_any_bytes_give_a_value_or_an_error_that_says_so(content: bytes) -> None
 
 
 def test_classes_themselves_stay_as_they_are() -> None:
-    size_range = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRange")
     for state in (b"}" + text("name") + b"Nsb", b"N}" + text("__new__") + b"Ns\x86b"):
         with pytest.raises(MemberError, match="missing 1 required positional argument"):
-            read_pickle(PROTO + size_range + state + b".")
-    assert read_pickle(PROTO + SIZE_RANGE + b".").name.endswith("SizeRange")
+            read_pickle(PROTO + SIZE_RANGE + state + b".")
 
 
 def test_an_endless_value_is_named_by_its_kind() -> None:
