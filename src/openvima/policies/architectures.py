@@ -336,6 +336,18 @@ class TokenPolicy(PolicyNetwork):
         layers[-1].bias.fill_(-_LINEAR_RANGE)
         self.decoder.align()
 
+    @torch.no_grad()
+    def fit_crops(self, features_KF: torch.Tensor) -> None:
+        """Let fresh tokens and attention begin with what pretrained crops tell apart, (K, F)."""
+        if (
+            isinstance(self.images, ObjectEncoder)
+            and self.resampler is None
+            and not self.images.config.fuse_views
+        ):
+            is_crop_D = self.images.fit_fusion(features_KF)
+            if self.images.config.width == self.decoder.width:
+                self.decoder.align(is_crop_D)
+
     def _frame_tokens(self, features: torch.Tensor) -> torch.Tensor:
         """Make tokens of pairs of frames, (..., tokens · N, E): the first token of all pairs first.
 

@@ -23,6 +23,8 @@ from openvima.policies.nn.layers import Linear, TensorRecord, Unpadder, normal_w
 MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history together
 MAX_PROMPT_POSITIONS = 256
 
+SHARPNESS = 1.5  # of heads that compare some entries alone
+
 KeysValues = tuple[torch.Tensor, torch.Tensor]  # (B, H, S, K) each
 
 
@@ -139,8 +141,13 @@ class CausalDecoder(nn.Module):
         """
         raise NotImplementedError
 
-    def align(self) -> None:
-        """Let fresh attention to the prompt compare queries and keys by one matrix."""
+    def align(self, entries_D: torch.Tensor | None = None) -> None:
+        """Let fresh attention to the prompt compare queries and keys by one matrix.
+
+        Args:
+            entries_D: Of a token, bool; the first half of the heads compares these alone. By default all do
+                with all entries.
+        """
         raise NotImplementedError
 
     def forward(
@@ -247,10 +254,10 @@ class Decoder(CausalDecoder):
         prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
 
-    def align(self) -> None:
+    def align(self, entries_D: torch.Tensor | None = None) -> None:
         """Do so in every cross block."""
         for block in (cast(CrossBlock, each) for each in self.cross_blocks):
-            _align(block.query.weight, block.key_value.weight[: self.width])
+            _align(block.query.weight, block.key_value.weight[: self.width], entries_D)
 
     def _cross_attend(
         self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
@@ -276,11 +283,11 @@ class PrefixDecoder(CausalDecoder):
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
         return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP)[1]
 
-    def align(self) -> None:
+    def align(self, entries_D: torch.Tensor | None = None) -> None:
         """Do so in the first block, whose attention reaches the history as well."""
         block = cast(SelfBlock, self.self_blocks[0])
         query_DD, key_DD, _ = block.query_key_value.weight.split(self.width)
-        _align(query_DD, key_DD)
+        _align(query_DD, key_DD, entries_D)
 
 
 def build_decoder(config: AnyDecoderConfig) -> Decoder | PrefixDecoder:
@@ -380,8 +387,13 @@ class SelfBlock(nn.Module):
         return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
 
 
-def _align(query_DD: torch.Tensor, key_DD: torch.Tensor) -> None:
+def _align(query_DD: torch.Tensor, key_DD: torch.Tensor, entries_D: torch.Tensor | None) -> None:
     nn.init.orthogonal_(query_DD)
+    if entries_D is not None:
+        half = len(query_DD) // 2
+        nn.init.orthogonal_(part := query_DD[:half, entries_D], gain=SHARPNESS)
+        query_DD[:half] = 0.0
+        query_DD[:half, entries_D] = part
     key_DD.copy_(query_DD)
 
 

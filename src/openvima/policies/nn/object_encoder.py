@@ -11,7 +11,9 @@ harmonics, R bins of rotations; `...` any axes.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -87,6 +89,7 @@ _BOX_UNITS = (256.0, 128.0, 128.0, 256.0)  # centre x, centre y, height, width; 
 # Of objects on the table in demonstrations of the training tasks, in these units, both views together.
 _BOX_MEAN = (0.49, 0.55, 0.23, 0.13)
 _BOX_STD = (0.19, 0.16, 0.10, 0.06)
+_TOKEN_STD = 0.8  # of the entries of fitted tokens; the largest components are about three times as large
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +174,40 @@ class ObjectEncoder(nn.Module):
             first.bias.sub_(first.weight @ mean)
             # Orthogonal layers of gain √2 map four numbers of variance 1 to vectors of length √8.
             last.weight.mul_((len(last.bias) / 8) ** 0.5)
+
+    @torch.no_grad()
+    def fit_fusion(self, features_KF: torch.Tensor) -> torch.Tensor:
+        """Let fresh tokens carry pretrained crop features apart from boxes, centred and whitened.
+
+        Random layers mix them: of six containers of one shape, whose features tell 97 % of their textures, the
+        product of tokens finds 24 %. Principal components whose variance is below the mean one are noise
+        rather than appearance, so they are amplified less.
+
+        Args:
+            features_KF: Of all crops in the data, K > F.
+
+        Returns:
+            Which entries of a token are of the crop, (D,); of each half of a token a quarter is of the box.
+        """
+        features, half = features_KF.shape[-1], self.config.width // 2
+        slots_D = torch.arange(2 * half).view(2, half).T.flatten()  # components alternate between the halves
+        is_crop_D = torch.arange(2 * half) % half < half - half // 4
+        crops = slots_D[is_crop_D[slots_D]][:features]
+        variances_F, axes_FF = torch.linalg.eigh(torch.cov(features_KF.T))
+        whitened_F = (variances_F / (variances_F + variances_F.mean())).flip(0)[: len(crops)]
+        axes_CF = (
+            axes_FF.T.flip(0)[: len(crops)] * (whitened_F / variances_F.flip(0)[: len(crops)]).sqrt()[:, None]
+        )
+        axes_CF *= _TOKEN_STD * whitened_F.mean() ** -0.5
+        for fusion in cast(Iterable[nn.Linear], self.fusion):
+            fusion.bias.zero_()
+            fusion.weight[:, :features].zero_()
+            fusion.weight[crops, :features] = axes_CF
+            fusion.weight[is_crop_D, features:] = 0.0
+            nn.init.orthogonal_(boxes := fusion.weight[~is_crop_D, features:])
+            fusion.weight[~is_crop_D, features:] = boxes
+            fusion.bias.sub_(fusion.weight[:, :features] @ features_KF.mean(dim=0))
+        return is_crop_D
 
     def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
         """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""
