@@ -59,11 +59,12 @@ class PreprocessedEpisode:
         place_ids: Id of the object to place at, likewise.
         false_positives: False detections to augment with.
         final: Visible objects after the last step.
-        actions: Actions of the oracle, shape (T, 12), float32: positions in metres and quaternions.
+        actions: Actions to learn, shape (T, 12), float32: positions in metres and quaternions.
         images: All crops or halved frames but the blank one, shape (K, 3, height, width), uint8; index n is
             `images[n - 1]`.
         descriptions: Texture and name of the objects in object images of the task's prompt, by placeholder;
             see `openvima.tasks.prompts.image_descriptions`.
+        executed: Actions of the oracle, where others are to be learned.
     """
 
     task: str
@@ -79,6 +80,7 @@ class PreprocessedEpisode:
     actions: np.ndarray
     images: np.ndarray
     descriptions: Mapping[str, str] = field(default_factory=dict)
+    executed: np.ndarray | None = None
 
     @property
     def num_steps(self) -> int:

@@ -94,6 +94,7 @@ _PAPERS: Mapping[str, Any] = {
     "optimizer.pointing_loss_weight": 1.0,
     "model.points": True,
     "augmentation.centre_picks": True,
+    "augmentation.leftmost_first": True,
     "augmentation.rename_objects_prob": 0.3,
     "augmentation.shuffle_sentences_prob": 0.3,
     "augmentation.distractor_prob": 0.3,
@@ -102,6 +103,7 @@ _PAPERS_MIDAS: Mapping[str, Any] = {
     **_PAPERS,
     "preset": "midas-nano",
     "model.points": None,  # its head is autoregressive
+    "augmentation.leftmost_first": False,
     "augmentation.inverse_dynamics_prob": 0.33,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
@@ -240,6 +242,8 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
     if tokens != "objects" or others.get("model.head") == "autoregressive":
         unfit = {"model.points"}
+    if others.get("model.head") == "autoregressive":
+        unfit |= {"augmentation.leftmost_first"}
     if tokens != "objects":
         unfit |= {"optimizer.pointing_loss_weight"}
     if tokens not in ("objects", "object-perceiver"):

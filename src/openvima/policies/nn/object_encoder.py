@@ -89,7 +89,7 @@ _BOX_UNITS = (256.0, 128.0, 128.0, 256.0)  # centre x, centre y, height, width; 
 # Of objects on the table in demonstrations of the training tasks, in these units, both views together.
 _BOX_MEAN = (0.49, 0.55, 0.23, 0.13)
 _BOX_STD = (0.19, 0.16, 0.10, 0.06)
-_TOKEN_STD = 0.8  # of the entries of fitted tokens; the largest components are about three times as large
+_TOKEN_VARIANCE = 0.64  # mean of the entries that crops have in fitted tokens; the largest is about three
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,34 +179,35 @@ class ObjectEncoder(nn.Module):
     def fit_fusion(self, features_KF: torch.Tensor) -> torch.Tensor:
         """Let fresh tokens carry pretrained crop features apart from boxes, centred and whitened.
 
-        Random layers mix them: of six containers of one shape, whose features tell 97 % of their textures, the
-        product of tokens finds 24 %. Principal components whose variance is below the mean one are noise
-        rather than appearance, so they are amplified less.
+        Random layers mix them: of six containers of one shape, whose features tell 97 % of their textures,
+        products of tokens find 24 %. Principal components whose variance is below the mean one tell little of
+        appearance, so they are amplified less.
 
         Args:
-            features_KF: Of all crops in the data, K > F.
+            features_KF: Of all crops in the data.
 
         Returns:
-            Which entries of a token are of the crop, (D,); of each half of a token a quarter is of the box.
+            Which entries of a token are of the crop, (D,): the first three quarters of either half.
         """
-        features, half = features_KF.shape[-1], self.config.width // 2
-        slots_D = torch.arange(2 * half).view(2, half).T.flatten()  # components alternate between the halves
+        num_features, half = features_KF.shape[-1], self.config.width // 2
         is_crop_D = torch.arange(2 * half) % half < half - half // 4
-        crops = slots_D[is_crop_D[slots_D]][:features]
+        entries_D = (
+            torch.arange(2 * half).view(2, half).T.flatten()
+        )  # components alternate between the halves
+        entries_C = entries_D[is_crop_D[entries_D]][:num_features]
         variances_F, axes_FF = torch.linalg.eigh(torch.cov(features_KF.T))
-        whitened_F = (variances_F / (variances_F + variances_F.mean())).flip(0)[: len(crops)]
-        axes_CF = (
-            axes_FF.T.flip(0)[: len(crops)] * (whitened_F / variances_F.flip(0)[: len(crops)]).sqrt()[:, None]
-        )
-        axes_CF *= _TOKEN_STD * whitened_F.mean() ** -0.5
+        variances_C, axes_CF = variances_F.flip(0)[: len(entries_C)], axes_FF.T.flip(0)[: len(entries_C)]
+        softness = variances_F.mean()
+        level = (variances_C / (variances_C + softness)).mean()
+        axes_CF = axes_CF * (_TOKEN_VARIANCE / level / (variances_C + softness)).sqrt()[:, None]
         for fusion in cast(Iterable[nn.Linear], self.fusion):
-            fusion.bias.zero_()
-            fusion.weight[:, :features].zero_()
-            fusion.weight[crops, :features] = axes_CF
-            fusion.weight[is_crop_D, features:] = 0.0
-            nn.init.orthogonal_(boxes := fusion.weight[~is_crop_D, features:])
-            fusion.weight[~is_crop_D, features:] = boxes
-            fusion.bias.sub_(fusion.weight[:, :features] @ features_KF.mean(dim=0))
+            box_layer = nn.init.orthogonal_(
+                torch.empty(2 * half - int(is_crop_D.sum()), fusion.in_features - num_features)
+            )
+            fusion.weight.zero_()
+            fusion.weight[entries_C, :num_features] = axes_CF
+            fusion.weight[~is_crop_D, num_features:] = box_layer.to(fusion.weight)
+            fusion.bias.copy_(-fusion.weight[:, :num_features] @ features_KF.mean(dim=0))
         return is_crop_D
 
     def encode_images(self, crops: torch.Tensor) -> torch.Tensor:

@@ -130,6 +130,57 @@ def centre_picks(episode: PreprocessedEpisode) -> PreprocessedEpisode:
     return replace(episode, actions=actions)
 
 
+# Of these the goals of one stage may be met in any order, which no network can foresee.
+ANY_ORDER = ("rearrange", "rearrange_then_restore", "same_shape", "twist")
+_OCCUPIED_M = 0.1  # a place is taken where an object is nearer
+
+
+def leftmost_first(episode: PreprocessedEpisode) -> PreprocessedEpisode:
+    """Let each step's label be the leftmost of the actions that could be next; what was done stays.
+
+    Where goals may be met in any order, the oracle takes one that cannot be foreseen. A network whose parts
+    of an action are independent then picks one object and puts it where another belongs.
+    """
+    if episode.task not in ANY_ORDER:
+        return episode
+    picks, steps = episode.pick_ids.tolist(), range(episode.num_steps)
+    stage, moved = [], set[int]()
+    for pick in picks:  # an object that moves again begins the next stage
+        stage.append((stage[-1] if stage else 0) + (pick in moved))
+        moved = {pick} if pick in moved else moved | {pick}
+    tables = episode.objects.split(episode.objects_per_step)
+    labels = [
+        min(
+            (
+                s
+                for s in steps[t:]
+                if stage[s] == stage[t] and (s == t or _is_free(episode, s, tables[t], tables[s]))
+            ),
+            key=lambda s: episode.actions[s, PICK][1],
+        )
+        for t in steps
+    ]
+    return replace(
+        episode,
+        actions=episode.actions[labels],
+        pick_ids=episode.pick_ids[labels],
+        place_ids=episode.place_ids[labels],
+        executed=episode.actions,
+    )
+
+
+def _is_free(episode: PreprocessedEpisode, step: int, now: ObjectTable, then: ObjectTable) -> bool:
+    """Whether the place of a later action is taken now by no object that leaves it before."""
+    place = episode.actions[step, PLACE]
+
+    def ids_near(objects: ObjectTable) -> set[int]:
+        points = unproject(objects.grasps[:, TOP], CAMERAS["top"])
+        near = (np.linalg.norm(points - place, axis=1) < _OCCUPIED_M) & objects.masks[:, TOP]
+        return set(objects.ids[near].tolist()) - {int(episode.pick_ids[step])}
+
+    return ids_near(now) <= ids_near(then)
+
+
 Transform: TypeAlias = Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
 
 
@@ -157,12 +208,14 @@ class DemonstrationAugmentation:
     Args:
         inverse_dynamics_prob: Probability of the inverse-dynamics prompt.
         centres_picks: Whether picks are moved, see `centre_picks`.
+        leftmost_first: Whether labels are changed, see `leftmost_first`; not of inverse dynamics.
         of_inverse_dynamics: Transforms of demonstrations with that prompt.
         of_tasks: Transforms of those with the prompt of their task, after distractors were inserted.
     """
 
     inverse_dynamics_prob: float = 0.0
     centres_picks: bool = False
+    leftmost_first: bool = False
     of_inverse_dynamics: tuple[Transform, ...] = ()
     of_tasks: tuple[Transform, ...] = ()
 
@@ -183,6 +236,8 @@ class DemonstrationAugmentation:
             episode = centre_picks(episode)
         prob = self.inverse_dynamics_prob
         is_inverse = prob == 1 or (rng is not None and prob > 0 and rng.random() < prob)
+        if self.leftmost_first and not is_inverse:
+            episode = leftmost_first(episode)
         if is_inverse:
             episode = with_motion_prompt(episode)
         elif rng is not None and other is not None:
@@ -202,6 +257,7 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
     return DemonstrationAugmentation(
         config.inverse_dynamics_prob,
         config.centre_picks,
+        config.leftmost_first,
         of_inverse_dynamics=(partial(drop_unused_objects, prob=config.drop_unused_objects_prob), shuffle),
         of_tasks=(
             Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
