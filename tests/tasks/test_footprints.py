@@ -7,9 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openvima.scene import Zone
+from openvima.catalog.packs import load_assets
+from openvima.scene import Placement, Pose, Zone
+from openvima.tasks import sample_episode
 from openvima.tasks.kernels import mark_free_centres, nth_centre, squared_depths
 from openvima.tasks.pushes import Rectangle
+from openvima.tasks.table import is_wedged
 
 rectangles = st.builds(
     Rectangle,
@@ -152,3 +155,21 @@ def test_depths_are_exact_euclidean_distances(density: float) -> None:
         depths = np.empty((11, 8), np.int32)
         squared_depths(labels, 6, 2, 3, np.empty_like(depths), depths)
         np.testing.assert_array_equal(depths, naive_squared_depths(mask))
+
+
+@pytest.mark.parametrize(
+    ("y", "height_m", "wedged"),
+    [(0.07, 0.0, True), (-0.07, 0.0, True), (0.2, 0.0, False), (0.07, 0.04, False)],
+)
+def test_the_corner_beside_the_handle_of_a_pan_is_not_free(y: float, height_m: float, wedged: bool) -> None:
+    pan = Placement(5, "pan", "red", (0.16, 0.24, 0.03), Pose.planar(0.4, 0.0, z=0.0138), fixed=True)
+    letter = Placement(6, "letter R", "blue", (0.144, 0.144, 0.036), Pose.planar(0.52, y, z=height_m))
+    assert is_wedged(letter, pan, load_assets("procedural")) == wedged
+
+
+def test_nothing_lies_there_at_levels_beyond_the_published_ones() -> None:
+    assets = load_assets("procedural")
+    for seed in range(30):
+        placements = sample_episode("sort_by_shape", seed=seed, domain="eval").problem.scene.placements
+        pairs = [(p, base) for base in placements for p in placements if base.fixed and not p.fixed]
+        assert not any(is_wedged(p, base, assets) for p, base in pairs)

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from openvima.catalog import Assets
+from openvima.catalog.partitions import PUBLISHED_LEVELS
 from openvima.errors import ConfigError, OpenVimaError, SamplingError, unknown_name
 from openvima.scene import (
     Condition,
@@ -35,7 +36,7 @@ from openvima.tasks import clutter
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewrite
 from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, check_steps, list_tasks, task_spec
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import TableSampler, is_wedged
 from openvima.user_code import described
 
 Domain = Literal["train", "eval", "user"]
@@ -257,6 +258,8 @@ def sample_episode(
             problem = spec.sample(table, **options)
             if level == clutter.LEVEL and isinstance(problem, Problem):
                 problem = clutter.add_clutter(table, problem, task)
+            if level not in PUBLISHED_LEVELS and isinstance(problem, Problem):
+                _check_room(problem.scene, pack)
         except SamplingError as error:
             reason = error
             continue
@@ -283,6 +286,18 @@ def sample_episode(
     raise SamplingError(
         f"{MAX_REDRAWS + 1} draws of {task} at level {level}, seed {number}, failed: {reason}"
     )
+
+
+def _check_room(scene: Scene, assets: Assets) -> None:
+    """Check that no object lies where a base would press it into the table; published seeds stay as they are.
+
+    Raises:
+        SamplingError: One does.
+    """
+    for base in scene.placements:
+        for placement in scene.placements if base.fixed else ():
+            if not placement.fixed and is_wedged(placement, base, assets):
+                raise SamplingError(f"the {placement.object} lies in the {base.object}'s hull.")
 
 
 @functools.cache

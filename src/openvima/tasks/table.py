@@ -1,6 +1,7 @@
 """Sampling of object placements on the table."""
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -8,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from openvima.catalog import Assets, Pool, Vector3, object_spec
+from openvima.catalog.geometry import CollisionBox, CollisionShape
 from openvima.errors import SamplingError
 from openvima.scene import FIRST_OBJECT_ID, WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Placement, Pose, Scene
 
@@ -378,6 +380,42 @@ def is_in_the_way(placement: Placement, other: Placement) -> bool:
     """
     reach = max((placement.size[axis] + other.size[axis]) / 2 + _CROWDING_MARGIN_M for axis in (0, 1))
     return placement.pose.planar_distance(other.pose) <= reach
+
+
+_ON_TABLE_M = 0.003  # above its height at rest
+_ANGLES = np.arange(64) * (np.pi / 64)
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # in which a line may part two convex shapes
+
+
+def is_wedged(placement: Placement, base: Placement, assets: Assets) -> bool:
+    """Whether an object that lies on the table reaches into the convex collision shapes of a base.
+
+    A top view does not show it: the hull of a pan fills the corners beside its handle, and what lies there
+    would be pressed into the table.
+    """
+    geometry = assets.geometry(placement.object, placement.size, placement.scale)
+    if placement.pose.z > geometry.rest_z_m + _ON_TABLE_M:
+        return False
+    shadows = [_shadow(part, placement.pose) for part in geometry.collision]
+    others = [
+        _shadow(part, base.pose) for part in assets.geometry(base.object, base.size, base.scale).collision
+    ]
+    return any(
+        not ((low > other_high) | (other_low > high)).any()
+        for low, high in shadows
+        for other_low, other_high in others
+    )
+
+
+def _shadow(part: CollisionShape, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest coordinates of a convex part on the table along all directions, shape (64,), m."""
+    if isinstance(part, CollisionBox):
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        points = signs * part.half_size + part.centre
+    else:
+        points = part.points
+    along = pose.transform(points)[:, :2] @ _DIRECTIONS
+    return along.min(axis=0), along.max(axis=0)
 
 
 @functools.lru_cache(maxsize=256)
