@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import fcntl
-import glob
 import logging
 import os
 import shutil
@@ -141,8 +140,11 @@ def remove_stale(folder: Path, name: str | None = None) -> None:
         folder: The folder.
         name: Delete only those of this file or folder.
     """
-    for path in folder.glob(".*.tmp" if name is None else f".{glob.escape(name)}.*.tmp"):
-        process = path.name.split(".")[-2]
+    start = "." if name is None else f".{name}."
+    for found in os.listdir(folder):
+        if not (found.startswith(start) and found.endswith(".tmp")):
+            continue
+        path, process = folder / found, found.split(".")[-2]
         if not process.isdecimal() or process_runs(int(process)):
             continue
         if path.is_dir() and not path.is_symlink():

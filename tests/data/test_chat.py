@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from openvima.data.chat import UNREADABLE, ChatFormat, demo_turns, family_of
+from openvima.data.chat import UNREADABLE, ChatFormat, demo_turns, encode_picture, family_of
 from openvima.data.chat_settings import POINTS
 from openvima.data.records import rollout_oracle
 from openvima.env import EnvConfig
@@ -49,6 +49,13 @@ def test_scenes_of_a_prompt_stay_whole_and_both_views_can_be_shown() -> None:
     shapes = [pixels(part).shape for part in parts if isinstance(part, bytes)]
     assert shapes == [(256, 512, 3)] * 3
     assert "first of these pictures" in parts[-1]
+
+
+@pytest.mark.parametrize("enlarge", [1, 3])
+def test_pictures_are_enlarged_without_smoothing(enlarge: int) -> None:
+    rgb = np.random.default_rng(0).integers(256, size=(3, 5, 7), dtype=np.uint8)
+    large = np.moveaxis(rgb, 0, -1).repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+    assert np.array_equal(pixels(encode_picture(rgb, enlarge)), large)
 
 
 @pytest.mark.parametrize("points", POINTS)

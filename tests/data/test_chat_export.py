@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.chat import ChatFormat, content_of, demo_turns
+from openvima.data.chat import ChatFormat, demo_turns
 from openvima.data.chat_export import ChatExportConfig, export_chat
 from openvima.errors import ConfigError, DatasetError
 
@@ -43,7 +43,7 @@ def test_what_is_trained_is_what_is_asked(demos: Path, chats: Path) -> None:
         turns = demo_turns(demo, FORM)
         for end in range(2, len(turns) + 1, 2):
             example = next(written)
-            asked = content_of(turns[:end])
+            asked = [json.loads(turn.message) for turn in turns[:end]]
             images = iter(example["images"])
             for message, sent in zip(example["messages"], asked, strict=True):
                 for block, part in zip(message["content"], sent["content"], strict=True):
@@ -51,7 +51,7 @@ def test_what_is_trained_is_what_is_asked(demos: Path, chats: Path) -> None:
                         assert block == part
                     else:
                         file = chats / next(images)
-                        assert content_of([turns[0]])[0]["role"] == "user" and file.is_file()
+                        assert part["type"] == "image_url" and file.is_file()
             assert next(images, None) is None
             assert FORM.read_answer(example["messages"][-1]["content"][0]["text"], demo.end_effector)
     assert next(written, None) is None

@@ -16,7 +16,8 @@ import sys
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -34,15 +35,8 @@ Part = str | bytes  # a text, or an image as a PNG file
 Tokens = Callable[[int, int], int]  # of an image with that width and height in pixels
 
 
-@dataclass(frozen=True, slots=True)
-class Family:
-    """Models that point in one way.
-
-    Args:
-        pattern: Regular expression that is found in the lower-case names of its models.
-        points: How they write points.
-        image_tokens: Tokens of an image, by its width and height in pixels.
-    """
+class Family(NamedTuple):
+    """Models that point in one way; the pattern is found in their lower-case names."""
 
     pattern: str
     points: Points
@@ -78,17 +72,17 @@ def family_of(model: str) -> Family:
     return next(family for family in FAMILIES if re.search(family.pattern, model.lower()))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Turn:
     """One message of a conversation: texts and images (PNG files) in reading order."""
 
     role: Literal["user", "assistant"]
     parts: tuple[Part, ...]
 
-
-def content_of(turns: Sequence[Turn]) -> list[dict[str, Any]]:
-    """Return a conversation as the messages of the OpenAI-compatible protocol."""
-    return [{"role": turn.role, "content": [_content(part) for part in turn.parts]} for turn in turns]
+    @cached_property
+    def message(self) -> str:
+        """JSON of the OpenAI-compatible protocol; made once, though every later request holds it."""
+        return json.dumps({"role": self.role, "content": [_content(part) for part in self.parts]})
 
 
 def _content(part: Part) -> dict[str, Any]:
@@ -320,15 +314,22 @@ def wording_hash() -> str:
 
 def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
     """Encode an image, shape (3, H, W), uint8, as a PNG file of `enlarge` times its size, unsmoothed."""
-    rows = np.repeat(channels_last(rgb), enlarge, axis=1)
-    height, width = rows.shape[0] * enlarge, rows.shape[1]
-    # Repeated rows are differences of zero to the one above (filter 2), with little left to compress: a third
-    # of the time that Pillow takes.
-    lines = np.zeros((rows.shape[0], enlarge, 1 + 3 * width), np.uint8)
-    lines[:, 0, 1:] = rows.reshape(len(rows), -1)
-    lines[:, 1:, 0] = 2
+    pixels = np.ascontiguousarray(channels_last(rgb))
+    height, width = pixels.shape[0] * enlarge, pixels.shape[1] * enlarge
+    rows = np.zeros((len(pixels), 1 + 3 * width), np.uint8)  # each begins with its filter, 0: as it is
+    rows[:, 1:] = np.repeat(pixels, enlarge, axis=1).reshape(len(pixels), -1)
+    # A repeated row is nothing but zeros to the one above, filter 2. All repetitions are compressed once, and
+    # inserted where the compressor refers to nothing before: a sixth of the time that Pillow takes.
+    repeated = (b"\2" + bytes(3 * width)) * (enlarge - 1)
+    packer = zlib.compressobj(1, wbits=-15)
+    inserted = packer.compress(repeated) + packer.flush(zlib.Z_FULL_FLUSH)
+    data, checksum = [b"\x78\x01"], 1
+    for row in rows:
+        data += [packer.compress(row), packer.flush(zlib.Z_FULL_FLUSH), inserted]
+        checksum = zlib.adler32(repeated, zlib.adler32(row, checksum))
+    data += [packer.flush(), checksum.to_bytes(4, "big")]
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # eight bits of red, green and blue
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 1)), (b"IEND", b""))
+    chunks = ((b"IHDR", head), (b"IDAT", b"".join(data)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         for kind, data in chunks

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from openvima.atomic_io import atomic_write_file
-from openvima.data.chat import MOST_CHARACTERS, ChatFormat, Turn, content_of, family_of, tool_in, wording_hash
+from openvima.data.chat import MOST_CHARACTERS, ChatFormat, Turn, family_of, tool_in, wording_hash
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 from openvima.errors import AnswerError, ConfigError, LimitReachedError, PolicyError, ServerError, echo
 from openvima.imports import import_extra
@@ -167,16 +167,17 @@ class ChatClient:
             ServerError: The server is away, or refuses the key, the model or the images.
             LimitReachedError: The limit of requests or tokens is reached.
         """
-        body = self._body(turns, schema)
-        content = json.dumps([self.config.server, body], sort_keys=True)
-        request = hashlib.sha256(content.encode()).hexdigest()[:32]
+        settings = self._settings(schema)
+        messages = f'"messages": [{", ".join(turn.message for turn in turns)}]}}'.encode()
+        named = json.dumps([self.config.server, settings]).encode()
+        request = hashlib.sha256(named + messages).hexdigest()[:32]
         folder = self.config.answers
         path = None if folder is None else folder / request[:2] / f"{request}.json"
         if path is not None and path.is_file():
             record = json.loads(path.read_text(encoding="utf-8"))
             return Answer(**{**record, "left_out": tuple(record["left_out"])})
         self._reserve()
-        answer = self._asked(body, request)
+        answer = self._asked(settings, messages, request)
         with self._lock:
             self.num_tokens += answer.tokens_in + answer.tokens_out
         if path is not None:
@@ -184,15 +185,15 @@ class ChatClient:
             atomic_write_file(path, json.dumps(asdict(answer)) + "\n")
         return answer
 
-    def _body(self, turns: Sequence[Turn], schema: Mapping[str, Any]) -> dict[str, Any]:
+    def _settings(self, schema: Mapping[str, Any]) -> dict[str, Any]:
         options = self.config.options
-        body: dict[str, Any] = {"model": self.model, "messages": content_of(turns)}
+        settings: dict[str, Any] = {"model": self.model}
         if options.temperature >= 0:
-            body["temperature"] = options.temperature
+            settings["temperature"] = options.temperature
         if not options.free_text:
             named = {"name": "action", "strict": True, "schema": schema}
-            body["response_format"] = {"type": "json_schema", "json_schema": named}
-        return body
+            settings["response_format"] = {"type": "json_schema", "json_schema": named}
+        return settings
 
     def _reserve(self) -> None:
         """Count a request, if there may be one more."""
@@ -227,17 +228,18 @@ class ChatClient:
             pass
         self._is_reached = True
 
-    def _asked(self, body: Mapping[str, Any], request: str) -> Answer:
+    def _asked(self, settings: Mapping[str, Any], messages: bytes, request: str) -> Answer:
         """Ask the server; where it refuses a request, ask without the settings that it may not know."""
         openai, refusal = self._openai, None
-        optional = [name for name in _OPTIONAL if name in body and name not in self._left_out]
+        optional = [name for name in _OPTIONAL if name in settings and name not in self._left_out]
         for count in range(len(optional) + 1):
             left_out = (*self._left_out, *optional[:count])
-            sent = {name: value for name, value in body.items() if name not in left_out}
+            sent = json.dumps({name: value for name, value in settings.items() if name not in left_out})
+            content = f"{sent[:-1]}, ".encode() + messages
             started = time.perf_counter()
             try:
                 # Not `chat.completions.create`, which walks through the images: a third of a step's time.
-                said = self._client.post("/chat/completions", cast_to=object, body=sent)
+                said = self._client.post("/chat/completions", cast_to=object, content=content)
             except (openai.BadRequestError, openai.UnprocessableEntityError) as error:
                 refusal = refusal or error
                 continue
@@ -253,7 +255,7 @@ class ChatClient:
             self._left_out = left_out
             return self._answer(said, request, time.perf_counter() - started, left_out)
         assert refusal is not None  # it was refused each time
-        raise self._refusal(refusal, body)
+        raise self._refusal(refusal, messages)
 
     def _answer(self, said: Any, request: str, seconds: float, left_out: tuple[str, ...]) -> Answer:
         """Take out of a response what counts; servers differ in what they leave out."""
@@ -269,7 +271,7 @@ class ChatClient:
             request, text[-MOST_CHARACTERS:], name, tokens_in, tokens_out, round(seconds, 3), left_out
         )
 
-    def _refusal(self, error: Any, body: Mapping[str, Any] | None = None) -> ServerError:
+    def _refusal(self, error: Any, messages: bytes = b"") -> ServerError:
         """Compose the error for a request that the server refused."""
         status = error.status_code
         hint = {
@@ -278,8 +280,8 @@ class ChatClient:
             404: f"is {echo(self.model)!r} a model of it, and --base-url complete, such as http://HOST:PORT/v1?",
             429: "it is busy, or what was paid for is used up; the same command goes on where this ended",
         }.get(status, "")
-        if body is not None or status == 413:
-            images = str(body).count("'image_url':") if body else "the"
+        if messages or status == 413:
+            images = messages.count(b'"image_url": ') or "the"
             enlarge = self.config.options.enlarge
             hint = f"can the model see, and take {images} images, the view {enlarge} times enlarged?"
         said = self._shown(error)
