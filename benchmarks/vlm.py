@@ -1,4 +1,4 @@
-"""How many decisions a second an evaluation of a vision-language model makes, and what one costs the processor.
+"""How many decisions a second an evaluation of a vision-language model makes, and what one costs.
 
     python benchmarks/vlm.py [--tasks a,b|all] [--episodes N] [--answer-s S] [--concurrency C] [--json FILE]
 
@@ -88,7 +88,9 @@ def main() -> None:
 
     tasks = tasks_of("L1") if args.tasks == "all" else args.tasks.split(",")
     ours, theirs = multiprocessing.Pipe()
-    server = multiprocessing.get_context("spawn").Process(target=serve, args=(args.answer_s, theirs), daemon=True)
+    server = multiprocessing.get_context("spawn").Process(
+        target=serve, args=(args.answer_s, theirs), daemon=True
+    )
     server.start()
     url = f"http://127.0.0.1:{ours.recv()}/v1"
     measure(tasks, 1, url, args.concurrency)
@@ -97,8 +99,8 @@ def main() -> None:
     found["decisions_per_s"] = found["decisions"] / found["seconds"]
     found["cpu_ms_per_decision"] = 1000 * found["cpu_s"] / found["decisions"]
     print(
-        f"{found['decisions']} decisions in {found['seconds']:.1f} s: {found['decisions_per_s']:.1f} a second; "
-        f"{found['cpu_ms_per_decision']:.1f} ms of a processor each"
+        f"{found['decisions']} decisions in {found['seconds']:.1f} s: {found['decisions_per_s']:.1f} a "
+        f"second; {found['cpu_ms_per_decision']:.1f} ms of a processor each"
     )
     if args.json:
         record = {**circumstances(), "tasks": tasks, "answer_s": args.answer_s, **found}

@@ -35,7 +35,7 @@ from transformers.models.clip.image_processing_pil_clip import CLIPImageProcesso
 
 from openvima.cli.main import main as openvima
 from openvima.data.chat import ChatFormat
-from openvima.data.chat_export import EXAMPLES_NAME, ChatExportConfig, export_chat
+from openvima.data.chat_export import EXAMPLES_NAME, export_chat
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.records import package_versions, rollout_oracle
@@ -195,7 +195,7 @@ def main() -> None:
     out: Path = arguments.out.absolute()
     demos, chats, model_folder = out / "demos", out / "chats", out / "model"
     record(demos)
-    export_chat(ChatExportConfig(demos, chats, form=ChatFormat(enlarge=ENLARGE)))
+    export_chat(demos, chats, form=ChatFormat(enlarge=ENLARGE))
     torch.manual_seed(0)
     lines = (chats / EXAMPLES_NAME).read_text(encoding="utf-8").splitlines()
     blocks = [

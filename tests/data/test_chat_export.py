@@ -13,7 +13,7 @@ from PIL import Image
 
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.chat import ChatFormat, demo_turns
-from openvima.data.chat_export import ChatExportConfig, export_chat
+from openvima.data.chat_export import export_chat
 from openvima.errors import ConfigError, DatasetError
 
 EXPERIMENT = Path(__file__).parents[2] / "experiments" / "vlm" / "closed_loop.py"
@@ -29,7 +29,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def chats(demos: Path) -> Path:
-    return export_chat(ChatExportConfig(demos, demos.parent / "chats", form=FORM, questions=3))
+    return export_chat(demos, demos.parent / "chats", form=FORM, questions=3)
 
 
 def examples(folder: Path) -> Iterator[dict[str, Any]]:
@@ -76,7 +76,7 @@ def test_questions_are_on_the_scene(demos: Path, chats: Path) -> None:
 
 
 def test_llava_has_a_mark_for_each_image(demos: Path) -> None:
-    folder = export_chat(ChatExportConfig(demos, demos.parent / "llava", "llava", tasks=("rotate",)))
+    folder = export_chat(demos, demos.parent / "llava", format="llava", tasks=("rotate",))
     for example in examples(folder):
         said = example["conversations"]
         assert [turn["from"] for turn in said] == ["human", "gpt"] * (len(said) // 2)
@@ -84,13 +84,12 @@ def test_llava_has_a_mark_for_each_image(demos: Path) -> None:
 
 
 def test_exports_are_repeatable_and_not_overwritten(demos: Path, chats: Path) -> None:
-    config = ChatExportConfig(demos, demos.parent / "again", form=FORM, questions=3)
-    again = export_chat(config)
+    again = export_chat(str(demos), str(demos.parent / "again"), form=FORM, questions=3)
     assert (again / "train.jsonl").read_bytes() == (chats / "train.jsonl").read_bytes()
     with pytest.raises(DatasetError, match="is there already"):
-        export_chat(config)
-    with pytest.raises(ConfigError, match="holds the demonstrations themselves"):
-        ChatExportConfig(demos, demos.parent)
+        export_chat(demos, again)
+    with pytest.raises(ConfigError, match="questions is -1"):
+        export_chat(demos, demos.parent / "other", questions=-1)
 
 
 def closed_loop() -> ModuleType:

@@ -239,7 +239,7 @@ def main(
         vlm=VlmConfig(chat.base_url, chat.view, vlm),
     )
     if chat.dry_run:
-        from openvima.evaluation.chat_preview import write_preview
+        from openvima.evaluation.chat import write_preview
 
         page, estimate = write_preview(config)
         print(f"About {estimate}.")

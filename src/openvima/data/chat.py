@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -82,14 +83,14 @@ class Turn:
     @cached_property
     def message(self) -> str:
         """JSON of the OpenAI-compatible protocol; made once, though every later request holds it."""
-        return json.dumps({"role": self.role, "content": [_content(part) for part in self.parts]})
-
-
-def _content(part: Part) -> dict[str, Any]:
-    if isinstance(part, str):
-        return {"type": "text", "text": part}
-    url = f"data:image/png;base64,{base64.b64encode(part).decode('ascii')}"
-    return {"type": "image_url", "image_url": {"url": url}}
+        content: list[dict[str, Any]] = []
+        for part in self.parts:
+            if isinstance(part, str):
+                content.append({"type": "text", "text": part})
+            else:
+                url = f"data:image/png;base64,{base64.b64encode(part).decode('ascii')}"
+                content.append({"type": "image_url", "image_url": {"url": url}})
+        return json.dumps({"role": self.role, "content": content})
 
 
 _SEEN_FROM = {"top": "from above", "front": "from the front"}
@@ -150,13 +151,7 @@ class ChatFormat:
     def first_turn(
         self, prompt: RenderedPrompt, observation: Mapping, extractor: ObjectExtractor | None = None
     ) -> Turn:
-        """Compose the first message of an episode.
-
-        Args:
-            prompt: The prompt.
-            observation: `rgb` and `ee`, and what the extractor needs.
-            extractor: Finds the objects whose boxes are listed; None lists none.
-        """
+        """Compose the first message of an episode; an extractor finds the objects whose boxes are listed."""
         tool = tool_in(observation)
         shown = "suction cup" if tool == "suction" else "spatula"
         parts: list[Part] = [f"You control a robot arm with a {shown} above a table. The task:"]
@@ -185,14 +180,9 @@ class ChatFormat:
         return json.dumps(values)
 
     def read_answer(self, text: str, tool: str) -> Action:
-        """Find the action in an answer: its last JSON object that has the names of one.
+        """Find the action in an answer: its last JSON object that has the names of one for this tool.
 
-        Args:
-            text: What a model said.
-            tool: "suction" or "spatula".
-
-        Returns:
-            The action; points of the picture beside the workspace are moved into it.
+        Points of the picture beside the workspace are moved into it.
 
         Raises:
             AnswerError: There is none, or a value cannot be.
@@ -202,7 +192,7 @@ class ChatFormat:
         points = [self._position(values[name], name) for name in names]
         turn = values.get("rotate", 0)
         if not _is_number(turn):
-            raise AnswerError(f"{UNREADABLE}: rotate is no number", f"rotate is {echo(repr(turn), 60)}")
+            raise _unreadable("rotate is no number", f"rotate is {echo(repr(turn), 60)}")
         return Action.planar(points[0], points[1], -math.radians(turn))
 
     def schema(self, tool: str) -> dict[str, Any]:
@@ -211,30 +201,26 @@ class ChatFormat:
         values: dict[str, Any] = dict.fromkeys(_NAMES[tool], point)
         if tool == "suction":
             values["rotate"] = {"type": "number"}
-        return {
-            "type": "object",
-            "properties": values,
-            "required": list(values),
-            "additionalProperties": False,
-        }
+        form = {"type": "object", "properties": values, "required": [*values]}
+        return {**form, "additionalProperties": False}
 
     def point(self, position: Sequence[float]) -> list[float]:
         """Write a position on the table, in metres, as a point of the picture."""
-        camera = CAMERAS[self.views[0]]
-        pixel = project(np.array([*position[:2], 0.0]), camera)
-        return self._ordered((pixel + 0.5) / (camera.width, camera.height))
+        return self._written(project(np.array([*position[:2], 0.0]), CAMERAS[self.views[0]]))
 
-    def _ordered(self, fractions: np.ndarray) -> list[float]:
-        """Write fractions of width and height, x first, in the numbers and the order of this format."""
-        scale, _, order = self.points.partition("-")
-        digits = 3 if scale == "1" else 0
-        x, y = (fractions * self._ranges()).tolist()
-        numbers = [round(value, digits) if digits else round(value) for value in (x, y)]
-        return numbers if order == "xy" else numbers[::-1]
+    def _written(self, pixel: np.ndarray) -> list[float]:
+        """Write a pixel of the view, column first, in the numbers and the order of this format."""
+        numbers = (pixel + 0.5) * self._scale()
+        digits = 3 if self.points.startswith("1-") else None  # whole numbers
+        written = [round(number, digits) for number in numbers.tolist()]
+        return written if self.points.endswith("xy") else written[::-1]
 
-    def _ranges(self) -> tuple[float, float]:
-        scale = self.points.partition("-")[0]
-        return self.size if scale == "pixels" else (float(scale), float(scale))
+    def _scale(self) -> np.ndarray:
+        """Return what a pixel of the view is in the numbers of this format: of columns, and of rows."""
+        camera, largest = CAMERAS[self.views[0]], self.points.partition("-")[0]
+        if largest == "pixels":
+            return np.full(2, float(self.enlarge))
+        return float(largest) / np.array([camera.width, camera.height])
 
     def _position(self, value: object, name: str) -> tuple[float, float]:
         """Read a point, in metres.
@@ -243,17 +229,12 @@ class ChatFormat:
             AnswerError: It is not two numbers, or lies beside the picture.
         """
         if not (isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))):
-            raise AnswerError(
-                f"{UNREADABLE}: a point is not two numbers", f"{name} is {echo(repr(value), 60)}"
-            )
+            raise _unreadable("a point is not two numbers", f"{name} is {echo(repr(value), 60)}")
         numbers = np.array(value if self.points.endswith("xy") else value[::-1], np.float64)
-        fractions = numbers / self._ranges()
-        if not ((fractions >= 0) & (fractions <= 1)).all():
-            raise AnswerError(
-                f"{UNREADABLE}: a point beside the picture", f"{name} is {value}, with points {self.points}"
-            )
-        camera = CAMERAS[self.views[0]]
-        x, y = unproject(fractions * (camera.width, camera.height) - 0.5, camera).tolist()
+        camera, pixel = CAMERAS[self.views[0]], numbers / self._scale()
+        if not ((pixel >= 0) & (pixel <= (camera.width, camera.height))).all():
+            raise _unreadable("a point beside the picture", f"{name} is {value}, points are {self.points}")
+        x, y = unproject(pixel - 0.5, camera).tolist()
         return x, y
 
     def _scene(self, observation: Mapping, extractor: ObjectExtractor | None) -> list[Part]:
@@ -269,12 +250,10 @@ class ChatFormat:
     def _boxes(self, observation: Mapping, extractor: ObjectExtractor) -> str:
         found = extractor.in_observation(observation)
         view = VIEWS.index(self.views[0])
-        camera = CAMERAS[self.views[0]]
         lines = []
         for x, y, height, width in found.boxes[view, found.masks[view]].tolist():
-            corners = np.array([[x - width / 2, y - height / 2], [x + width / 2, y + height / 2]]) + 0.5
-            low, high = (self._ordered(corner / (camera.width, camera.height)) for corner in corners)
-            lines.append(f"{json.dumps([*low, *high])}")
+            centre, half = np.array([x, y]), np.array([width, height]) / 2
+            lines.append(json.dumps([*self._written(centre - half), *self._written(centre + half)]))
         names = "left, top, right, bottom" if self.points.endswith("xy") else "top, left, bottom, right"
         return f"Objects in it, [{names}]: {', '.join(lines) or 'none'}."
 
@@ -282,8 +261,11 @@ class ChatFormat:
         rgb = image.rgb[self.views[0]]
         if image.kind == "object":
             cut = cut_to_object(np.ascontiguousarray(channels_last(rgb)), image.segm[self.views[0]])
-            return encode_picture(np.moveaxis(cut, -1, 0), self.enlarge)
+            rgb = np.moveaxis(cut, -1, 0)
         return encode_picture(rgb, self.enlarge)
+
+
+DEFAULT_FORMAT = ChatFormat()
 
 
 def point_meaning(form: ChatFormat) -> str:
@@ -344,12 +326,9 @@ def tool_in(observation: Mapping) -> str:
 def _joined(parts: Sequence[Part]) -> tuple[Part, ...]:
     """Join texts that follow one another: a model's template may put anything between two of them."""
     joined: list[Part] = []
-    for part in parts:
-        last = joined[-1] if joined else b""
-        if isinstance(part, str) and isinstance(last, str):
-            joined[-1] = f"{last}\n{part}"
-        else:
-            joined.append(part)
+    for kind, group in groupby(parts, type):
+        found = list(group)
+        joined += ["\n".join(map(str, found))] if kind is str else found
     return tuple(joined)
 
 
@@ -365,10 +344,13 @@ def _last_object(text: str, names: Sequence[str]) -> dict[str, Any]:
             return found
     wanted = " and ".join(names)
     what = f"no JSON with {wanted}" if text.strip() else "it is empty"
-    raise AnswerError(f"{UNREADABLE}: {what}", f"it ends with {echo(text[-60:].strip())!r}")
+    raise _unreadable(what, f"it ends with {echo(text[-60:].strip())!r}")
+
+
+def _unreadable(what: str, detail: str) -> AnswerError:
+    return AnswerError(f"{UNREADABLE}: {what}", detail)
 
 
 def _is_number(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return -_MOST < value < _MOST  # NaN and infinity are not
+    is_one = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_one and -_MOST < value < _MOST  # NaN and infinity are not

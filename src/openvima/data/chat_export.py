@@ -6,14 +6,15 @@ An example is a step: what `openvima evaluate --policy vlm:MODEL` asks before it
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
 from openvima.data.chat import (
+    DEFAULT_FORMAT,
     ChatFormat,
     Part,
     Turn,
@@ -25,18 +26,29 @@ from openvima.data.chat import (
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
 from openvima.errors import ConfigError, DatasetError
-from openvima.input_files import settle
+from openvima.input_files import as_path
 from openvima.multiprocess import Report
 from openvima.perception.objects import ObjectExtractor
 
 ExportFormat = Literal["messages", "llava"]
 EXAMPLES_NAME, SOURCE_NAME = "train.jsonl", "source.json"
 _IMAGES = "images"
+_SPEAKERS = {"user": "human", "assistant": "gpt"}  # of llava
 
 
-@dataclass(frozen=True, slots=True)
-class ChatExportConfig:
-    """What to export, and where to.
+def export_chat(
+    data: Path | str,
+    out: Path | str,
+    *,
+    format: ExportFormat = "messages",
+    tasks: Sequence[str] | None = None,
+    form: ChatFormat = DEFAULT_FORMAT,
+    extractor: ObjectExtractor | None = None,
+    questions: int = 0,
+    seed: int = 0,
+    report: Report | None = None,
+) -> Path:
+    """Write `train.jsonl` and its images; the folder appears whole, or not at all.
 
     Args:
         data: Folder of demonstrations.
@@ -44,79 +56,48 @@ class ChatExportConfig:
         format: "messages": roles and contents, as TRL reads them; "llava": conversations with <image>.
         tasks: Keep the episodes of these tasks only; None keeps all.
         form: How views are shown and points are written.
+        extractor: Finds the objects whose boxes are listed; None lists none.
         questions: Auxiliary questions on the scene for each demonstration.
         seed: Of the choice of questions.
-
-    Raises:
-        ConfigError: A value is not allowed, or `out` holds `data`.
-    """
-
-    data: Path
-    out: Path
-    format: ExportFormat = "messages"
-    tasks: tuple[str, ...] | None = None
-    form: ChatFormat = field(default_factory=ChatFormat)
-    questions: int = 0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        settle(self, paths=("data", "out"), names=("tasks",))
-        if self.questions < 0:
-            raise ConfigError(f"questions is {self.questions}; it must be at least 0.")
-        if self.data.resolve().is_relative_to(self.out.resolve()):
-            raise ConfigError(f"{self.out} holds the demonstrations themselves; give another folder.")
-
-
-def export_chat(
-    config: ChatExportConfig, extractor: ObjectExtractor | None = None, report: Report | None = None
-) -> Path:
-    """Write `train.jsonl` and its images; the folder appears whole, or not at all.
-
-    Args:
-        config: What and where to.
-        extractor: Finds the objects whose boxes are listed; None lists none.
         report: Called as `report(episodes done, episodes in all, task)`.
 
     Returns:
         The folder.
 
     Raises:
+        ConfigError: There cannot be so many questions.
         DatasetError: There are no such demonstrations, or the folder has content.
         ShardError: A shard is damaged.
     """
-    dataset = Dataset(config.data, tasks=config.tasks)
-    out = config.out
+    if questions < 0:
+        raise ConfigError(f"questions is {questions}; it must be at least 0.")
+    dataset, out = Dataset(data, tasks=tasks), as_path(out)
     if out.exists() and not (out.is_dir() and all(map(is_lock_file, out.iterdir()))):
         raise DatasetError(f"{out} is there already; give another folder.")
-    write = _messages if config.format == "messages" else _llava
     with folder_lock(out), atomic_folder(out) as folder:
         (folder / _IMAGES).mkdir()
         with (folder / EXAMPLES_NAME).open("w", encoding="utf-8") as lines:
             for number, demo in enumerate(dataset, 1):
                 name = f"{demo.task}-{demo.level}-{demo.domain}-{demo.seed}"
-                turns = demo_turns(demo, config.form, extractor)
+                turns = demo_turns(demo, form, extractor)
                 paths = _save(folder, name, turns)
                 for end in range(2, len(turns) + 1, 2):
-                    lines.write(_line(write(f"{name}-{end // 2}", turns[:end], paths)))
-                rng = np.random.default_rng([config.seed, number])
-                for index, question in enumerate(_questions(demo, config, rng)):
+                    lines.write(_line(format, f"{name}-{end // 2}", turns[:end], paths))
+                rng = np.random.default_rng([seed, number])
+                for index, question in enumerate(_questions(demo, questions, form, rng)):
                     asked = f"{name}-question{index}"
-                    lines.write(_line(write(asked, question, _save(folder, asked, question))))
+                    lines.write(_line(format, asked, question, _save(folder, asked, question)))
                 if report:
                     report(number, len(dataset), demo.task)
         source = {
             "command": "openvima data export-chat",
-            "config": {**asdict(config.form), "questions": config.questions, "seed": config.seed},
+            "config": {**asdict(form), "questions": questions, "seed": seed},
             "boxes": extractor is not None,
             "wording": wording_hash(),
             "content_hash": dataset.manifest["content_hash"],
         }
         (folder / SOURCE_NAME).write_text(json.dumps(source, indent=1) + "\n", encoding="utf-8")
     return out
-
-
-def _line(example: dict[str, Any]) -> str:
-    return json.dumps(example, ensure_ascii=False) + "\n"
 
 
 def _save(folder: Path, name: str, turns: Sequence[Turn]) -> list[str]:
@@ -129,41 +110,35 @@ def _save(folder: Path, name: str, turns: Sequence[Turn]) -> list[str]:
     return paths
 
 
-def _messages(name: str, turns: Sequence[Turn], paths: Sequence[str]) -> dict[str, Any]:
-    contents = [{"role": turn.role, "content": [_block(part) for part in turn.parts]} for turn in turns]
-    return {"id": name, "messages": contents, "images": list(paths[: _num_images(turns)])}
+def _line(format: ExportFormat, name: str, turns: Sequence[Turn], paths: Sequence[str]) -> str:
+    """Write an example; `paths` are those of its images, and may go on."""
+    shown = paths[: sum(isinstance(part, bytes) for turn in turns for part in turn.parts)]
+    if format == "messages":
+        said = [{"role": turn.role, "content": [_block(part) for part in turn.parts]} for turn in turns]
+        example = {"id": name, "messages": said, "images": shown}
+    else:
+        texts = [
+            "\n".join(each if isinstance(each, str) else "<image>" for each in turn.parts) for turn in turns
+        ]
+        said = [
+            {"from": _SPEAKERS[turn.role], "value": text} for turn, text in zip(turns, texts, strict=True)
+        ]
+        example = {"id": name, "image": shown, "conversations": said}
+    return json.dumps(example, ensure_ascii=False) + "\n"
 
 
 def _block(part: Part) -> dict[str, str]:
     return {"type": "text", "text": part} if isinstance(part, str) else {"type": "image"}
 
 
-def _llava(name: str, turns: Sequence[Turn], paths: Sequence[str]) -> dict[str, Any]:
-    speakers = {"user": "human", "assistant": "gpt"}
-    said = [
-        {
-            "from": speakers[turn.role],
-            "value": "\n".join(part if isinstance(part, str) else "<image>" for part in turn.parts),
-        }
-        for turn in turns
-    ]
-    return {"id": name, "image": list(paths[: _num_images(turns)]), "conversations": said}
-
-
-def _num_images(turns: Sequence[Turn]) -> int:
-    return sum(isinstance(part, bytes) for turn in turns for part in turn.parts)
-
-
 def _questions(
-    demo: Demonstration, config: ChatExportConfig, rng: np.random.Generator
+    demo: Demonstration, count: int, form: ChatFormat, rng: np.random.Generator
 ) -> Iterator[tuple[Turn, Turn]]:
     """Ask on the scene: where an object is, which there are, how two lie to each other, what has changed."""
     kinds = (_where, _which, _relation, _change) if demo.scenes else ()
-    for _ in range(config.questions if kinds else 0):
+    for _ in range(count if kinds else 0):
         kind = kinds[rng.integers(len(kinds))]
-        step = int(rng.integers(demo.num_steps))
-        found = kind(demo, step, config.form, rng)
-        if found is not None:
+        if found := kind(demo, int(rng.integers(demo.num_steps)), form, rng):
             parts, answer = found
             yield Turn("user", parts), Turn("assistant", (answer,))
 

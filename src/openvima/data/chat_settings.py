@@ -1,15 +1,16 @@
 """Settings of chats with vision-language models; apart, so that the command line starts without the rest."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from openvima.errors import ConfigError, unknown_name
 
 Points = Literal["1000-xy", "1000-yx", "1-xy", "1-yx", "pixels-xy", "pixels-yx"]
-POINTS: tuple[Points, ...] = ("1000-xy", "1000-yx", "1-xy", "1-yx", "pixels-xy", "pixels-yx")
+POINTS: tuple[Points, ...] = get_args(Points)
 ChatView = Literal["top", "front", "top+front", "front+top"]
-CHAT_VIEWS: tuple[ChatView, ...] = ("top", "front", "top+front", "front+top")
+CHAT_VIEWS: tuple[ChatView, ...] = get_args(ChatView)
 DEFAULT_ENLARGE = 4
+SEGMENTATION = "segmentation"  # where boxes come from, in place of a detector
 
 
 def check_format(points: str, view: str, enlarge: int) -> None:

@@ -15,13 +15,20 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
+from openvima.data.chat_settings import SEGMENTATION
 from openvima.data.object_cache import Boxes, ObjectCache, open_object_cache
 from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.detector.detection import MATCHING_VERSION, DetectedObjects
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
-from openvima.perception.objects import AheadExtractor, ObjectExtractor, ObjectViews, make_hidden_objects
+from openvima.perception.objects import (
+    GROUND_TRUTH,
+    AheadExtractor,
+    ObjectExtractor,
+    ObjectViews,
+    make_hidden_objects,
+)
 from openvima.policies.naming import WEIGHTS_FILE, checkpoint_folder
 from openvima.scene import PromptImage
 from openvima.user_code import call_function, is_code, load_function, source_hash
@@ -66,6 +73,13 @@ def plugged_extractor(source: str) -> ObjectExtractor:
             f"{source} returned a {type(extractor).__name__}; it must return an ObjectExtractor."
         )
     return PluggedExtractor(cast(ObjectExtractor, extractor))  # it has both methods
+
+
+def chat_extractor(boxes: str) -> ObjectExtractor | None:
+    """Return what finds the objects that a chat lists: "segmentation", a form above, or "" for none."""
+    if boxes == SEGMENTATION:
+        return GROUND_TRUTH
+    return plugged_extractor(boxes) if boxes else None
 
 
 def plugged_boxes(source: str, *, fraction: float = 1.0) -> Boxes:

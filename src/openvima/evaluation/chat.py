@@ -1,4 +1,4 @@
-"""What evaluations of vision-language models need besides: demonstrations before the task, and mistakes.
+"""What evaluations of vision-language models need besides: shots before the task, mistakes, a preview.
 
 What a model said in each step is in `answers.jsonl`; counts and groups of mistakes are in the results.
 """
@@ -9,15 +9,21 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from openvima.atomic_io import atomic_write_file
-from openvima.data.chat import UNREADABLE, ChatFormat, Turn, demo_turns
+from openvima.data.chat import UNREADABLE, ChatFormat, Tokens, Turn, demo_turns, family_of
 from openvima.data.records import rollout_oracle
+from openvima.detector.plugins import chat_extractor
 from openvima.env.tabletop import TabletopEnv
-from openvima.errors import AnswerError, OracleError
+from openvima.errors import AnswerError, ConfigError, OracleError
+from openvima.evaluation.config import EvaluationConfig, cells
 from openvima.evaluation.results import EpisodeOutcome
+from openvima.html import render_page
 from openvima.perception.objects import ObjectExtractor
 from openvima.render.labels import CELL_M, LABEL_SHAPE, label_raster
 from openvima.scene import WORKSPACE_LOW, Action, AtPose
@@ -26,7 +32,8 @@ from openvima.scene.goal import object_of, oracle_move
 from openvima.serving.chat import Answer
 from openvima.tasks import task_spec
 
-ANSWERS_NAME = "answers.jsonl"
+ANSWERS_NAME, PREVIEW_NAME = "answers.jsonl", "first_message.html"
+_CHARACTERS_PER_TOKEN = 4
 Said = list[dict[str, Any]]  # what a model said in each step of an episode, as plain JSON values
 _SHOT_LEVEL = "train"
 _OTHER, _NOTHING = "picked another object", "picked nothing"
@@ -63,21 +70,15 @@ def shot_turns(
 
 def said_in(env: TabletopEnv, answer: Answer, decision: Any) -> dict[str, Any]:
     """Describe an answer before it is carried out: who said what, what it cost, and what is wrong with it."""
-    record: dict[str, Any] = asdict(answer)
-    if isinstance(decision, AnswerError):
-        return {**record, "mistake": {"kind": UNREADABLE}}
-    return {**record, "mistake": mistake_in(env, Action.from_arrays(decision))}
+    is_read = not isinstance(decision, AnswerError)
+    mistake = mistake_in(env, Action.from_arrays(decision)) if is_read else {"kind": UNREADABLE}
+    return {**asdict(answer), "mistake": mistake}
 
 
 def mistake_in(env: TabletopEnv, action: Action) -> dict[str, Any] | None:
     """Say what is wrong with a pick and place, by the goals that can be met next; None: nothing is known.
 
-    Args:
-        env: The environment before the action.
-        action: The action.
-
-    Returns:
-        Its kind, and by how much in cm or degrees.
+    The environment is as before the action. What is wrong has a kind, and by how much in cm or degrees.
     """
     problem, progress, scene = env.episode.problem, env.progress, env.scene
     if scene.end_effector != "suction" or not progress.open_goals:
@@ -104,13 +105,9 @@ def mistake_in(env: TabletopEnv, action: Action) -> dict[str, Any] | None:
 
 
 def summarise(episodes: Sequence[tuple[EpisodeOutcome, Said]]) -> dict[str, Any]:
-    """Count what the answers of a model cost, and group the failures by their first mistake.
+    """Count what the answers of a model cost, and group the failures by their first mistake, as JSON values.
 
-    Args:
-        episodes: How each ended, and what was said in it.
-
-    Returns:
-        Plain JSON values. Equal requests are one: the second answer came from disk.
+    Equal requests are one: the second answer came from disk.
     """
     answers = {said["request"]: said for _, steps in episodes for said in steps}.values()
     groups: dict[str, list[float]] = {}
@@ -145,3 +142,51 @@ def write_answers(folder: Path, steps: Iterable[Mapping[str, Any]]) -> float | N
         return None
     atomic_write_file(folder / ANSWERS_NAME, "\n".join(lines) + "\n")
     return statistics.median(seconds)
+
+
+def write_preview(config: EvaluationConfig) -> tuple[Path, str]:
+    """Write the first message of the first vision-language model as a page; no server is asked.
+
+    Args:
+        config: The evaluation.
+
+    Returns:
+        The page in `config.out`, and an estimate for that model.
+
+    Raises:
+        ConfigError: No policy is vlm:MODEL.
+    """
+    models = [source.ref.model for source in config.sources if source.kind == "vlm"]
+    if not models:
+        raise ConfigError("a dry run shows what a vision-language model is asked; name a policy vlm:MODEL.")
+    form, tokens = config.vlm.format_of(models[0]), family_of(models[0]).image_tokens
+    extractor = chat_extractor(config.vlm.options.boxes)
+    first: tuple[Turn, ...] = ()
+    requests = image_tokens = text_tokens = 0
+    for task, level in cells(config):
+        env = config.env_config.make(task, level, domain="eval")
+        observation, _ = env.reset(seed=config.seed)
+        shots = shot_turns(env, config.vlm.options.shots, form, extractor)
+        begin = (*shots, form.first_turn(env.prompt, observation, extractor))
+        first = first or begin
+        steps = len(rollout_oracle(env, config.seed).actions)
+        later = steps * (steps - 1) // 2  # messages after the first, in all requests of an episode
+        images, text = _count(begin, tokens)
+        more_images, more_text = _count([form.next_turn(observation, extractor)], tokens)
+        requests += config.episodes * steps
+        image_tokens += config.episodes * (steps * images + later * more_images)
+        text_tokens += config.episodes * (steps * text + later * more_text)
+    estimate = (
+        f"{requests:,} requests, {image_tokens:,} tokens of images and {text_tokens:,} of text, if episodes "
+        "take as many steps as the oracle; failures take more, and answers come on top"
+    )
+    page = render_page("chat", model=models[0], turns=first, estimate=estimate, points=form.points)
+    return atomic_write_file(config.out / PREVIEW_NAME, page), estimate
+
+
+def _count(turns: Sequence[Turn], tokens: Tokens) -> tuple[int, int]:
+    """Return the tokens of the images and of the text."""
+    parts = [part for turn in turns for part in turn.parts]
+    sizes = [Image.open(BytesIO(part)).size for part in parts if isinstance(part, bytes)]
+    images = sum(tokens(width, height) for width, height in sizes)
+    return images, sum(len(part) for part in parts if isinstance(part, str)) // _CHARACTERS_PER_TOKEN

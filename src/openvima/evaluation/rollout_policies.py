@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from openvima.detector.plugins import plugged_extractor
+from openvima.detector.plugins import chat_extractor, plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import (
     AnswerError,
@@ -30,7 +30,7 @@ from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene import Action
 from openvima.scene.action import END_EFFECTOR, PRIMITIVES, ToolCommand
 from openvima.scene.explanation import Explanation
-from openvima.serving.chat import DEFAULT_VLM, SEGMENTATION, ChatClient, VlmConfig, VlmPolicy
+from openvima.serving.chat import DEFAULT_VLM, ChatClient, VlmConfig, VlmPolicy
 from openvima.serving.client import RemotePolicy
 from openvima.user_code import described
 
@@ -350,9 +350,7 @@ def build_policy(
     if ref.kind == "remote":
         return RemotePolicy(source)
     if ref.kind == "vlm":
-        detects = vlm.options.boxes not in ("", SEGMENTATION)
-        extractor = plugged_extractor(vlm.options.boxes) if detects else None
-        return VlmPolicy(ChatClient(ref.model, vlm), extractor)
+        return VlmPolicy(ChatClient(ref.model, vlm), chat_extractor(vlm.options.boxes))
     if precision:
         import torch
 

@@ -19,16 +19,15 @@ import numpy as np
 
 from openvima.atomic_io import atomic_write_file
 from openvima.data.chat import MOST_CHARACTERS, ChatFormat, Turn, family_of, tool_in, wording_hash
-from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
+from openvima.data.chat_settings import DEFAULT_OPTIONS, SEGMENTATION, ChatView, VlmOptions
 from openvima.errors import AnswerError, ConfigError, LimitReachedError, PolicyError, ServerError, echo
 from openvima.imports import import_extra
-from openvima.perception.objects import GROUND_TRUTH, ObjectExtractor
+from openvima.perception.objects import ObjectExtractor
 from openvima.policies.base import Policy
 from openvima.scene import RenderedPrompt
 from openvima.scene.explanation import Explanation
 
 KEY_VARIABLE, URL_VARIABLE = "OPENAI_API_KEY", "OPENAI_BASE_URL"
-SEGMENTATION = "segmentation"
 _LEAST_SECRET = 12  # characters of a key that is kept out of texts
 _RETRIES = 12  # with pauses of up to 8 s, or what the server asks for: a minute and more
 _TIMEOUT_S, _CONNECT_S = 600.0, 10.0
@@ -57,10 +56,9 @@ class VlmConfig:
 
     def __post_init__(self) -> None:
         ChatFormat(view=self.view)
-        if self.base_url is not None and not self.base_url.startswith(("http://", "https://")):
-            raise ConfigError(
-                f"base_url is {echo(self.base_url)!r}; give one such as http://127.0.0.1:8000/v1."
-            )
+        url = self.base_url
+        if url is not None and not url.startswith(("http://", "https://")):
+            raise ConfigError(f"base_url is {echo(url)!r}; give one such as http://127.0.0.1:8000/v1.")
 
     @property
     def server(self) -> str:
@@ -80,31 +78,20 @@ class VlmConfig:
 
     def record(self, model: str) -> dict[str, Any]:
         """Return what the answers of a model depend on, as plain JSON values."""
-        options = asdict(self.options)
-        for name in ("concurrency", "max_requests", "max_tokens", "points", "enlarge"):
-            del options[name]
-        return {
-            "model": model,
-            "server": self.server,
-            **asdict(self.format_of(model)),
-            **options,
-            "modalities": list(self.modalities),
-            "wording": wording_hash(),
+        options = {
+            name: getattr(self.options, name) for name in ("boxes", "shots", "free_text", "temperature")
         }
+        what = {"model": model, "server": self.server, **asdict(self.format_of(model)), **options}
+        return {**what, "modalities": list(self.modalities), "wording": wording_hash()}
 
 
 DEFAULT_VLM = VlmConfig()
 
 
 def require_extra() -> Any:
-    """Import the client's package.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
-    return import_extra(
-        "openai", "policies vlm:MODEL need openai; install it with: pip install 'openvima[vlm]'"
-    )
+    """Import the client's package; a `MissingExtraError` says how to install it."""
+    advice = "policies vlm:MODEL need openai; install it with: pip install 'openvima[vlm]'"
+    return import_extra("openai", advice)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +114,7 @@ class Answer:
     tokens_in: int
     tokens_out: int
     seconds: float
-    left_out: tuple[str, ...] = ()
+    left_out: list[str]
 
 
 class ChatClient:
@@ -154,7 +141,7 @@ class ChatClient:
         self._lock = threading.Lock()
         self.is_stopped = False  # set to ask nothing more
         self._is_reached = False
-        self._left_out: tuple[str, ...] = ()
+        self._left_out: list[str] = []
 
     def ask(self, turns: Sequence[Turn], schema: Mapping[str, Any]) -> Answer:
         """Ask for the next message of a conversation.
@@ -174,14 +161,12 @@ class ChatClient:
         folder = self.config.answers
         path = None if folder is None else folder / request[:2] / f"{request}.json"
         if path is not None and path.is_file():
-            record = json.loads(path.read_text(encoding="utf-8"))
-            return Answer(**{**record, "left_out": tuple(record["left_out"])})
+            return Answer(**json.loads(path.read_text(encoding="utf-8")))
         self._reserve()
         answer = self._asked(settings, messages, request)
         with self._lock:
             self.num_tokens += answer.tokens_in + answer.tokens_out
         if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
             atomic_write_file(path, json.dumps(asdict(answer)) + "\n")
         return answer
 
@@ -230,10 +215,8 @@ class ChatClient:
 
     def _asked(self, settings: Mapping[str, Any], messages: bytes, request: str) -> Answer:
         """Ask the server; where it refuses a request, ask without the settings that it may not know."""
-        openai, refusal = self._openai, None
-        optional = [name for name in _OPTIONAL if name in settings and name not in self._left_out]
-        for count in range(len(optional) + 1):
-            left_out = (*self._left_out, *optional[:count])
+        openai, left_out = self._openai, self._left_out
+        while True:
             sent = json.dumps({name: value for name, value in settings.items() if name not in left_out})
             content = f"{sent[:-1]}, ".encode() + messages
             started = time.perf_counter()
@@ -241,7 +224,10 @@ class ChatClient:
                 # Not `chat.completions.create`, which walks through the images: a third of a step's time.
                 said = self._client.post("/chat/completions", cast_to=object, content=content)
             except (openai.BadRequestError, openai.UnprocessableEntityError) as error:
-                refusal = refusal or error
+                optional = [name for name in _OPTIONAL if name in settings and name not in left_out]
+                if not optional:
+                    raise self._refusal(error, messages) from None
+                left_out = [*left_out, optional[0]]
                 continue
             except openai.APIStatusError as error:
                 raise self._refusal(error) from None
@@ -254,10 +240,8 @@ class ChatClient:
                 said = str(error)
             self._left_out = left_out
             return self._answer(said, request, time.perf_counter() - started, left_out)
-        assert refusal is not None  # it was refused each time
-        raise self._refusal(refusal, messages)
 
-    def _answer(self, said: Any, request: str, seconds: float, left_out: tuple[str, ...]) -> Answer:
+    def _answer(self, said: Any, request: str, seconds: float, left_out: list[str]) -> Answer:
         """Take out of a response what counts; servers differ in what they leave out."""
         names = ("reasoning", "reasoning_content", "content")
         words = (_found(said, "choices", 0, "message", name) for name in names)
@@ -266,17 +250,16 @@ class ChatClient:
             text = text.replace(self._key, "…")
         counts = (_found(said, "usage", name) for name in ("prompt_tokens", "completion_tokens"))
         tokens_in, tokens_out = (count if isinstance(count, int) and count > 0 else 0 for count in counts)
-        name = echo(str(_found(said, "model") or self.model))
-        return Answer(
-            request, text[-MOST_CHARACTERS:], name, tokens_in, tokens_out, round(seconds, 3), left_out
-        )
+        name, text = echo(str(_found(said, "model") or self.model)), text[-MOST_CHARACTERS:]
+        return Answer(request, text, name, tokens_in, tokens_out, round(seconds, 3), left_out)
 
     def _refusal(self, error: Any, messages: bytes = b"") -> ServerError:
         """Compose the error for a request that the server refused."""
         status = error.status_code
+        key = f"the key is that of the environment variable {KEY_VARIABLE}"
         hint = {
-            401: f"the key is that of the environment variable {KEY_VARIABLE}",
-            403: f"the key is that of the environment variable {KEY_VARIABLE}",
+            401: key,
+            403: key,
             404: f"is {echo(self.model)!r} a model of it, and --base-url complete, such as http://HOST:PORT/v1?",
             429: "it is busy, or what was paid for is used up; the same command goes on where this ended",
         }.get(status, "")
@@ -320,15 +303,14 @@ class VlmPolicy(Policy):
 
     Args:
         client: The model's.
-        extractor: Finds the objects whose boxes are listed, unless the segmentation does; None lists none.
+        extractor: Finds the objects whose boxes are listed; None lists none.
 
     Example: `VlmPolicy(ChatClient("qwen3-vl", VlmConfig("http://127.0.0.1:8000/v1")))`
     """
 
     def __init__(self, client: ChatClient, extractor: ObjectExtractor | None = None) -> None:
-        self.client = client
+        self.client, self.extractor = client, extractor
         self.modalities = client.config.modalities
-        self.extractor = GROUND_TRUTH if "segm" in self.modalities else extractor
         self.format = client.config.format_of(client.model)
         self.shots: tuple[Turn, ...] = ()  # conversations that come before those of the episodes
         self._chats: list[_Chat] = []

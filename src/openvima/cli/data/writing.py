@@ -283,24 +283,22 @@ def export_chat(
         Exit status.
     """
     from openvima.data.chat import ChatFormat
-    from openvima.data.chat_export import ChatExportConfig
     from openvima.data.chat_export import export_chat as write_export
-    from openvima.detector.plugins import plugged_extractor
-    from openvima.perception.objects import GROUND_TRUTH
-    from openvima.serving.chat import SEGMENTATION
+    from openvima.detector.plugins import chat_extractor
 
-    config = ChatExportConfig(
-        data=folder,
-        out=out,
-        format=format,
-        tasks=parse_tasks(tasks),
-        form=ChatFormat(points, view, enlarge),
-        questions=questions,
-        seed=seed,
-    )
-    extractor = GROUND_TRUTH if boxes == SEGMENTATION else plugged_extractor(boxes) if boxes else None
     with progress_bar("export") as report:
-        print(write_export(config, extractor, report))
+        written = write_export(
+            folder,
+            out,
+            format=format,
+            tasks=parse_tasks(tasks),
+            form=ChatFormat(points, view, enlarge),
+            extractor=chat_extractor(boxes),
+            questions=questions,
+            seed=seed,
+            report=report,
+        )
+    print(written)
     return 0
 
 
