@@ -14,13 +14,11 @@ ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^```python(.*?)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 EXAMPLES = {file.read_text(encoding="utf-8") for file in ROOT.glob("examples/*.py")}
 # Pages whose blocks run in tests of their own, which also check what they give.
-ELSEWHERE = {"format", "midas", "policies", "reinforcement_learning", "studies"}
+ELSEWHERE = {"format", "policies", "reinforcement_learning", "studies"}
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BEGINNINGS = {  # page to the example that it begins with
     "compose": "compose_a_scene",
     "explain": "explain_a_decision",
-    "observations": "joints_and_depth",
-    "prompts": "language_prompts",
     "your_own_objects": "custom_object",
     "your_own_policy": "own_network",
     "your_own_task": "custom_task",
