@@ -1,6 +1,7 @@
 """The loss on which object is picked and at which one it is placed, and positions that are read from it."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,15 @@ import pytest
 import torch
 
 from openvima.errors import ConfigError
+from openvima.policies.build import build_network
 from openvima.policies.nn.action_head import ObservationTokens, add_pointing, point_at_objects, pointing_loss
 from openvima.policies.nn.actions import PLACE_NEAR_M, ActionTargets, greedy
 from openvima.policies.presets import preset
+from openvima.policies.processor import Processor
 from openvima.policies.variants import with_variant
 from openvima.training import TrainingConfig
 from openvima.training.building import build_learner, resolve
+from small_networks import collate_examples, examples_of
 
 B, T, Q, D = 2, 3, 5, 8
 
@@ -115,3 +119,19 @@ def test_pointing_needs_the_loss_that_teaches_it():
         TrainingConfig.of({**settings, "optimizer.pointing_loss_weight": 1.0}), []
     ).network
     assert network.head.points
+
+
+def test_what_is_measured_in_training_is_what_the_policy_does(demonstrations):
+    network = build_network(replace(preset("vima-nano"), points=True), seed=0).eval()
+    processor = Processor.of(network.config.inputs)
+    examples, images = examples_of(demonstrations, processor)
+    batch = collate_examples(processor, examples)
+    with torch.no_grad():
+        features = network.encode_images(images)
+        prompt = network.encode_prompt(batch.prompts, features)
+        observations = network.observe(batch.history, features)
+        cache = network.init_cache(prompt)
+        *_, actions = network.head.loss(network.decoder, cache, observations, batch.targets)
+    picks = actions[..., None, :2].to(observations.points_BTQ2)
+    distances = (picks - observations.points_BTQ2).norm(dim=-1).amin(-1)
+    assert distances[batch.targets.steps_BT].max() < 1e-6

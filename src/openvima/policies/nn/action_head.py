@@ -136,7 +136,10 @@ class ActionHead(nn.Module):
         previous = self._segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
         outputs_BTQD, _ = decode_observations(decoder, cache, observations, previous)
         query_BTD = observations.query(outputs_BTQD)
-        found = self.action_loss(query_BTD, targets)
+        loss, metrics, actions_BTC = self.action_loss(query_BTD, targets)
+        if self.points:
+            actions_BTC = point_at_objects(actions_BTC, query_BTD, observations, greedy)
+        found = loss, metrics, actions_BTC
         return add_pointing(found, self.pointing_weight, query_BTD, query_BTD, observations, targets)
 
     def decode_step(
