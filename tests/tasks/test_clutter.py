@@ -6,10 +6,10 @@ import pytest
 
 from openvima.catalog import object_spec, tasks_at
 from openvima.catalog.textures import NEUTRAL_TEXTURE
-from openvima.scene import ObjectImage, Placement, Problem
+from openvima.scene import AtPose, ObjectImage, Placement, Problem
 from openvima.tasks import sample_episode
 from openvima.tasks.clutter import LEAST, MOST
-from task_cases import judge_step
+from task_cases import judge_step, judged
 
 CASES = [(task, seed) for task in tasks_at("L5") for seed in range(4)]
 NUM_TWINS = {"novel_adj": {"dragged_obj": 2}}  # of one shape; the adjective tells them apart
@@ -73,3 +73,19 @@ def test_words_and_relations_fit_the_objects_of_the_goals_alone(seed: int) -> No
 
     there = [p for p in neighbour.scene.placements if offset(p)[0] > offset(p)[1]]
     assert min(there, key=lambda p: sum(offset(p))) == meant
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_target_has_to_be_cleared_before_objects_are_rearranged(seed: int) -> None:
+    problem = sample_episode("rearrange", level="L5", seed=seed, domain="eval").problem
+    (clearing,) = problem.prerequisites
+    (target,) = {
+        goal.object_id: goal.target
+        for goal in problem.goals
+        if isinstance(goal, AtPose)
+        and goal.target.planar_distance(problem.scene[clearing.object_id].pose) < 0.01
+    }.values()
+    moves = {goal.object_id: goal.target for goal in problem.goals if isinstance(goal, AtPose)}
+    assert judged(problem, moves)[1].failure
+    assert judged(problem, {clearing.object_id: clearing.target}, moves)[1].success
+    assert clearing.target.planar_distance(target) > 0.1

@@ -4,7 +4,8 @@ A task is sampled as at L3, then objects are added that its prompt does not mean
 in `MEANT_BY`; an added object differs from all that are meant in that attribute, so that the prompt has
 one reading as before. Two thirds share a shape or a texture with an object of the goals; the first is tall
 and stands, where there is room, between such an object and the front camera. Where six bases fill the table,
-objects lie in those that are not meant.
+objects lie in those that are not meant. To rearrange means to clear: an object of the same shape is where one
+of those shown is to go.
 """
 
 import contextlib
@@ -59,6 +60,9 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
     Raises:
         SamplingError: Fewer than four objects found a place.
     """
+    num_before, count = len(table.placements), int(table.rng.integers(LEAST + 3, MOST + 1))
+    if task == "rearrange" and not problem.prerequisites:
+        problem = _occupy_a_target(table, problem)
     scene, goals = problem.scene, problem.goals
     moved = [scene[i] for i in dict.fromkeys(object_of(goal) for goal in goals) if i is not None]
     bases = [scene[i] for i in {getattr(goal, "relative_to", None) for goal in goals} if i is not None]
@@ -85,7 +89,6 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
             new = table.place_one("clutter", draw, tries=tries, scale=scale, reject=reject)
             forbidden.add((new.object, new.texture))
 
-    num_before, count = len(table.placements), int(table.rng.integers(LEAST + 3, MOST + 1))
     free_bases = [p for p in scene.placements if p.fixed and p not in bases]
     for base in free_bases if task == "pick_in_order_then_restore" else ():
         shape, texture = draw(BASES)
@@ -109,6 +112,21 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
     at_end = any(isinstance(c, DistractorsApart) and c.at_end for c in problem.constraints)
     new = [ZoneKeptClear(added, zone) for zone in zones] or [DistractorsApart(added, at_end=at_end)]
     return replace(problem, scene=table.scene(), constraints=(*problem.constraints, *new))
+
+
+def _occupy_a_target(table: TableSampler, problem: Problem) -> Problem:
+    """Place a look-alike on the target of an object; the oracle clears it first."""
+    goal = table.choose([goal for goal in problem.goals if isinstance(goal, AtPose)])
+    like = problem.scene[goal.object_id]
+    taken = [p.texture for p in problem.scene.placements if p.object == like.object]
+    texture = table.choose([texture for texture in TEXTURES if texture not in taken])
+    blocks = _blocks_for("rearrange", problem, [])
+    new = table.add(like.object, texture, size=like.size, pose=goal.target, fixed=False)
+    if any(is_in_the_way(new, other) for other in problem.scene.placements):
+        raise SamplingError("the object on the target crowds another.")
+    place = table.find_place("parking place", new, tries=_HIDING_TRIES, reject=blocks)
+    clearing = AtPose(new.id, place.pose, goal.tolerance)
+    return replace(problem, scene=table.scene(), prerequisites=(clearing,))
 
 
 def _hides(new: Placement, hidden: Placement) -> bool:
