@@ -48,8 +48,6 @@ _NOT_STARTED = (
 # In a worker: the shared array of counts.
 _counters: Any = None
 
-Counts = Sequence[Sequence[int]]
-"""The numbers last passed to `count`, one row per job; zeros before it starts."""
 Report = Callable[[int, int, str], None]
 """Called with the number of things done, that of all, and a note."""
 
@@ -57,7 +55,7 @@ Report = Callable[[int, int, str], None]
 class Job(Protocol):
     """A function of one item that calls `count` with the number of things done so far."""
 
-    def __call__(self, item: Any, count: Callable[..., None], /) -> Any:
+    def __call__(self, item: Any, count: Callable[[int], None], /) -> Any:
         """Run the job."""
 
 
@@ -80,54 +78,28 @@ def imap_unordered(
         WorkerError: A worker was killed, or none could start.
         Exception: Any exception of a job; the other jobs are stopped.
     """
-    watch = None if report is None else (lambda counts: report(sum(row[0] for row in counts)))
-    yield from imap_with_progress(job, items, num_workers, watch=watch)
-
-
-def imap_with_progress(
-    job: Job,
-    items: Sequence[Any],
-    num_workers: int,
-    *,
-    num_counts: int = 1,
-    watch: Callable[[Counts], None] | None = None,
-) -> Iterator[tuple[Any, Any]]:
-    """Like `imap_unordered`, with separate counts for each job.
-
-    Args:
-        job: Calls `count` with `num_counts` numbers.
-        items: Its arguments.
-        num_workers: Number of processes.
-        num_counts: Numbers that a job counts.
-        watch: Called repeatedly with the counts of all jobs, in the order of the items.
-
-    Yields:
-        An item and its result, as they finish.
-    """
     check_workers(num_workers)
-    watch = watch or (lambda counts: None)
+    report = report or (lambda done: None)
     if num_workers == 1 or len(items) <= 1:
-        yield from _run_serially(job, items, num_counts, watch)
+        yield from _run_serially(job, items, report)
         return
     context = multiprocessing.get_context("spawn")
-    # One row per job, and whether a worker has started: no lock that a killed worker could hold.
-    counters = context.RawArray("q", len(items) * num_counts + 1)
+    # One number per job, and whether a worker has started: no lock that a killed worker could hold.
+    counters = context.RawArray("q", len(items) + 1)
     others = set(multiprocessing.active_children())
     with single_threaded_workers():
         pool = ProcessPoolExecutor(
             min(num_workers, len(items)), mp_context=context, initializer=_start_worker, initargs=(counters,)
         )
         try:
-            pending = {
-                pool.submit(_run_one, job, item, slot, num_counts): item for slot, item in enumerate(items)
-            }
+            pending = {pool.submit(_run_one, job, item, slot): item for slot, item in enumerate(items)}
             while pending:
                 done, _ = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
                 for future in done:
                     result, found = future.result()
                     _warn(found)
                     yield pending.pop(future), result
-                watch(_rows(counters, num_counts))
+                report(sum(counters[:-1]))
         except BrokenProcessPool:
             raise WorkerError(_KILLED if counters[-1] else _NOT_STARTED) from None
         except BaseException:  # a job's own error, or Ctrl-C
@@ -157,17 +129,17 @@ def check_workers(num_workers: int) -> None:
         raise ConfigError(f"workers is {num_workers}; it must lie within 1 … {MAX_WORKERS}.")
 
 
-def _run_serially(
-    job: Job, items: Sequence[Any], num_counts: int, watch: Callable[[Counts], None]
-) -> Iterator[tuple[Any, Any]]:
-    counts: list[tuple[int, ...]] = [(0,) * num_counts] * len(items)
-    for slot, item in enumerate(items):
+def _run_serially(job: Job, items: Sequence[Any], report: Callable[[int], None]) -> Iterator[tuple[Any, Any]]:
+    before = last = 0
 
-        def count(*numbers: int, slot: int = slot) -> None:
-            counts[slot] = numbers
-            watch(counts)
+    def count(number: int) -> None:
+        nonlocal last
+        last = number
+        report(before + number)
 
+    for item in items:
         yield item, job(item, count)
+        before, last = before + last, 0
 
 
 @contextlib.contextmanager
@@ -237,12 +209,11 @@ def _start_worker(counters: Any) -> None:
     init_worker()
 
 
-def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> tuple[Any, list[UnknownWordWarning]]:
+def _run_one(job: Job, item: Any, slot: int) -> tuple[Any, list[UnknownWordWarning]]:
     """Run a job in a worker; return its result, and the unknown words to warn of where all come together."""
-    first = slot * num_counts
 
-    def count(*numbers: int) -> None:
-        _counters[first : first + num_counts] = numbers
+    def count(number: int) -> None:
+        _counters[slot] = number
 
     with unknown_words() as found:
         return job(item, count), found
@@ -252,11 +223,6 @@ def _warn(found: Sequence[UnknownWordWarning]) -> None:
     """Warn in this process of what a worker found."""
     for warning in found:
         warnings.warn(warning, stacklevel=3)
-
-
-def _rows(counters: Any, num_counts: int) -> Counts:
-    flat = counters[:-1]
-    return [flat[first : first + num_counts] for first in range(0, len(flat), num_counts)]
 
 
 RAY_POLL_S = 0.5
@@ -274,8 +240,7 @@ def ray_imap_unordered(
     num_workers: int | None,
     *,
     address: str | None = None,
-    num_counts: int = 1,
-    watch: Callable[[Counts], None] | None = None,
+    report: Callable[[int], None] | None = None,
 ) -> Iterator[tuple[Any, Any]]:
     """Apply a job to every item on a Ray cluster and yield the results as they finish.
 
@@ -288,8 +253,7 @@ def ray_imap_unordered(
         num_workers: Concurrent jobs; None: one per CPU of the cluster.
         address: "HOST:PORT" of the cluster's head, "ray://HOST:PORT", or "auto". None uses the Ray
             session of this process, or starts one on this machine and stops it at the end.
-        num_counts: Numbers that a job counts.
-        watch: Called repeatedly with the counts of all jobs, in the order of the items.
+        report: Called repeatedly with the sum of all counts.
 
     Yields:
         An item and its result, as they finish.
@@ -303,7 +267,7 @@ def ray_imap_unordered(
     """
     ray = _import_ray()
     with _connected(ray, address, num_workers):
-        yield from _run_all(ray, job, items, num_workers or len(items), num_counts, watch or (lambda _: None))
+        yield from _run_all(ray, job, items, num_workers or len(items), report or (lambda done: None))
 
 
 def _import_ray() -> ModuleType:
@@ -367,10 +331,9 @@ def _run_all(
     job: Job,
     items: Sequence[Any],
     num_workers: int,
-    num_counts: int,
-    watch: Callable[[Counts], None],
+    report: Callable[[int], None],
 ) -> Iterator[tuple[Any, Any]]:
-    counts: list[tuple[int, ...]] = [(0,) * num_counts] * len(items)
+    counts = [0] * len(items)
     # On the machine of this process, without which nothing goes on anyway.
     strategies = importlib.import_module("ray.util.scheduling_strategies")
     here = strategies.NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
@@ -389,20 +352,19 @@ def _run_all(
             for reference in done:
                 slot = running.pop(reference)
                 try:
-                    result, numbers, found = ray.get(reference)
+                    result, counts[slot], found = ray.get(reference)
                 except _lost(ray):
                     deaths[slot] += 1
                     if deaths[slot] > RETRIES:
                         raise
                     waiting.appendleft(slot)
                     continue
-                counts[slot] = numbers or counts[slot]
                 _warn(found)
                 yield items[slot], result
-            for slot, numbers in ray.get(progress.read.remote()).items():
+            for slot, number in ray.get(progress.read.remote()).items():
                 if slot in running.values():
-                    counts[slot] = numbers
-            watch(counts)
+                    counts[slot] = number
+            report(sum(counts))
     except ray.exceptions.RayTaskError as error:
         if isinstance(error.cause, ray.exceptions.RayError):  # the job could not be unpickled
             raise ConfigError(
@@ -452,28 +414,25 @@ class _ProgressActor:
     """Actor that holds the counts of running jobs."""
 
     def __init__(self) -> None:
-        self._counts: dict[int, tuple[int, ...]] = {}
+        self._counts: dict[int, int] = {}
 
-    def write(self, slot: int, numbers: tuple[int, ...]) -> None:
-        self._counts[slot] = numbers
+    def write(self, slot: int, number: int) -> None:
+        self._counts[slot] = number
 
-    def read(self) -> dict[int, tuple[int, ...]]:
+    def read(self) -> dict[int, int]:
         return self._counts
 
 
-def _run_counted(
-    job: Job, item: Any, slot: int, progress: Any
-) -> tuple[Any, tuple[int, ...], list[UnknownWordWarning]]:
-    """Run a job in a worker; return its result, its last counts and its unknown words."""
-    last: tuple[int, ...] = ()
-    next_s = 0.0
+def _run_counted(job: Job, item: Any, slot: int, progress: Any) -> tuple[Any, int, list[UnknownWordWarning]]:
+    """Run a job in a worker; return its result, its last count and its unknown words."""
+    last, next_s = 0, 0.0
 
-    def count(*numbers: int) -> None:
+    def count(number: int) -> None:
         nonlocal last, next_s
-        last = numbers
+        last = number
         if time.monotonic() >= next_s:
             next_s = time.monotonic() + COUNT_INTERVAL_S
-            progress.write.remote(slot, numbers)
+            progress.write.remote(slot, number)
 
     with unknown_words() as found:
         return job(item, count), last, found

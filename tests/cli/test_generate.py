@@ -1,15 +1,12 @@
 """`openvima generate`: flags reach the library, and progress fits where it is shown."""
 
-import io
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
-from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.cli.main import main
-from openvima.cli.terminal import Pace, generation_table, plain_lines, table_of
-from openvima.data import Dataset, GenerationProgress, Shard, TaskProgress
+from openvima.cli.terminal import Pace, plain_lines
+from openvima.data import Dataset, Shard
 
 WORDS = ["generate", "--tasks", "rotate", "--episodes", "5"]
 
@@ -56,23 +53,6 @@ def test_wrong_input_is_one_line_and_status_2(
     assert not (tmp_path / "out").exists()
 
 
-def progress(done: int, total: int = 1000) -> GenerationProgress:
-    return GenerationProgress((TaskProgress("rotate", done, total, done, 2 * done, 3),))
-
-
-def test_without_a_terminal_generating_prints_a_first_and_a_last_line(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with generation_table() as report:
-        for done in range(1001):
-            report(progress(done))
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert lines[0] == "demonstrations: 0 of 1,000 (0 %)"
-    assert lines[1].startswith("demonstrations: 1,000 of 1,000 (100 %), ")
-    assert lines[1].endswith(" episodes/s; 50.0 % of the seeds solved")
-
-
 def test_without_a_terminal_progress_is_a_line_at_each_stage_and_each_minute(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -97,23 +77,6 @@ def test_less_than_one_a_second_is_a_number_a_minute(capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err.splitlines()[1] == "evaluation: 16 of 32 (50 %), 10.7/min, 0:01:30 left"
 
 
-def test_a_run_with_nothing_to_do_says_that_it_is_done(capsys: pytest.CaptureFixture[str]) -> None:
-    with generation_table() as report:
-        report(GenerationProgress((TaskProgress("rotate", 5, 5),)))
-    assert capsys.readouterr().err == "demonstrations: 5 of 5 (100 %)\n"
-
-
-def test_all_tasks_fit_a_small_terminal() -> None:
-    tasks = tuple(TaskProgress(task, 10**6, 10**7, 10**6, 10**7, 10**7) for task in PUBLISHED_TASKS)
-    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
-    console.print(table_of(GenerationProgress(tasks), Pace()))
-    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # a StringIO
-    assert len(lines) <= 22
-    for task in tasks:
-        line = next(line for line in lines if line.startswith(f"{task.task} "))
-        assert all(word in line for word in ("1,000,000", "10,000,000", "10.0 %"))
-
-
 def test_the_pace_leaves_out_the_start_of_the_workers() -> None:
     now = iter([40.0, 100.0, 102.0, 104.0])
     pace = Pace(lambda: next(now))
@@ -122,4 +85,4 @@ def test_the_pace_leaves_out_the_start_of_the_workers() -> None:
     for written in (10, 30, 60):
         pace.update(written)
     assert pace.rate == 12.5
-    assert pace.summary(60, 45_060, " episodes") == "60 of 45,060 (0 %), 12.5 episodes/s, 1:00:00 left"
+    assert pace.summary(60, 45_060) == "60 of 45,060 (0 %), 12.5/s, 1:00:00 left"

@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 import worker_jobs
-from openvima.data import GenerateConfig, GenerationProgress, generate, plan
+from openvima.data import GenerateConfig, generate, plan
 from openvima.data.manifest import is_finished
 from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
 from openvima.multiprocess import ray_imap_unordered
@@ -41,17 +41,17 @@ def ray() -> Iterator[ModuleType]:
 
 @pytest.mark.slow
 def test_two_workers_do_not_change_a_byte(whole: Path, tmp_path: Path) -> None:
-    reports: list[GenerationProgress] = []
-    generate(config(tmp_path, workers=2), reports.append)
+    reports: list[tuple[int, int, str]] = []
+    generate(config(tmp_path, workers=2), lambda *report: reports.append(report))
     assert contents(tmp_path) == contents(whole)
-    assert (reports[0].done, reports[-1].done, reports[-1].total) == (0, 6, 6)
+    assert (reports[0], reports[-1]) == ((0, 6, ""), (6, 6, ""))
 
 
 @pytest.mark.slow
 def test_ray_stopped_by_hand_leaves_whole_files_and_is_continued(
     whole: Path, tmp_path: Path, ray: ModuleType
 ) -> None:
-    def stop(progress: GenerationProgress) -> None:
+    def stop(*_: object) -> None:
         if any(tmp_path.rglob("*.arrow")):  # episodes are reported before their file is whole
             raise KeyboardInterrupt
 
@@ -71,12 +71,10 @@ def test_jobs_on_ray_use_one_thread_each(
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     counts = []
     paths = [tmp_path / str(k) for k in range(3)]
-    done = list(
-        ray_imap_unordered(worker_jobs.write_number, paths, 2, watch=lambda rows: counts.append(list(rows)))
-    )
+    done = list(ray_imap_unordered(worker_jobs.write_number, paths, 2, report=counts.append))
     assert sorted(item for item, _ in done) == paths
     assert [path.read_text() for path in paths] == ["1"] * 3
-    assert counts[-1] == [(3,), (3,), (3,)]
+    assert counts[-1] == 9
 
 
 def test_an_error_of_a_job_on_ray_reaches_the_caller(ray: ModuleType) -> None:
@@ -124,11 +122,11 @@ def test_ranges_of_shards_in_any_order_make_the_same_data_set(whole: Path, tmp_p
 
 
 def test_a_range_of_shards_is_all_that_is_written_and_reported(tmp_path: Path) -> None:
-    reports: list[GenerationProgress] = []
-    generate(config(tmp_path, shard_range=(1, 3)), reports.append)
+    reports: list[tuple[int, int, str]] = []
+    generate(config(tmp_path, shard_range=(1, 3)), lambda *report: reports.append(report))
     names = [block.path.name for block in plan(config(tmp_path))]
     assert sorted(contents(tmp_path)) == names[1:3]
-    assert [task.total for task in reports[-1].tasks] == [1, 2]
+    assert reports[-1] == (3, 3, "")
 
 
 def test_the_plain_command_finishes_what_ranges_began(whole: Path, tmp_path: Path) -> None:
@@ -171,7 +169,7 @@ def test_large_shards_are_handed_out_first(tmp_path: Path) -> None:
     asked = GenerateConfig(out=tmp_path, tasks=("rotate",), episodes=21)
     order: list[str] = []
 
-    def note(progress: GenerationProgress) -> None:
+    def note(*_: object) -> None:
         order.extend(sorted({path.name for path in tmp_path.glob("*.arrow")} - set(order)))
 
     generate(asked, note)

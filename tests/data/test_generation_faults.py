@@ -17,7 +17,7 @@ import pytest
 
 import generation_server
 from openvima.cli.main import main
-from openvima.data import Dataset, GenerationProgress, generate
+from openvima.data import Dataset, generate
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, ShardError, StorageError
 from small_data_sets import TASKS, config, contents
@@ -148,8 +148,8 @@ def test_the_command_killed_with_its_workers_is_continued(whole: Path, tmp_path:
 
 
 def test_a_run_stopped_by_hand_leaves_whole_files_and_is_continued(whole: Path, tmp_path: Path) -> None:
-    def stop(progress: GenerationProgress) -> None:
-        if progress.done == 3:  # in the middle of the writing of the second shard
+    def stop(done: int, total: int, note: str) -> None:
+        if done == 3:  # in the middle of the writing of the second shard
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -222,7 +222,7 @@ def test_a_quota_reached_while_writing_loses_no_finished_shard(
     assert f"cannot write to {tmp_path}: File too large. 2 of 4 shards are whole and were kept" in message
     assert "same command then goes on" in message
     there = contents(tmp_path)
-    assert there.pop(".dataset.json.old") == before["dataset.json"]
+    del before["dataset.json"]
     assert there.items() <= before.items()
     assert {f"{task}-train-00000.arrow" for task in TASKS} <= there.keys()
     assert main(words) == 0

@@ -228,12 +228,12 @@ def _one_thread() -> "Iterator[None]":
 
 def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
     """Generate enough episodes for the frames."""
-    from openvima.cli.terminal import generation_table
+    from openvima.cli.terminal import progress_bar
     from openvima.data import GenerateConfig, generate
 
     config = GenerateConfig(out=folder, level=level, start_seed=seed)
     episodes = -(-frames // (FRAMES_PER_EPISODE * len(config.resolved_tasks())))
-    with generation_table() as report:
+    with progress_bar("demonstrations") as report:
         generate(GenerateConfig(out=folder, level=level, start_seed=seed, episodes=episodes), report)
 
 

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from openvima.cli.terminal import generation_table, parse_list, parse_shard_range, print_left_out
+from openvima.cli.terminal import parse_list, parse_shard_range, print_left_out, progress_bar
 
 
 def main(
@@ -96,7 +96,7 @@ def main(
         for number, block in enumerate(plan(config)):
             print(f"{number}\t{block.path.name}\t{block.episodes}")
         return 0
-    with generation_table() as report:
+    with progress_bar("demonstrations") as report:
         folder = generate(config, report)
     if is_finished(folder):
         print(f"`openvima data info {shlex.quote(str(folder))}` shows what is there.", file=sys.stderr)

@@ -110,14 +110,8 @@ def _ascii(letter: str) -> str:
     return "".join(c for c in plain if c.isascii()) or "?"
 
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from openvima.data import GenerationProgress
-
 Report = Callable[[int, int, str], None]
 LINE_S = 60.0  # between two lines of a stage, where stderr is no terminal
-REDRAW_S = 0.25
 
 
 @contextmanager
@@ -176,65 +170,32 @@ def progress_bar(label: str) -> Iterator[Report]:
         progress.stop()
 
 
-@contextmanager
-def generation_table() -> Iterator[Callable[["GenerationProgress"], None]]:
-    """Show how far generating is: rate, time left, and a line a task; a few plain lines if nobody watches.
-
-    Yields:
-        A callback for `openvima.data.generate`.
-    """
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        say = plain_lines("demonstrations", unit=" episodes")
-        yield lambda progress: say(progress.done, progress.total, _solved(progress), progress.written)
-        return
-    pace = Pace()
-    with Live(console=console, auto_refresh=False) as live:
-        drawn_s = 0.0
-
-        def report(progress: "GenerationProgress") -> None:
-            nonlocal drawn_s
-            pace.update(progress.written)
-            is_last = progress.done == progress.total
-            if is_last or time.monotonic() - drawn_s >= REDRAW_S:
-                drawn_s = time.monotonic()
-                live.update(table_of(progress, pace), refresh=True)
-
-        yield report
-
-
-def plain_lines(
-    label: str, *, unit: str = "", clock: Callable[[], float] = time.monotonic
-) -> Callable[..., None]:
+def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> Callable[..., None]:
     """Return a progress callback that prints lines: at each stage, once a minute, and at the end.
 
     Args:
         label: What is being done, in a word or two.
-        unit: Of what is counted, after a space.
         clock: Returns the time in seconds.
 
     Returns:
-        A callback `report(done, total, note)`. How many were done by this process may follow, for the rate.
+        A callback `report(done, total, note)`.
     """
     stage, stages_ended, shown_s, pace = None, set[str](), 0.0, Pace(clock)
 
-    def report(done: int, total: int, note: str, new: int | None = None) -> None:
+    def report(done: int, total: int, note: str) -> None:
         nonlocal stage, shown_s, pace
         now_s, before = clock(), stage
         word = note.partition(" ")[0].rstrip(":,")
         stage = word if any(map(str.isalpha, word)) else ""
         if stage != before:
             pace = Pace(clock)
-        pace.update(done if new is None else new)
+        pace.update(done)
         is_end = done == total and stage not in stages_ended
         if stage != before or is_end or now_s - shown_s >= LINE_S:
             shown_s = now_s
             if done == total:
                 stages_ended.add(stage)
-            text = f"{label}: {pace.summary(done, total, unit)}{f'; {note}' if note else ''}"
+            text = f"{label}: {pace.summary(done, total)}{f'; {note}' if note else ''}"
             print(text, file=sys.stderr, flush=True)
 
     return report
@@ -261,42 +222,14 @@ class Pace:
             if now_s > since_s and count > before:
                 self.rate = (count - before) / (now_s - since_s)
 
-    def summary(self, done: int, total: int, unit: str = "") -> str:
+    def summary(self, done: int, total: int) -> str:
         """Describe in a line how far it is, how fast, and how long it still takes."""
         text = f"{done:,} of {total:,}" + (f" ({100 * done // total} %)" if total else "")
         if self.rate is None:
             return text
-        speed = f"{self.rate:.1f}{unit}/s" if self.rate >= 1 else f"{60 * self.rate:.1f}{unit}/min"
+        speed = f"{self.rate:.1f}/s" if self.rate >= 1 else f"{60 * self.rate:.1f}/min"
         left = f", {_duration((total - done) / self.rate)} left" if done < total else ""
         return f"{text}, {speed}{left}"
-
-
-def _solved(progress: "GenerationProgress") -> str:
-    return f"{_percent(progress.written, progress.tried)} of the seeds solved" if progress.tried else ""
-
-
-def table_of(progress: "GenerationProgress", pace: Pace) -> "Table":
-    """Draw a line a task; 17 of them fit a terminal of 80 columns and 24 lines."""
-    from rich.table import Table
-
-    table = Table(
-        title=pace.summary(progress.done, progress.total, " episodes"),
-        title_justify="left",
-        box=None,
-        pad_edge=False,
-    )
-    table.add_column("task", no_wrap=True)
-    for name in ("done", "of", "solved", "resamples"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for task in progress.tasks:
-        counts = (
-            f"{task.done:,}",
-            f"{task.total:,}",
-            _percent(task.written, task.tried),
-            f"{task.redraws:,}",
-        )
-        table.add_row(task.task, *counts)
-    return table
 
 
 def _percent(part: int, whole: int) -> str:

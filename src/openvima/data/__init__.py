@@ -6,7 +6,7 @@ from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
     from openvima.data.generation import generate
-    from openvima.data.planning import GenerateConfig, GenerationProgress, TaskProgress, plan
+    from openvima.data.planning import GenerateConfig, plan
     from openvima.data.reader import Dataset
     from openvima.data.records import Demonstration, Step, rollout_oracle
     from openvima.data.shard import Shard, ShardWriter
@@ -18,11 +18,9 @@ _HOMES = {
     "Dataset": "reader",
     "Demonstration": "records",
     "GenerateConfig": "planning",
-    "GenerationProgress": "planning",
     "Shard": "shard",
     "ShardWriter": "shard",
     "Step": "records",
-    "TaskProgress": "planning",
     "VerifyConfig": "verification",
     "generate": "generation",
     "plan": "planning",
@@ -35,11 +33,9 @@ __all__ = [
     "Dataset",
     "Demonstration",
     "GenerateConfig",
-    "GenerationProgress",
     "Shard",
     "ShardWriter",
     "Step",
-    "TaskProgress",
     "VerifyConfig",
     "generate",
     "plan",

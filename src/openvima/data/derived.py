@@ -17,7 +17,6 @@ from openvima.data.manifest import (
     FAILED_FOLDER,
     INDEX_NAME,
     MANIFEST_NAME,
-    PREVIOUS_NAME,
     fingerprint,
 )
 from openvima.data.reader import Dataset
@@ -25,7 +24,7 @@ from openvima.data.shard import ShardWriter
 from openvima.errors import DatasetError, ShardError
 from openvima.multiprocess import Report, imap_unordered
 
-_NAMES = (MANIFEST_NAME, PREVIOUS_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
 
 
 def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:

@@ -119,7 +119,7 @@ class ShardInfo:
         there, here = ({**asdict(info), **info.versions} for info in (self, asked))
         names = [name for name in here if name not in ("task", "number", "versions")]
         return [
-            f"{name} is {there.get(name) or 'none'}, asked for is {here[name] or 'none'}"
+            f"{name} is {str(there.get(name, '')) or 'none'}, asked for is {str(here[name]) or 'none'}"
             for name in names
             if there.get(name) != here[name]
         ]

@@ -11,32 +11,26 @@ from openvima.data.encoding import ShardInfo, SkipKind, Skipped
 from openvima.data.manifest import (
     FAILED_FOLDER,
     MANIFEST_NAME,
-    ShardSummary,
     clear,
     finish_folder,
     is_finished,
-    read_previous_summaries,
     remove_leftovers,
-    set_aside,
     storage_error,
 )
 from openvima.data.planning import (
     COMMAND,
     DOMAIN,
-    NUM_COUNTS,
     Block,
     GenerateConfig,
-    Report,
-    make_watcher,
     plan,
 )
 from openvima.data.reader import read_manifest
 from openvima.data.records import Demonstration, rollout_oracle
-from openvima.data.shard import Shard, ShardWriter, list_spans
+from openvima.data.shard import Shard, ShardWriter, remedy
 from openvima.env import TabletopEnv
 from openvima.env.config import EnvConfig
-from openvima.errors import DatasetError, OracleError, SamplingError
-from openvima.multiprocess import Counts, imap_with_progress
+from openvima.errors import DatasetError, OracleError, SamplingError, ShardError
+from openvima.multiprocess import Report, imap_unordered
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
 
@@ -108,26 +102,28 @@ def _explain_surplus(found: ShardInfo, config: GenerateConfig) -> str:
     return f"its task {found.task} is not asked for"
 
 
-def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:
+def write_block(block: Block, count: Callable[[int], None]) -> None:
     """Write one shard, and one of its failed episodes if these are kept.
+
+    A smaller shard that is there is continued, unless its failed episodes are wanted now.
 
     Args:
         block: What to write.
-        count: Called with the numbers of episodes written, seeds tried, and redraws so far.
+        count: Called with the number of episodes written so far.
 
     Raises:
         OracleError: The oracle solved too few of the block's episodes.
         ShardError: A record that is to be copied is damaged.
     """
-    num_kept, num_redraws, skipped = 0, 0, []
+    num_kept, skipped = 0, []
     with contextlib.ExitStack() as files:  # closed in reverse: where a shard is, its failed episodes are too
         kept = files.enter_context(ShardWriter(block.path, block.info))
         failed: ShardWriter | None = None
-        if block.kept:
-            num_kept, next_seed = len(block.kept), _copy_kept(block, kept)
+        if block.path.is_file() and block.failed_path is None:
+            num_kept, next_seed = _copy_records(block.path, kept)
             rest = range(next_seed, block.seeds.stop)
             block = replace(block, episodes=block.episodes - num_kept, seeds=rest)
-        for num_tried, rollout in enumerate(rollouts(block), start=1):
+        for rollout in rollouts(block):
             if isinstance(rollout, Skipped):
                 skipped.append(rollout)
             elif rollout.outcome.success:
@@ -140,21 +136,23 @@ def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:
                         block.failed_path.parent.mkdir(exist_ok=True)
                         failed = files.enter_context(ShardWriter(block.failed_path, block.info))
                     failed.write(rollout)
-            num_redraws += 0 if isinstance(rollout, Skipped) else rollout.num_redraws
-            count(num_kept, num_tried, num_redraws)
+            count(num_kept)
 
 
-def _copy_kept(block: Block, writer: ShardWriter) -> int:
-    """Copy the records that a shard has already; return the seed to go on with.
+def _copy_records(path: Path, writer: ShardWriter) -> tuple[int, int]:
+    """Copy the records that a shard has already; return their number, and the seed to go on with.
 
     Raises:
         ShardError: One is damaged.
     """
-    shard = Shard(block.path)
-    for row, span in enumerate(block.kept):
-        shard.check(row, span)
-        writer.copy(shard.batch(row))
-    return shard.read(len(block.kept) - 1, ["seed"])["seed"] + 1
+    shard, next_seed = Shard(path), 0
+    for row in range(len(shard)):
+        batch, demo = shard.batch(row), shard[row]
+        if demo.content_hash() != batch.column("content_hash")[0].as_py():
+            raise ShardError(f"{path}: record {row} is damaged. {remedy(path.parent)}")
+        writer.copy(batch)
+        next_seed = demo.seed + 1
+    return len(shard), next_seed
 
 
 def rollouts(block: Block) -> Iterator[Demonstration | Skipped]:
@@ -212,7 +210,7 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
 
     Args:
         config: What to generate.
-        report: Called now and then with how far it is.
+        report: Called with episodes written, those that were there included, episodes in all, and "".
 
     Returns:
         The folder: shards and, once all are there, `index.parquet` and `dataset.json`. Its bytes depend on
@@ -259,16 +257,20 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
     """
     _remove_leftovers(config, own)
     missing = [block for block in own if not is_done(block)]
-    previous = read_previous_summaries(config.out) if missing and not config.keep_failed else {}
-    missing = [_keep_records(block, previous.get(block.path.name)) for block in missing]
     missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
-    watch = make_watcher(report, own, missing)
+    total, left = (sum(block.episodes for block in part) for part in (own, missing))
+
+    def count(done: int) -> None:
+        if report is not None:
+            report(total - left + done, total, "")
+
+    count(0)
     if not missing:
         return
     for folder in (config.out, config.out / FAILED_FOLDER):
-        set_aside(folder)  # a manifest speaks of whole data sets
+        (folder / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
     try:
-        for _ in _run(config, missing, watch):
+        for _ in _run(config, missing, count):
             pass  # a block's result is its file
     finally:
         _remove_leftovers(config, own)
@@ -285,17 +287,14 @@ def _remove_leftovers(config: GenerateConfig, own: Sequence[Block]) -> None:
 
 
 def _run(
-    config: GenerateConfig, missing: Sequence[Block], watch: Callable[[Counts], None]
+    config: GenerateConfig, missing: Sequence[Block], report: Callable[[int], None]
 ) -> Iterator[tuple[Block, None]]:
     if config.engine == "processes":
-        num_workers = config.workers or 1
-        return imap_with_progress(write_block, missing, num_workers, num_counts=NUM_COUNTS, watch=watch)
+        return imap_unordered(write_block, missing, config.workers or 1, report=report)
     from openvima.multiprocess import ray_imap_unordered
 
     num_workers = config.workers or (1 if config.address is None else None)
-    return ray_imap_unordered(
-        write_block, missing, num_workers, address=config.address, num_counts=NUM_COUNTS, watch=watch
-    )
+    return ray_imap_unordered(write_block, missing, num_workers, address=config.address, report=report)
 
 
 def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None:
@@ -307,18 +306,12 @@ def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None
             finish(config, blocks)
 
 
-def _keep_records(block: Block, summary: ShardSummary | None) -> Block:
-    """Add the records that a smaller shard has already."""
-    return block if summary is None else replace(block, kept=tuple(list_spans(summary.index)))
-
-
-def finish(config: GenerateConfig, blocks: Sequence[Block], *, reuse: bool = True) -> None:
+def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
     """Write index and manifest of a folder whose shards are all there, and those of its failed episodes.
 
     Args:
         config: What was generated.
         blocks: Its division into shards.
-        reuse: Trust what the previous manifest says of shards that it fits, instead of reading them.
 
     Raises:
         ShardError: A shard is damaged.
@@ -329,5 +322,4 @@ def finish(config: GenerateConfig, blocks: Sequence[Block], *, reuse: bool = Tru
         settings = {**record, "kept": FAILED_FOLDER}
         finish_folder(config.out / FAILED_FOLDER, failed, command=COMMAND, config=settings, versions=versions)
     paths = [block.path for block in blocks]
-    known = read_previous_summaries(config.out) if reuse else {}
-    finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions, known=known)
+    finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions)

@@ -1,16 +1,13 @@
 """What lies beside the shards: the index of episodes, and the manifest with counts, checksums and origin."""
 
-import contextlib
 import hashlib
 import json
-import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,15 +16,14 @@ import pyarrow.parquet as pq
 
 from openvima.atomic_io import NO_SPACE, atomic_write_file
 from openvima.data.schema import SCHEMA_VERSION
-from openvima.data.shard import Envelope, Shard, Span, measure
-from openvima.errors import DatasetError, ShardError, StorageError
+from openvima.data.shard import Shard, Span, measure
+from openvima.errors import DatasetError, StorageError
 
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
-PREVIOUS_NAME = ".dataset.json.old"  # while a data set is being extended
 BROKEN_NAME = "broken.json"  # episodes that an import left out
 FAILED_FOLDER = "failed"  # episodes that the oracle did not solve; a data set of the same form
-_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, PREVIOUS_NAME)
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
 CACHE_FOLDER = "object_cache"  # derived from the shards, safe to delete
 LICENCE = "MIT"
 
@@ -79,7 +75,6 @@ def finish_folder(
     config: Mapping[str, Any],
     versions: Mapping[str, str],
     licence: str = LICENCE,
-    known: Mapping[str, ShardSummary] = MappingProxyType({}),
 ) -> None:
     """Write the index and the manifest of a folder whose shards are all there.
 
@@ -90,12 +85,11 @@ def finish_folder(
         config: The settings that decide the content; nothing that depends on time or machine.
         versions: Package name to version.
         licence: Of the demonstrations.
-        known: Name to summary of the shards that need not be read.
 
     Raises:
         ShardError: A shard is damaged.
     """
-    summaries = [known.get(path.name) or summarise_shard(path) for path in shards]
+    summaries = [summarise_shard(path) for path in shards]
     origin = {"command": command, "config": dict(config), "versions": dict(versions), "licence": licence}
     index, manifest = compose_manifest(summaries, origin)
     sink = BytesIO()
@@ -105,33 +99,6 @@ def finish_folder(
     atomic_write_file(folder / INDEX_NAME, sink.getvalue())
     text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False)
     atomic_write_file(folder / MANIFEST_NAME, text + "\n")
-    (folder / PREVIOUS_NAME).unlink(missing_ok=True)
-
-
-def set_aside(folder: Path) -> None:
-    """Rename the manifest of a folder that is about to change; `read_previous_summaries` still finds it."""
-    with contextlib.suppress(FileNotFoundError):
-        os.replace(folder / MANIFEST_NAME, folder / PREVIOUS_NAME)
-
-
-def read_previous_summaries(folder: Path) -> dict[str, ShardSummary]:
-    """Return summaries of the shards that are as the folder's manifest says, without reading their records.
-
-    The manifest may have been set aside. Size, schema and footer of each shard are compared.
-    """
-    path = folder / MANIFEST_NAME
-    try:
-        manifest = parse_manifest((path if path.exists() else folder / PREVIOUS_NAME).read_bytes())
-        index = parse_index((folder / INDEX_NAME).read_bytes(), manifest)
-    except (OSError, DatasetError):
-        return {}
-    found = {}
-    for name, part in split_index(index).items():
-        entry = manifest["shards"][name]
-        with contextlib.suppress(ShardError):
-            Shard(folder / name, Envelope.from_entry(entry))
-            found[name] = ShardSummary(name, entry, part)
-    return found
 
 
 def split_index(index: pa.Table) -> dict[str, pa.Table]:

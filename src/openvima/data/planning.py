@@ -6,8 +6,7 @@ data set of more episodes begins with the very shards of a smaller one: asking f
 
 import itertools
 import shlex
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,11 +17,10 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
-from openvima.data.shard import Span
 from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
 from openvima.errors import ConfigError, LevelError, brief_repr, unknown_name
 from openvima.input_files import settle
-from openvima.multiprocess import MAX_WORKERS, Counts
+from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.registry import named_tasks
 from openvima.tasks.sampling import MAX_SEED, check_task_options, check_text_form, takes_prompts
@@ -188,7 +186,6 @@ class Block:
         seeds: Seeds to try, in order.
         env_config: As in `GenerateConfig`.
         failed_path: File for the episodes that the oracle did not solve; None throws them away.
-        kept: Records that the file begins with already; they are copied.
     """
 
     path: Path
@@ -197,7 +194,6 @@ class Block:
     seeds: range
     env_config: EnvConfig
     failed_path: Path | None = None
-    kept: tuple[Span, ...] = ()
 
 
 def plan(config: GenerateConfig) -> list[Block]:
@@ -261,100 +257,3 @@ def _divide(config: GenerateConfig) -> Iterator[tuple[int, int, range]]:
 
 def _num_seeds(episodes: int) -> int:
     return SEEDS_PER_EPISODE * episodes + SPARE_SEEDS
-
-
-NUM_COUNTS = 3  # that a block tells: episodes written, seeds tried, redraws
-
-
-@dataclass(frozen=True, slots=True)
-class TaskProgress:
-    """How far one task is.
-
-    Args:
-        task: Its name.
-        done: Episodes written, those of whole shards that were there before included.
-        total: Episodes asked for.
-        written: Episodes written by this run.
-        tried: Seeds that this run tried.
-        redraws: Unlucky draws that the sampler threw away in this run.
-    """
-
-    task: str
-    done: int
-    total: int
-    written: int = 0
-    tried: int = 0
-    redraws: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class GenerationProgress:
-    """How far all tasks are.
-
-    Args:
-        tasks: One entry a task, by name.
-    """
-
-    tasks: tuple[TaskProgress, ...]
-
-    __repr__ = brief_repr
-
-    @property
-    def done(self) -> int:
-        """Episodes written, those of whole shards that were there before included."""
-        return sum(task.done for task in self.tasks)
-
-    @property
-    def total(self) -> int:
-        """Episodes asked for."""
-        return sum(task.total for task in self.tasks)
-
-    @property
-    def written(self) -> int:
-        """Episodes written by this run."""
-        return sum(task.written for task in self.tasks)
-
-    @property
-    def tried(self) -> int:
-        """Seeds that this run tried."""
-        return sum(task.tried for task in self.tasks)
-
-
-Report = Callable[[GenerationProgress], None]
-
-
-def make_watcher(
-    report: Report | None, blocks: Sequence[Block], missing: Sequence[Block]
-) -> Callable[[Counts], None]:
-    """Make of a caller's `report` what an engine calls; it first receives what was there before.
-
-    Args:
-        report: The caller's, if it wants to know.
-        blocks: All blocks of this run.
-        missing: Those that are still to be written, in the order in which an engine gets them.
-    """
-    if report is None:
-        return lambda counts: None
-    totals, left = Counter[str](), Counter[str]()
-    for block in blocks:
-        totals[block.info.task] += block.episodes
-    for block in missing:
-        left[block.info.task] += block.episodes
-
-    def tell(counts: Counts) -> None:
-        sums = {task: [0] * NUM_COUNTS for task in totals}
-        for block, row in zip(missing, counts, strict=True):
-            of_task = sums[block.info.task]
-            for index, number in enumerate(row):
-                of_task[index] += number
-        report(
-            GenerationProgress(
-                tuple(
-                    TaskProgress(task, totals[task] - left[task] + sums[task][0], totals[task], *sums[task])
-                    for task in sorted(totals)
-                )
-            )
-        )
-
-    tell([(0,) * NUM_COUNTS] * len(missing))
-    return tell

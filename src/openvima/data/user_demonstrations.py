@@ -13,11 +13,8 @@ from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
     MANIFEST_NAME,
-    ShardSummary,
     finish_folder,
-    read_previous_summaries,
     remove_leftovers,
-    set_aside,
     storage_error,
 )
 from openvima.data.reader import read_manifest
@@ -166,9 +163,7 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
         seeds = _seeds(shard) if shard.info.env_config == info.env_config else []
         if demo.seed in seeds:
             if not is_complete and shard[seeds.index(demo.seed)].content_hash() == demo.content_hash():
-                return _finish(
-                    folder, shards, read_previous_summaries(folder)
-                )  # recording it was interrupted
+                return _finish(folder, shards)  # recording it was interrupted
             raise DatasetError(
                 f"{folder} holds a demonstration of this episode already ({demo.task}, seed {demo.seed}); "
                 "go on with another seed or scene."
@@ -178,23 +173,21 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
         last, info = None, replace(info, number=len(same))
     else:
         info = last.info
-    known = read_previous_summaries(folder)
-    known.pop(info.file_name, None)
-    set_aside(folder)
+    (folder / MANIFEST_NAME).unlink(missing_ok=True)
     with ShardWriter(folder / info.file_name, info) as writer:
         for row in range(0 if last is None else len(last)):
             assert last is not None  # or there are no rows
             writer.copy(last.batch(row))
         writer.write(demo)
     others = [shard for shard in shards if shard is not last]
-    return _finish(folder, [*others, Shard(folder / info.file_name)], known)
+    return _finish(folder, [*others, Shard(folder / info.file_name)])
 
 
-def _finish(folder: Path, shards: Sequence[Shard], known: dict[str, ShardSummary]) -> int:
+def _finish(folder: Path, shards: Sequence[Shard]) -> int:
     """Write index and manifest; return the number of demonstrations."""
     config = {"level": LEVEL, "domain": DOMAIN}
     paths = sorted(shard.path for shard in shards)
-    finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions(), known=known)
+    finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions())
     return sum(map(len, shards))
 
 
