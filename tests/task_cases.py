@@ -23,6 +23,13 @@ from openvima.scene import (
 )
 from openvima.tasks import Progress, advance, begin
 
+# One of each kind of prompt, goal and tool. The whole registry is tested by `env/test_tabletop.py`,
+# `tasks/test_oracle_end_to_end.py` and the digests.
+REPRESENTATIVE_TASKS = (
+    *("rotate", "visual_manipulation", "rearrange", "follow_order", "novel_adj_and_noun", "twist"),
+    *("same_shape", "pick_in_order_then_restore", "sweep_without_touching", "gather_then_put"),
+)
+
 
 def roles(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
     """Target, base and distractors."""

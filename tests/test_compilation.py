@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from openvima import compilation
-from openvima.errors import ConfigError
-from openvima.input_files import as_path, cache_dir
+from openvima.input_files import cache_dir
 
 KERNEL = "from openvima.compilation import njit\n\n@njit\ndef double(value):\n    return 2 * value\n"
 
@@ -93,8 +92,3 @@ def test_functions_are_not_cached_where_others_write(homeless, double, tmp_path,
         monkeypatch.setattr(tempfile, "gettempdir", lambda: (_ for _ in ()).throw(FileNotFoundError()))
     assert double() == 42
     assert indices(tmp_path) == []
-
-
-def test_a_home_that_is_not_known_is_named(homeless: Path) -> None:
-    with pytest.raises(ConfigError, match="'~/run' needs a home folder"):
-        as_path("~/run")

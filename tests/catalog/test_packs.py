@@ -23,11 +23,6 @@ def test_the_procedural_pack_is_loaded_once():
     assert load_assets().name == "procedural"
 
 
-def test_a_pack_is_returned_as_it_is():
-    pack = ProceduralAssets()
-    assert load_assets(pack) is pack
-
-
 @pytest.mark.parametrize("value", [None, 3, ["procedural"]])
 def test_what_is_no_pack_is_refused(value):
     with pytest.raises(

@@ -50,17 +50,6 @@ def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys,
 
 
 @pytest.mark.slow
-def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(capsys, monkeypatch) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")  # rich then takes the output for a terminal
-    monkeypatch.setenv("TERM", "dumb")
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["policies", "list"]) == 0
-    shown = capsys.readouterr().out
-    assert max(len(line) for line in shown.splitlines() if "model card" not in line) <= 80
-    assert "207.76" in shown and "363.90" in shown and "…" not in shown
-
-
-@pytest.mark.slow
 def test_the_list_can_be_read_by_machines(capsys) -> None:
     assert main(["policies", "--json"]) == 0
     records = {record["name"]: record for record in json.loads(capsys.readouterr().out)}

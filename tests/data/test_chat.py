@@ -160,11 +160,8 @@ def test_rounded_answers_of_the_oracle_solve_the_task(task: str, form: ChatForma
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "form", [ChatFormat(), ChatFormat("1-yx"), ChatFormat("pixels-xy", "front")], ids=str
-)
-def test_rounding_costs_less_than_a_hundredth_of_the_episodes(form: ChatFormat) -> None:
-    assert solved_by_answers(CELLS, form, episodes=20) >= 0.99 * 20 * len(CELLS)
+def test_rounding_costs_less_than_a_hundredth_of_the_episodes() -> None:
+    assert solved_by_answers(CELLS, ChatFormat(), episodes=8) >= 0.99 * 8 * len(CELLS)
 
 
 def solved_by_answers(cells: list[tuple[str, str]], form: ChatFormat, episodes: int) -> int:

@@ -22,7 +22,7 @@ from openvima.data.verification import verify
 from openvima.errors import DatasetError, ShardError, StorageError
 from small_data_sets import TASKS, config, contents
 
-NUM_KILLS = 6  # for each of two beginnings
+NUM_KILLS = 3  # for each of two beginnings
 
 
 @pytest.fixture(scope="module")

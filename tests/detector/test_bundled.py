@@ -9,7 +9,7 @@ from openvima.perception.boxes import match_ids_to_slots
 from openvima.perception.objects import GROUND_TRUTH
 
 TASKS = ("visual_manipulation", "rearrange", "same_shape", "sweep_without_exceeding")
-EPISODES = 5
+EPISODES = 3
 
 
 @pytest.mark.parametrize(
@@ -36,22 +36,19 @@ def test_it_finds_the_objects_of_scenes_and_prompts(task: str) -> None:
 
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
-    """Both views of the first moment of twelve episodes."""
+    """Both views of the first moment of four episodes."""
     env = TabletopEnv("rearrange")
-    observations = [env.reset(seed=seed)[0] for seed in range(12)]
+    observations = [env.reset(seed=seed)[0] for seed in range(4)]
     return [observation["rgb"][view] for observation in observations for view in ("front", "top")]
 
 
-@pytest.mark.parametrize("count", [8, pytest.param(24, marks=pytest.mark.slow)])
-def test_detections_of_several_pairs_of_images_are_those_of_each_pair(frames, count) -> None:
+def test_detections_of_several_pairs_of_images_are_those_of_each_pair(frames) -> None:
     # To the bit on the processors at hand; another one may take other kernels for other sizes.
     detector = load_detector()
-    swapped, expected, together = [], [], []
+    swapped, expected, together = [], [], detector.detect_batch(frames)
     for k in range(0, len(frames), 2):
         expected += detector.detect_batch(frames[k : k + 2])
         swapped += detector.detect_batch(frames[k : k + 2][::-1])[::-1]
-    for k in range(0, len(frames), count):
-        together += detector.detect_batch(frames[k : k + count])
     for found in (swapped, together):
         for one, other in zip(found, expected, strict=True):
             assert len(one)

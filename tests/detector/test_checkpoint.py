@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from openvima.detector import detector_folder, load_detector
+from openvima.detector import load_detector
 from openvima.detector.checkpoint import (
     detectron2_config,
     from_detectron2,
@@ -97,19 +97,6 @@ def test_weights_of_other_sizes_are_refused_by_name(tiny, tmp_path):
     file.write_text(yaml.safe_dump(values))
     with pytest.raises(CheckpointError, match=re.escape("box_head.hidden.0.weight is float32 (32, 784)")):
         load_network(tmp_path / "detector")
-
-
-def test_other_files_are_not_overwritten(tiny, tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(CheckpointError, match="thesis"):
-        save_network(MaskRCNN(tiny), tmp_path)
-
-
-def test_a_folder_without_detector_is_named(tmp_path):
-    with pytest.raises(CheckpointError, match="there is no folder"):
-        detector_folder(tmp_path / "nowhere")
-    with pytest.raises(CheckpointError, match="no checkpoint"):
-        load_network(tmp_path)
 
 
 def test_sizes_survive_a_file_and_wrong_ones_are_told():

@@ -1,14 +1,11 @@
 """COCO metrics of detectors with known scores, and drawn detections."""
 
-import sys
-
 import numpy as np
 import pytest
 from PIL import Image
 
 from openvima.detector.detection import Detections
 from openvima.detector.evaluation import draw_detections, evaluate_detector, save_grid
-from openvima.errors import ConfigError, MissingExtraError
 
 pytest.importorskip("pycocotools")
 
@@ -58,19 +55,6 @@ def test_boxes_of_iou_two_thirds_count_at_50_and_not_at_75(frames):
 def test_no_detections_score_zero(frames):
     blind = Truthful(frames, lambda boxes, masks, scores: (boxes[:0], masks[:0], scores[:0]))
     assert evaluate_detector(blind, frames).boxes.ap50 == 0
-
-
-def test_frames_without_objects_are_rejected(rectangles):
-    frame = rectangles()
-    empty = type(frame)(frame.rgb, frame.boxes[:0], frame.masks[:0])
-    with pytest.raises(ConfigError, match="no object"):
-        evaluate_detector(Truthful([empty]), [empty])
-
-
-def test_without_pycocotools_the_extra_is_named(frames, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycocotools", None)
-    with pytest.raises(MissingExtraError, match=r"openvima\[detector\]"):
-        evaluate_detector(Truthful(frames), frames)
 
 
 @pytest.mark.parametrize("background", [0, 255])

@@ -11,14 +11,12 @@ from torch.nn import functional as F
 import naive
 from openvima.detector.boxes import (
     box_iou,
-    cell_anchors,
     clip_boxes,
     decode_boxes,
     encode_boxes,
     level_anchors,
     match,
     nms,
-    pyramid_anchors,
     subsample,
 )
 from openvima.detector.config import small
@@ -90,12 +88,6 @@ def random_boxes(count: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(np.concatenate([low, low + rng.uniform(1, 40, (count, 2))], axis=1))
 
 
-def test_iou_of_small_boxes():
-    boxes = torch.tensor([[0.0, 0, 2, 2], [1, 1, 3, 3], [2, 0, 4, 2], [0, 0, 2, 1], [5, 5, 5, 9]])
-    expected = [1, 1 / 7, 0, 1 / 2, 0]
-    assert box_iou(boxes[:1], boxes)[0].tolist() == pytest.approx(expected)
-
-
 def test_iou_agrees_with_the_naive_twin():
     first, second = random_boxes(30), random_boxes(20, 1)
     expected = [[naive.box_iou(a, b) for b in second.tolist()] for a in first.tolist()]
@@ -134,13 +126,6 @@ def test_boxes_are_clipped_to_the_image():
     assert clip_boxes(torch.tensor([[-3.0, 2, 40, 50]]), height=20, width=30).tolist() == [[0, 2, 30, 20]]
 
 
-def test_of_three_boxes_in_a_chain_the_middle_one_goes():
-    # The second overlaps both others by more than a third; it goes, and the third one stays.
-    boxes = torch.tensor([[0.0, 0, 10, 10], [4, 0, 14, 10], [8, 0, 18, 10]])
-    assert nms(boxes, torch.tensor([0.9, 0.8, 0.7]), 0.3).tolist() == [0, 2]
-    assert nms(boxes, torch.tensor([0.8, 0.9, 0.7]), 0.3).tolist() == [1]
-
-
 @pytest.mark.parametrize("limit", [0.0, 0.1, 0.3, 0.5, 0.7])
 @pytest.mark.parametrize("seed", range(5))
 def test_nms_agrees_with_the_naive_twin(limit, seed):
@@ -157,26 +142,9 @@ def test_nms_acts_in_each_group_alone_and_drops_boxes_without_area():
     assert nms(boxes, scores, 0.5, groups).tolist() == [2, 1]
 
 
-def test_nms_of_no_boxes_is_empty():
-    assert nms(torch.zeros(0, 4), torch.zeros(0), 0.5).tolist() == []
-
-
-def test_the_anchors_of_a_cell_have_one_area_and_three_shapes():
-    # sizes 8 · √2 by 8 / √2, 8 by 8, 8 / √2 by 8 · √2
-    long, short = 4 * 2**0.5, 2 * 2**0.5
-    expected = [[-long, -short, long, short], [-4, -4, 4, 4], [-short, -long, short, long]]
-    assert np.allclose(cell_anchors(8.0), expected)
-
-
 def test_the_anchors_of_a_level_agree_with_the_naive_twin():
     made = level_anchors(20.0, stride=8, height=3, width=5)
     assert np.allclose(made, naive.anchors(20.0, stride=8, height=3, width=5), atol=1e-5)
-
-
-def test_strides_double_from_level_to_level():
-    first, second = pyramid_anchors((16.0, 32.0), [(2, 4), (1, 2)], first_stride=4)
-    assert np.allclose(first, naive.anchors(16.0, stride=4, height=2, width=4), atol=1e-5)
-    assert np.allclose(second, naive.anchors(32.0, stride=8, height=1, width=2), atol=1e-5)
 
 
 OBJECTS = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60]])
@@ -224,26 +192,10 @@ def test_background_replaces_missing_foreground():
     assert (len(positive), len(negative)) == (1, 19)
 
 
-def ramp(height: int, width: int) -> torch.Tensor:
-    """Features that grow by 1 a column and by 10 a row."""
-    return (10.0 * torch.arange(height)[:, None] + torch.arange(width)).double()[None, None]
-
-
 def cut(features, boxes, *, size, stride=1.0, sampling_ratio=2, images=None) -> torch.Tensor:
     boxes = torch.tensor(boxes, dtype=torch.float64)
     images = torch.zeros(len(boxes), dtype=torch.int64) if images is None else torch.tensor(images)
     return roi_align(features, boxes, images, size=size, stride=stride, sampling_ratio=sampling_ratio)
-
-
-def test_cells_of_a_ramp_have_the_values_at_their_centres():
-    # A box of 4 × 4 pixels in cells of 2 × 2; the centre of the first lies at pixel 2.5 in both directions.
-    (cells,) = cut(ramp(10, 10), [[2.0, 2, 6, 6]], size=2)
-    assert torch.allclose(cells[0], torch.tensor([[27.5, 29.5], [47.5, 49.5]], dtype=torch.float64))
-
-
-def test_one_cell_on_one_pixel_is_that_pixel():
-    (cells,) = cut(ramp(5, 5), [[3.0, 1, 4, 2]], size=1, sampling_ratio=1)
-    assert cells.item() == 13
 
 
 def test_samples_more_than_one_pixel_outside_are_zero():
@@ -279,12 +231,6 @@ def test_its_gradient_is_that_of_finite_differences():
     boxes = [[0.3, 0.2, 3.9, 3.1], [1.0, 1.0, 4.6, 2.2]]
     function = lambda x: cut(x, boxes, size=2, images=[0, 1])  # noqa: E731
     assert torch.autograd.gradcheck(function, features.requires_grad_())
-
-
-def test_no_boxes_give_no_cells():
-    assert roi_align(
-        ramp(4, 4), torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), size=2, stride=1, sampling_ratio=2
-    ).shape == (0, 1, 2, 2)
 
 
 def test_the_pyramid_level_follows_from_the_size_of_a_box():

@@ -22,7 +22,7 @@ def test_a_task_with_an_unseen_word_is_generated_trained_and_scored(tmp_path: Pa
     monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
     runpy.run_path(str(TASK_FILE))
     monkeypatch.chdir(tmp_path)
-    generate = "generate --tasks put_between --episodes 300 --out demos"
+    generate = "generate --tasks put_between --episodes 40 --out demos"
     train = (
         "train --data demos --preset nano --recipe nano --out run --schedule.steps 30 --loader.batch-size 4 "
         "--schedule.checkpoint-every 10 --pretraining.steps 0 --loader.validation-episodes 4"

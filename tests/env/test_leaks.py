@@ -9,7 +9,7 @@ from openvima.env import TabletopEnv
 
 pytestmark = pytest.mark.slow
 
-NUM_RESETS = 1000
+NUM_RESETS = 400
 MB = 2**20
 
 
@@ -22,7 +22,7 @@ def num_handles() -> int:
     return len(os.listdir("/proc/self/fd"))
 
 
-def test_a_thousand_resets_leave_memory_and_file_handles_flat() -> None:
+def test_hundreds_of_resets_leave_memory_and_file_handles_flat() -> None:
     env = TabletopEnv("novel_adj_and_noun")
     for seed in range(600):  # fills the caches of shapes, textures, hulls and models
         env.reset(seed=seed)

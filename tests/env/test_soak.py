@@ -31,8 +31,8 @@ def assert_possible(scene: Scene, assets: Assets) -> None:
 @pytest.mark.parametrize(
     ("task", "num_actions"),
     [
-        *((task, 9) for task in list_tasks()),
-        *(pytest.param(task, 300, marks=pytest.mark.slow) for task in list_tasks()),
+        *((task, 9) for task in ("rotate", "sweep_without_touching")),
+        *(pytest.param(task, 40, marks=pytest.mark.slow) for task in list_tasks()),
     ],
 )
 def test_random_actions_do_no_harm(task: str, num_actions: int) -> None:

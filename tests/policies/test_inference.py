@@ -40,13 +40,13 @@ def network_of(name: str) -> PolicyNetwork:
     return network
 
 
-FAST = ("nano", "small")
+FAST, SLOW = ("nano", "small"), ("vima-nano", "gato-nano", "midas-nano")  # objects, frames, views
 for_two_networks = pytest.mark.parametrize("policy", FAST, indirect=True)  # what all share
 
 
 @pytest.fixture(
     scope="module",
-    params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
+    params=[*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)],
 )
 def policy(request) -> NetworkPolicy:
     """One policy in double precision for each kind of network; every test resets it."""

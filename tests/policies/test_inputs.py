@@ -100,36 +100,11 @@ def test_detected_objects_act(small_sizes, demonstrations) -> None:
     assert all(np.isfinite(value).all() for value in action.values())
 
 
-@pytest.mark.parametrize("layout", ["objects", "views", "frames"])
-@pytest.mark.parametrize("effector", [2, -1, 0.5, None])
-def test_an_end_effector_that_does_not_exist_is_refused(layout: str, effector: object) -> None:
-    processor = Processor(**FRAMES) if layout == "frames" else Processor(layout)
-    with pytest.raises(PolicyError, match=r"0 \(suction\) or 1 \(spatula\)"):
-        processor.encode_observations([[seen(ee=effector)]])
-
-
-@pytest.mark.parametrize("part", ["rgb", "ee"])
-def test_a_missing_part_of_an_observation_is_named(part: str) -> None:
-    observation = seen()
-    del observation[part]
-    for processor in (Processor("objects"), Processor(**FRAMES)):
-        with pytest.raises(PolicyError, match=f"no '{part}'"):
-            processor.encode_observations([[observation]])
-
-
 def test_frames_need_no_segmentation() -> None:
     observation = seen()
     del observation["segm"]
     batch, stack = Processor(**FRAMES).encode_observations([[observation]])
     assert stack.images()[batch.crop_index_BTVN[0, 0]].shape == (2, 1, 3, 64, 128)
-
-
-def test_frames_of_another_size_are_refused() -> None:
-    processor = Processor(**FRAMES)
-    with pytest.raises(ShapeError, match=r"\(3, 256, 512\); this policy takes those of \(3, 128, 256\)"):
-        processor.encode_observations([[seen(rgb=noise(shape=(256, 512)))]])
-    with pytest.raises(ShapeError, match="even height and width"):
-        processor.encode_observations([[seen(rgb=noise(shape=(127, 256)))]])
 
 
 @pytest.mark.parametrize("layout", ["objects", "views", "frames"])

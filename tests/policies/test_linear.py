@@ -1,7 +1,5 @@
 """The linear policy and its training."""
 
-from copy import deepcopy
-
 import pytest
 import torch
 from torch.nn import functional as F
@@ -62,15 +60,6 @@ def test_only_acting_makes_a_packed_copy_and_training_drops_it(layer) -> None:
     assert "_packed" not in layer.state_dict()
     layer.train()
     assert layer._packed is None
-
-
-def test_a_copy_of_a_layer_that_acted_is_independent(layer) -> None:
-    assert_right(layer)
-    copied = deepcopy(layer)
-    with torch.no_grad():
-        copied.weight.zero_()
-    assert_right(copied)
-    assert_right(layer)
 
 
 def test_gradients_are_those_of_a_linear_layer(layer) -> None:

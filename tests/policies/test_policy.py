@@ -70,41 +70,6 @@ def test_actions_are_four_float32_arrays_within_bounds(policy, demonstrations) -
                 assert (np.abs(action[key]) <= 1).all()
 
 
-def test_neither_company_nor_order_changes_an_episodes_actions(policy, demonstrations) -> None:
-    everyone = list(range(len(demonstrations)))
-    together = played(policy, demonstrations, everyone)
-    for rows in (everyone[::-1], everyone[::2], everyone[1:3], everyone[-1:]):
-        for row, actions in played(policy, demonstrations, rows).items():
-            assert_equal(actions, together[row])
-
-
-def test_a_reset_forgets_everything(policy, demonstrations) -> None:
-    first = played(policy, demonstrations, [0, 1])
-    again = played(policy, demonstrations, [0, 1])
-    for row in (0, 1):
-        assert_equal(first[row], again[row])
-
-
-def test_an_episode_that_has_ended_changes_nothing_for_the_others(policy, demonstrations) -> None:
-    long = len(demonstrations) - 1
-    alone = played(policy, demonstrations, [long])[long]
-    policy.reset([demonstrations[0].prompt, demonstrations[long].prompt])
-    actions = []
-    for step in range(3):
-        seen = demonstrations[long].observation(step) if step <= demonstrations[long].num_steps else None
-        if seen is None:
-            break
-        company, action = policy.act([demonstrations[0].observation(0) if step == 0 else None, seen])
-        assert (company is None) == (step > 0)
-        actions.append(action)
-    assert_equal(actions, alone)
-
-
-def test_nobody_left_to_act_is_fine(policy, demonstrations) -> None:
-    policy.reset([demonstrations[0].prompt, demonstrations[1].prompt])
-    assert policy.act([None, None]) == [None, None]
-
-
 def test_the_environment_takes_the_actions(policy) -> None:
     env = TabletopEnv("sweep_without_exceeding")
     observation, _ = env.reset(seed=3)
@@ -179,16 +144,6 @@ def test_the_random_policy_follows_from_its_seed_and_never_touches_the_global_ge
     assert_equal(drawn[0], drawn[1])
     assert not np.array_equal(drawn[0][0]["pose0_position"], drawn[2][0]["pose0_position"])
     assert (np.random.get_state()[1] == state).all()
-
-
-def test_fresh_weights_follow_from_the_seed(demonstrations) -> None:
-    rows = range(len(demonstrations))
-    first, same, other = (
-        played(load_policy("untrained", seed=seed), demonstrations, rows, 1) for seed in (5, 5, 6)
-    )
-    for row in rows:
-        assert_equal(first[row], same[row])
-    assert any(not np.array_equal(first[r][0]["pose1_rotation"], other[r][0]["pose1_rotation"]) for r in rows)
 
 
 @pytest.mark.parametrize(

@@ -69,18 +69,6 @@ def test_a_pointer_model_needs_fused_views_and_an_appearance_embedding() -> None
         replace(sizes.images, fuse_views=False)
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.0])
-def test_a_share_of_dropped_crops_out_of_range_is_named(share: float) -> None:
-    with pytest.raises(ConfigError, match=f"crop_dropout is {share}"):
-        replace(preset("nano").images, crop_dropout=share)
-
-
-@pytest.mark.parametrize("width", [0, 6])
-def test_a_crop_width_that_groups_do_not_divide_is_named(width: int) -> None:
-    with pytest.raises(ConfigError, match=f"width is {width}"):
-        ConvConfig(width, 32)
-
-
 @pytest.mark.parametrize("name", config_to_dict(PRESETS["nano"]()))
 def test_a_file_that_lacks_a_part_or_has_a_scalar_for_it_is_refused(name: str) -> None:
     values = config_to_dict(preset("nano"))

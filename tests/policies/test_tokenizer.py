@@ -182,18 +182,6 @@ def test_unknown_words_are_all_named_once_and_the_first_gets_a_suggestion() -> N
         WordTokenizer().encode("the quokka")  # another policy
 
 
-@pytest.mark.parametrize(
-    ("word", "suggestion"),
-    [("rotat", "rotate"), ("rotatte", "rotate"), ("rotade", "rotate"), ("rotation", None), ("fellows", None)],
-)
-def test_only_a_word_within_one_edit_is_suggested(word: str, suggestion: str | None) -> None:
-    tokenizer = WordTokenizer(Vocabulary(("rotate", "yellow")))
-    with pytest.warns(UnknownWordWarning) as caught:
-        tokenizer.encode(word)
-    message = str(caught[0].message)
-    assert "Did you mean" not in message if suggestion is None else f"Did you mean {suggestion!r}?" in message
-
-
 def test_a_vocabulary_without_an_unknown_token_drops_unknown_words() -> None:
     tokenizer = WordTokenizer(Vocabulary(("put", "the")))
     with pytest.warns(UnknownWordWarning, match="'quokka'"):
@@ -275,26 +263,9 @@ def test_a_damaged_vocabulary_is_refused(content: str, reason: str, tmp_path) ->
     assert str(error.value).isprintable() and len(str(error.value)) < 600
 
 
-def test_a_vocabulary_that_is_missing_is_named(tmp_path) -> None:
-    with pytest.raises(CheckpointError, match=r"lacks its vocabulary, .*vocabulary\.json"):
-        Vocabulary.read(tmp_path)
-
-
 def test_a_placeholder_without_image_is_refused() -> None:
     with pytest.raises(PromptError):
         encoded(RenderedPrompt("Put the {a} away.", {}))
-
-
-def test_empty_text_has_no_ids() -> None:
-    assert encode_text("") == []
-    assert encoded(RenderedPrompt("", {})) == [END_ID]
-
-
-def test_unknown_words_are_shown_short_and_without_control_characters() -> None:
-    with pytest.warns(UnknownWordWarning) as caught:
-        encode_text("put \x1b[2J\u202e " + "juggle " * 5000 + "x" * 5000)
-    message = str(caught[0].message)
-    assert message.isprintable() and len(message) < 400
 
 
 def test_a_client_with_ever_new_words_is_warned_of_a_bounded_number_of_times(recwarn) -> None:

@@ -8,7 +8,7 @@ import pytest
 from openvima.scene import Episode, SceneImage
 from openvima.tasks import list_tasks, sample_episode, task_spec
 
-NUM_EPISODES = 1000
+NUM_EPISODES = 200
 # Standard deviations of a chi-square statistic; chance exceeds it less than once in 100,000 tests.
 LIMIT = 6.0
 
@@ -71,4 +71,4 @@ def test_the_original_order_gives_the_answer_away() -> None:
     """The same test finds the leak of the original benchmark, where objects come in the order of roles."""
     found = ranks("visual_manipulation", "L1", compat=True)
     assert found["object to move among all ids"] == {(3, 1): NUM_EPISODES}
-    assert excess(found["base among all ids"]) > 100 * LIMIT
+    assert excess(found["base among all ids"]) > 10 * LIMIT

@@ -9,7 +9,7 @@ from hypothesis import given
 
 from openvima.errors import ActionError
 from openvima.scene import Action
-from openvima.scene.action import ToolCommand, is_valid_batch
+from openvima.scene.action import is_valid_batch
 from strategies import angles
 
 
@@ -95,23 +95,3 @@ def test_only_the_heading_of_a_tilted_tool_matters() -> None:
     tilted = np.array([0.1, 0.0, half, half], np.float32)
     yaw = Action.from_arrays(arrays(pose1_rotation=tilted)).yaw1_rad
     assert math.degrees(yaw) == pytest.approx(90, abs=10)
-
-
-@pytest.mark.parametrize("given", [None, 3, "abc", np.zeros(4, np.float32)], ids=repr)
-def test_what_is_no_mapping_is_refused_as_an_action(given: object) -> None:
-    with pytest.raises(ActionError, match=r"an action is a mapping.*Nothing was moved"):
-        Action.from_arrays(given)  # pyright: ignore[reportArgumentType]
-
-
-class WithGradients:
-    """What `torch.tensor(..., requires_grad=True)` is to NumPy."""
-
-    def __array__(self, dtype: object = None, copy: object = None) -> np.ndarray:
-        raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
-
-
-def test_tensors_with_gradients_are_refused_as_other_values_are() -> None:
-    with pytest.raises(ActionError, match="pose0_position is a WithGradients that NumPy cannot convert"):
-        Action.from_arrays(arrays(pose0_position=WithGradients()))
-    with pytest.raises(ActionError, match="the command is a WithGradients"):
-        ToolCommand.from_array(WithGradients())

@@ -12,7 +12,7 @@ from openvima.tasks import sample_episode, task_spec
 from task_cases import assert_uniform, played
 
 TASK = "follow_motion"
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 POINTS = [
     Pose.planar(0.5 + 0.19 * math.cos(a), 0.19 * math.sin(a)) for a in (n * 0.4 * math.pi for n in range(5))
 ]

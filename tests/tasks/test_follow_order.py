@@ -15,7 +15,7 @@ from openvima.tasks.follow_order import all_stackings
 from task_cases import assert_frequencies, assert_uniform, played
 
 TASK = "follow_order"
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 ROW_OF_THREE, ROW_OF_FOUR = (-0.25, 0.0, 0.25), (-0.3, -0.1, 0.1, 0.3)
 
 

@@ -17,7 +17,7 @@ from openvima.tasks import TableSampler, sample_episode, task_spec
 from task_cases import assert_judged_at_its_limits, assert_uniform, roles, roles_with_twins
 
 TASK = "novel_adj"
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 WORDS = ("daxer", "blicker", "modier", "kobar")
 MEANINGS = ("shorter", "taller", "lighter", "darker")
 SENTENCES = (

@@ -18,7 +18,7 @@ from task_cases import (
 )
 
 TASK = "novel_adj_and_noun"
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 ADJECTIVES = ("daxer", "blicker", "modier", "kobar")
 NOUNS = ("dax", "blicket", "wug", "zup")
 LESSON = " ".join(

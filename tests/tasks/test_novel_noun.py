@@ -11,7 +11,7 @@ from openvima.tasks import sample_episode
 from task_cases import assert_frequencies, assert_judged_at_its_limits, assert_uniform, roles
 
 TASK = "novel_noun"
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 NOUNS = ("dax", "blicket", "wug", "zup")
 FORMS = {
     "target first": r"This is a (?P<target>\w+) \{dragged_obj_1\}\. This is a (?P<base>\w+) \{base_obj\}\. "

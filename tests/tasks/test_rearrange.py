@@ -10,7 +10,7 @@ from openvima.tasks.table import is_in_the_way
 from task_cases import assert_frequencies, assert_uniform, judged, pictured
 
 TASK = "rearrange"
-NUM_EPISODES = 2500
+NUM_EPISODES = 1250
 FAR_AWAY = Pose.planar(0.9, 0.0)
 
 

@@ -31,7 +31,7 @@ def all_roles(level: str, num_episodes: int) -> list[Roles]:
     return [group_roles(sample_episode(TASK, level=level, seed=seed).problem) for seed in range(num_episodes)]
 
 
-@pytest.mark.parametrize(("level", "num_episodes"), [("train", 2000), ("L1", 300), ("L2", 300), ("L3", 500)])
+@pytest.mark.parametrize(("level", "num_episodes"), [("train", 1000), ("L1", 300), ("L2", 300), ("L3", 500)])
 @pytest.mark.slow
 def test_each_level_has_its_shapes_and_textures(level: str, num_episodes: int) -> None:
     episodes = all_roles(level, num_episodes)
@@ -49,14 +49,14 @@ def test_each_level_has_its_shapes_and_textures(level: str, num_episodes: int) -
 
 
 def test_distractors_of_a_round_base_are_all_that_is_not_round() -> None:
-    shapes = [others[0].object for base, _, others in all_roles("train", 2000) if base.object == "bowl"]
+    shapes = [others[0].object for base, _, others in all_roles("train", 1000) if base.object == "bowl"]
     counts = {name: shapes.count(name) * 13 / len(shapes) for name in set(shapes)}
     assert set(counts) == set(OBJECT_SETS["D_shape"]) - {"ring"}
     assert all(0.6 < share < 1.6 for share in counts.values()), counts
 
 
 def test_objects_to_gather_may_share_a_texture_but_not_with_a_distractor() -> None:
-    episodes = all_roles("train", 2000)
+    episodes = all_roles("train", 1000)
     same = [first.texture == second.texture for _, (first, second), _ in episodes]
     assert_frequencies(same, {True: 1 / 19, False: 18 / 19})
     for _, dragged, distractors in episodes:

@@ -17,7 +17,7 @@ Roles = tuple[Placement, list[Placement], list[Placement]]
 @pytest.fixture(scope="module")
 def all_roles() -> list[Roles]:
     return [
-        group_roles(sample_episode("same_texture", level="L4", seed=seed).problem) for seed in range(2000)
+        group_roles(sample_episode("same_texture", level="L4", seed=seed).problem) for seed in range(1000)
     ]
 
 

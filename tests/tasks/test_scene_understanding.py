@@ -13,7 +13,7 @@ from openvima.tasks import TableSampler, advance, begin, sample_episode, task_sp
 from task_cases import assert_frequencies, assert_uniform, pictured
 
 TASK = "scene_understanding"
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 SENTENCE = r"Put the ([\w ]+) object in \{scene\} into the ([\w ]+) object\."
 
 

@@ -23,7 +23,7 @@ from openvima.tasks import TableSampler, advance, begin, sample_episode, task_sp
 from task_cases import assert_frequencies, assert_uniform
 
 TASK = "twist"
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 PROMPT = (
     '"Twist" is defined as rotating object a specific angle. For examples: '
     "From {before_twist_1} to {after_twist_1}. From {before_twist_2} to {after_twist_2}. "

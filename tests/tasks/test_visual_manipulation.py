@@ -10,7 +10,7 @@ from openvima.scene import AtPose, DistractorsApart, Placement, Pose, Problem
 from openvima.tasks import advance, begin, sample_episode, task_spec
 from task_cases import assert_frequencies, assert_uniform
 
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 
 
 def roles(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:

@@ -239,7 +239,6 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {},  # images encoded once
         {"pretraining.finetune_crop_encoder": True, "loader.num_workers": 2},
         {
             "augmentation.inverse_dynamics_prob": 0.5,

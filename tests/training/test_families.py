@@ -50,7 +50,7 @@ def assert_it_acts(run: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("architecture", ["gato", "flamingo", "midas"])
+@pytest.mark.parametrize("architecture", ["flamingo", "midas"])
 def test_a_run_makes_a_working_policy(architecture, data, tmp_path) -> None:
     assert run_train(data, tmp_path, f"{architecture}-nano") == 0
     assert_it_acts(tmp_path)

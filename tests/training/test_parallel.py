@@ -180,28 +180,17 @@ def test_compiled_layers_train_equally(bins, tmp_path, monkeypatch) -> None:
     assert not {"Linear", "Sequential"} & set(traced)
 
 
-def test_half_precision_trains_nearly_equally(bins, tmp_path) -> None:
-    plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
-    half = train(TrainingConfig.of({**bins, "out": tmp_path / "half", "runtime.precision": "bfloat16"}))
-    for a, b in zip(losses(plain), losses(half), strict=True):
-        if "loss" in a:
-            assert a["loss"] != b["loss"]
-            assert a["loss"] == pytest.approx(b["loss"], rel=0.02)
-
-
 @pytest.mark.skipif(
     not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"), reason="torch is older"
 )
-@pytest.mark.parametrize("preset", ["small", "tiny-bins"])
-def test_another_device_trains_equally(preset, bins, tmp_path, monkeypatch) -> None:
+def test_another_device_trains_equally(bins, tmp_path, monkeypatch) -> None:
     """No GPU is needed to see that all tensors are on one device."""
-    if preset == "small":
-        sizes = presets.preset(preset)
-        sizes = replace(sizes, decoder=replace(sizes.decoder, dropout=0.0))  # it draws otherwise there
-        monkeypatch.setitem(presets.PRESETS, preset, lambda: sizes)
-        attributes = {"pretraining.steps": 2, "pretraining.attribute_loss_weight": 0.5}
-        bins |= {"preset": preset, "schedule.steps": 2, "pretraining.hard_negative_prob": 0.4, **attributes}
-        bins |= {"augmentation.text_description_prob": 0.3, "augmentation.distractor_prob": 0.5}
+    sizes = presets.preset("small")
+    sizes = replace(sizes, decoder=replace(sizes.decoder, dropout=0.0))  # it draws otherwise there
+    monkeypatch.setitem(presets.PRESETS, "small", lambda: sizes)
+    attributes = {"pretraining.steps": 2, "pretraining.attribute_loss_weight": 0.5}
+    bins |= {"preset": "small", "schedule.steps": 2, "pretraining.hard_negative_prob": 0.4, **attributes}
+    bins |= {"augmentation.text_description_prob": 0.3, "augmentation.distractor_prob": 0.5}
     here = train(TrainingConfig.of({**bins, "out": tmp_path / "here"}))
     there = {**bins, "out": tmp_path / "there", "runtime.device": "python"}
     option, program, settings = script_arguments(there)
