@@ -9,15 +9,13 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
-from failures import draw_failures, failures
-from findings import Findings, find, read_simulator, read_trainings
+from findings import Findings, find, read_simulator
 from openvima.errors import ConfigError, DatasetError
-from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import save_checkpoint
-from publish import fill, record, write
+from publish import record, write
 from small_networks import narrow_small
 from tables import tables
 from weights import facts, settings, ship, shipped
@@ -210,32 +208,3 @@ def test_a_run_is_shipped_with_its_record(tmp_path: Path) -> None:
     (run / "sessions_log.jsonl").write_text(json.dumps(session))
     with pytest.raises(ConfigError, match="uncommitted changes"):
         ship(run, folder)
-
-
-def test_failures_are_drawn_from_recorded_actions(tmp_path: Path) -> None:
-    pytest.importorskip("PIL")
-    config = EvaluationConfig(("random",), ("rotate",), ("L1",), 2, seed=60_000, out=tmp_path / "evaluation")
-    evaluate(config)
-    (failure,) = failures(tmp_path / "evaluation")
-    assert failure.outcome.seed == 60_000 and failure.title == "rotate, L1: 2 of 2 failed"
-    assert len(failure.actions) == failure.outcome.steps
-    assert draw_failures(tmp_path / "evaluation", tmp_path / "failures.png") == tmp_path / "failures.png"
-    assert (tmp_path / "failures.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_wrong_inputs_are_named(tmp_path: Path) -> None:
-    record, file = training(tmp_path, "vima", 8), tmp_path / "list.json"
-    with pytest.raises(DatasetError, match=r"list\.json"):
-        read_trainings([file])
-    file.write_text(json.dumps([{"name": "vima"}]))
-    with pytest.raises(DatasetError, match="evaluation"):
-        read_trainings([file])
-    file.write_text(json.dumps([record, record]))
-    with pytest.raises(ConfigError, match="vima"):
-        read_trainings([file])
-
-
-@pytest.mark.parametrize("text", ["<!-- small:text -->", "<!-- small:txt --><!-- /small:txt -->"])
-def test_marks_that_cannot_be_filled_are_named(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"page\.md.*text"):
-        fill(text, {"text": "table"}, where="page.md")
