@@ -264,7 +264,7 @@ def _or_if_none(things: Things) -> Iterator[Meaning]:
 
 
 def _or_if_no_kind(things: Things) -> Iterator[Meaning]:
-    textures = {p.texture for p in (*things.loose, *things.absent)}
+    textures = dict.fromkeys(p.texture for p in (*things.loose, *things.absent))  # in order, unlike a set
     for shape, texture in itertools.product(things.shapes(), textures):
         there = [p for p in things.loose if (p.object, p.texture) == (shape, texture)]
         for other in things.loose:
