@@ -157,24 +157,3 @@ def test_fresh_attention_finds_the_object_that_the_prompt_shows(name):
         query_ND = decoder.self_blocks[0].query_key_value(scene_ND)[:, :128]
         key_ND = decoder.self_blocks[0].query_key_value(in_prompt_ND)[:, 128:256]
     assert (query_ND @ key_ND.T).argmax(dim=1).tolist() == [0, 1, 2, 3, 4, 5]
-
-
-@pytest.mark.parametrize("name", ["vima-nano", "midas-nano"])
-def test_fitted_tokens_are_compared_by_their_crops_alone(name):
-    network, generator = build_network(preset(name), seed=0).eval(), torch.Generator().manual_seed(0)
-    scale = torch.linspace(-3, 2, 96).exp()
-    features_KF = 5.0 + torch.randn(2000, 96, generator=generator) * scale
-    network.fit_crops(features_KF)
-    boxes_2VN4 = torch.randint(0, 60, (2, 2, 6, 4), generator=generator)
-    masks_VN = torch.ones(2, 6, dtype=torch.bool)
-    crops_VNF = features_KF[:6].expand(2, -1, -1)
-    in_prompt_ND, in_scene_ND = (network.images(crops_VNF, boxes, masks_VN)[:6] for boxes in boxes_2VN4)
-    is_crop_D = torch.arange(128) % 64 < 48
-    torch.testing.assert_close(in_prompt_ND[:, is_crop_D], in_scene_ND[:, is_crop_D])
-    assert (in_prompt_ND - in_scene_ND)[:, ~is_crop_D].abs().mean(dim=1).min() > 0.1
-    every_ND = network.images(features_KF.expand(2, -1, -1), torch.zeros(2, 2000, 4), torch.ones(2, 2000))
-    assert every_ND[:, is_crop_D].mean(dim=0).abs().max() < 1e-4
-    assert every_ND[:, is_crop_D].square().mean().item() == pytest.approx(0.64, rel=0.01)
-    attention = network.decoder.self_blocks[0].query_key_value
-    query_ND, key_ND = attention(in_scene_ND)[:, :128], attention(in_prompt_ND)[:, 128:256]
-    assert (query_ND @ key_ND.T).argmax(dim=1).tolist() == [0, 1, 2, 3, 4, 5]

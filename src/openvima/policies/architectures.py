@@ -334,15 +334,7 @@ class TokenPolicy(PolicyNetwork):
         # Image tokens are of the order of 1: so far above zero, the ReLUs between the layers are linear.
         layers[0].bias.fill_(_LINEAR_RANGE)
         layers[-1].bias.fill_(-_LINEAR_RANGE)
-        self.decoder.align(torch.ones(self.decoder.width, dtype=torch.bool))
-
-    def fit_crops(self, features_KF: torch.Tensor) -> None:
-        """Let fresh tokens and attention begin with what pretrained crops tell apart, (K, F)."""
-        if not isinstance(self.images, ObjectEncoder) or self.images.config.fuse_views or self.resampler:
-            return
-        is_crop_D = self.images.fit_fusion(features_KF)
-        if len(is_crop_D) == self.decoder.width:
-            self.decoder.align(is_crop_D)
+        self.decoder.align()
 
     def _frame_tokens(self, features: torch.Tensor) -> torch.Tensor:
         """Make tokens of pairs of frames, (..., tokens · N, E): the first token of all pairs first.

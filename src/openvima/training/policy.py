@@ -210,13 +210,10 @@ class _Stages:
                     inverse_dynamics_prob=prob,
                     describes=describes,
                 )
-            is_fresh = not (config.init_from or self.trainer.progress.step)
-            if is_fresh:
+            if not (config.init_from or self.trainer.progress.step):
                 learner.network.fit_prior(read_actions(self._examples[0]))
             if freezes_crops(learner.network, config):
                 freeze_crops(learner, caches, self.parallel)
-                if is_fresh and learner.features is not None:
-                    learner.network.fit_crops(learner.features)
         if config.runtime.compile:
             compile_layers(learner)
         module = self.parallel.wrap(learner)

@@ -23,8 +23,6 @@ from openvima.policies.nn.layers import Linear, TensorRecord, Unpadder, normal_w
 MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history together
 MAX_PROMPT_POSITIONS = 256
 
-_SHARPNESS = 1.5  # of attention that begins aligned
-
 KeysValues = tuple[torch.Tensor, torch.Tensor]  # (B, H, S, K) each
 
 
@@ -141,14 +139,9 @@ class CausalDecoder(nn.Module):
         """
         raise NotImplementedError
 
-    def align(self, entries_D: torch.Tensor) -> None:
-        """Let fresh attention fetch tokens that are alike in some of their entries, see `_align`.
-
-        Args:
-            entries_D: Which entries are compared, bool.
-        """
-        for block in (cast(SelfBlock, each) for each in self.self_blocks):
-            _align((*block.query_key_value.weight.split(self.width), block.attention_out.weight), entries_D)
+    def align(self) -> None:
+        """Let fresh attention to the prompt compare queries and keys by one matrix."""
+        raise NotImplementedError
 
     def forward(
         self,
@@ -254,12 +247,10 @@ class Decoder(CausalDecoder):
         prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
 
-    def align(self, entries_D: torch.Tensor) -> None:
-        """Align attention to the prompt as well."""
-        super().align(entries_D)
+    def align(self) -> None:
+        """Do so in every cross block."""
         for block in (cast(CrossBlock, each) for each in self.cross_blocks):
-            key_DD, value_DD = block.key_value.weight.split(self.width)
-            _align((block.query.weight, key_DD, value_DD, block.attention_out.weight), entries_D)
+            _align(block.query.weight, block.key_value.weight[: self.width])
 
     def _cross_attend(
         self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
@@ -284,6 +275,12 @@ class PrefixDecoder(CausalDecoder):
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
         return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP)[1]
+
+    def align(self) -> None:
+        """Do so in the first block, whose attention reaches the history as well."""
+        block = cast(SelfBlock, self.self_blocks[0])
+        query_DD, key_DD, _ = block.query_key_value.weight.split(self.width)
+        _align(query_DD, key_DD)
 
 
 def build_decoder(config: AnyDecoderConfig) -> Decoder | PrefixDecoder:
@@ -383,24 +380,9 @@ class SelfBlock(nn.Module):
         return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
 
 
-@torch.no_grad()
-def _align(attention: Sequence[torch.Tensor], entries_D: torch.Tensor) -> None:
-    """Let fresh attention fetch tokens that are like the own one; each half of a token by half of the heads.
-
-    Args:
-        attention: Weights of queries, keys, values and of the output, (D, D) each.
-        entries_D: Which entries of a token are compared, bool.
-    """
-    query_DD, key_DD, value_DD, out_DD = attention
-    rows_2H, half = torch.arange(len(query_DD)).chunk(2), len(query_DD) // 2
-    query_DD.zero_()
-    for rows_H in rows_2H:
-        columns = rows_H[entries_D[rows_H]]
-        projection = nn.init.orthogonal_(torch.empty(half, len(columns)), gain=_SHARPNESS)
-        query_DD[rows_H[:, None], columns] = projection.to(query_DD)
+def _align(query_DD: torch.Tensor, key_DD: torch.Tensor) -> None:
+    nn.init.orthogonal_(query_DD)
     key_DD.copy_(query_DD)
-    for identity_DD in (value_DD, out_DD):
-        identity_DD.copy_(torch.eye(len(identity_DD)))
 
 
 def position_ids(mask_BL: torch.Tensor) -> torch.Tensor:

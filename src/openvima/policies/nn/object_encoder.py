@@ -11,9 +11,7 @@ harmonics, R bins of rotations; `...` any axes.
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -89,7 +87,6 @@ _BOX_UNITS = (256.0, 128.0, 128.0, 256.0)  # centre x, centre y, height, width; 
 # Of objects on the table in demonstrations of the training tasks, in these units, both views together.
 _BOX_MEAN = (0.49, 0.55, 0.23, 0.13)
 _BOX_STD = (0.19, 0.16, 0.10, 0.06)
-_TOKEN_VARIANCE = 0.64  # mean of the entries that crops have in fitted tokens; the largest is about three
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,41 +171,6 @@ class ObjectEncoder(nn.Module):
             first.bias.sub_(first.weight @ mean)
             # Orthogonal layers of gain √2 map four numbers of variance 1 to vectors of length √8.
             last.weight.mul_((len(last.bias) / 8) ** 0.5)
-
-    @torch.no_grad()
-    def fit_fusion(self, features_KF: torch.Tensor) -> torch.Tensor:
-        """Let fresh tokens carry pretrained crop features apart from boxes, centred and whitened.
-
-        Random layers mix them: of six containers of one shape, whose features tell 97 % of their textures,
-        products of tokens find 24 %. Principal components whose variance is below the mean one tell little of
-        appearance, so they are amplified less.
-
-        Args:
-            features_KF: Of all crops in the data.
-
-        Returns:
-            Which entries of a token are of the crop, (D,): the first three quarters of either half.
-        """
-        num_features, half = features_KF.shape[-1], self.config.width // 2
-        is_crop_D = torch.arange(2 * half) % half < half - half // 4
-        entries_D = (
-            torch.arange(2 * half).view(2, half).T.flatten()
-        )  # components alternate between the halves
-        entries_C = entries_D[is_crop_D[entries_D]][:num_features]
-        variances_F, axes_FF = torch.linalg.eigh(torch.cov(features_KF.T))
-        variances_C, axes_CF = variances_F.flip(0)[: len(entries_C)], axes_FF.T.flip(0)[: len(entries_C)]
-        softness = variances_F.mean()
-        level = (variances_C / (variances_C + softness)).mean()
-        axes_CF = axes_CF * (_TOKEN_VARIANCE / level / (variances_C + softness)).sqrt()[:, None]
-        for fusion in cast(Iterable[nn.Linear], self.fusion):
-            box_layer = nn.init.orthogonal_(
-                torch.empty(2 * half - int(is_crop_D.sum()), fusion.in_features - num_features)
-            )
-            fusion.weight.zero_()
-            fusion.weight[entries_C, :num_features] = axes_CF
-            fusion.weight[~is_crop_D, num_features:] = box_layer.to(fusion.weight)
-            fusion.bias.copy_(-fusion.weight[:, :num_features] @ features_KF.mean(dim=0))
-        return is_crop_D
 
     def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
         """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""

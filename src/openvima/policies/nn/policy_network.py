@@ -134,9 +134,6 @@ class PolicyNetwork(nn.Module):
         """Let a fresh action head start from the distribution of demonstrated actions, (N, 12)."""
         self.head.fit_prior(actions_NC)
 
-    def fit_crops(self, features_KF: torch.Tensor) -> None:
-        """Let a fresh network start from the features of pretrained crops, (K, F)."""
-
     def init_cache(self, prompt: Any) -> Any:
         """Return the state of decoding after the prompt and before the first step."""
         return self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)
