@@ -172,19 +172,6 @@ def test_compat_places_base_then_objects_then_distractors(task: str) -> None:
 
 
 @both_tasks
-@pytest.mark.slow
-def test_sampling_hardly_ever_has_to_start_anew(task: str) -> None:
-    redraws = {
-        difficulty: sum(
-            sample_episode(task, level=LEVELS[task], seed=seed, difficulty=difficulty).num_redraws
-            for seed in range(100)
-        )
-        for difficulty in ("easy", "hard")
-    }
-    assert redraws["easy"] == 0 and redraws["hard"] <= 2, redraws
-
-
-@both_tasks
 def test_the_prompt_shows_the_base_and_nothing_else(task: str) -> None:
     problem = problem_of(task)
     ((name, image),) = problem.prompt.images

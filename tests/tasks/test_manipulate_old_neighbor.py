@@ -7,7 +7,6 @@ import re
 import pytest
 
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets
-from openvima.errors import ConfigError
 from openvima.render.labels import label_raster
 from openvima.scene import AtPose, DistractorsApart, InOrder, ObjectImage, Outcome, Placement, Pose, Problem
 from openvima.tasks import advance, begin, sample_episode, task_spec
@@ -218,12 +217,3 @@ def test_compat_places_row_by_row_and_the_base_last() -> None:
         assert [cell_of(p) for p in movable] == sorted(cell_of(p) for p in movable)
         assert base.id == roles(problem)[2].id == 5 + len(movable)
         assert all(p.pose.z == p.size[2] / 2 for p in problem.scene.placements)
-
-
-def test_an_unknown_difficulty_is_refused() -> None:
-    with pytest.raises(ConfigError, match="difficulty 'harder'"):
-        sample_episode(TASK, seed=0, difficulty="harder")
-
-
-def test_every_draw_succeeds() -> None:
-    assert all(sample_episode(TASK, seed=s, difficulty="hard").num_redraws == 0 for s in range(50))

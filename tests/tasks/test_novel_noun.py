@@ -94,11 +94,6 @@ def test_outcomes_change_at_the_limits(level: str) -> None:
         assert_judged_at_its_limits(sample_episode(TASK, level=level, seed=seed).problem)
 
 
-def test_hardly_any_draw_is_thrown_away() -> None:
-    redraws = [sample_episode(TASK, seed=seed, num_distractors=3).num_redraws for seed in range(100)]
-    assert sum(redraws) <= 2
-
-
 @pytest.mark.parametrize(
     ("difficulty", "options"),
     [

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets, object_spec, pool
-from openvima.errors import ConfigError
 from openvima.scene import (
     Action,
     AtPose,
@@ -246,12 +245,3 @@ def test_compat_hovers_the_object_over_its_base_and_places_it_first() -> None:
             assert dragged.pose.z == factor * dragged.size[2]
             assert (dragged.pose.x, dragged.pose.y) == (source.pose.x, source.pose.y)
             assert all(base.pose.z == base.size[2] / 2 for base in (source, *targets, *others))
-
-
-def test_an_unknown_difficulty_is_refused() -> None:
-    with pytest.raises(ConfigError, match="difficulty 'normal'"):
-        sample_episode(TASK, seed=0, difficulty="normal")
-
-
-def test_every_draw_succeeds() -> None:
-    assert all(sample_episode(TASK, seed=s, difficulty="hard").num_redraws == 0 for s in range(50))

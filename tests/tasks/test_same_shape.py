@@ -63,12 +63,6 @@ def test_objects_to_gather_may_share_a_texture_but_not_with_a_distractor() -> No
         assert {p.texture for p in dragged}.isdisjoint(p.texture for p in distractors)
 
 
-def test_the_prompt_is_the_published_sentence() -> None:
-    sentence = "Put all objects with the same profile as {base_obj} into it."
-    assert task_spec(TASK).template == sentence
-    assert {sample_episode(TASK, seed=seed).problem.prompt.text for seed in range(20)} == {sentence}
-
-
 @pytest.mark.parametrize("missing", ["ring", "shorter block"])
 def test_a_pool_that_leaves_a_base_without_objects_is_refused(missing: str, assets: Assets) -> None:
     train = pool(TASK, "train")

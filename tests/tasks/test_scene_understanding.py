@@ -208,8 +208,3 @@ def test_with_compat_objects_hover_and_keep_the_order_of_placing() -> None:
         assert (base.id, target.id, distractor.id) == (5, 6, 7)
         assert target.pose.z == pytest.approx(target.size[2] / 2)
         assert [p.texture == target.texture for p in pictured(problem)] == [True, False]
-
-
-@pytest.mark.slow
-def test_bad_luck_is_rare() -> None:
-    assert sum(sample_episode(TASK, level="L3", seed=seed).num_redraws for seed in range(500)) <= 5
