@@ -13,8 +13,8 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter, generate
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
-from openvima.data.page import lay_out_histogram, make_episode_card, write_page
-from openvima.data.summary import Histogram, Summary, Unfinished, summarise_folder
+from openvima.data.page import make_episode_card, write_page
+from openvima.data.summary import Histogram, Summary, summarise_folder
 from openvima.errors import ConfigError, DatasetError
 from openvima.html import render_page
 from openvima.scene import Action
@@ -91,7 +91,6 @@ def test_sizes_add_up(demos: Path) -> None:
     assert summary.file_bytes == sum(path.stat().st_size for path in demos.iterdir())
     records = sum(task.bytes for task in summary.tasks)
     assert 0.7 * summary.file_bytes < records < summary.file_bytes
-    assert all(0.5 < task.image_fraction < 0.95 for task in summary.tasks)
 
 
 def test_objects_are_counted_only_on_demand(demos: Path) -> None:
@@ -116,24 +115,6 @@ def test_failed_episodes_and_object_caches_are_counted(
     assert finished(demos).num_failed is None
 
 
-def test_an_unfinished_folder_is_described(
-    tmp_path: Path, made_up: MadeUp, info: ShardInfo, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with ShardWriter(tmp_path / "stack-train-00000.arrow", info) as writer:
-        writer.write(made_up(num_steps=0, num_images=0))
-    (tmp_path / "stack-train-00001.arrow").write_bytes(b"ARROW1")
-    found = summarise_folder(tmp_path)
-    assert found == Unfinished(tmp_path, 1, {"stack": 1}, ("stack-train-00001.arrow",))
-    assert main(["data", "info", str(tmp_path)]) == 0
-    shown = capsys.readouterr().out
-    assert "not finished; 1 episodes in 1 whole shards" in shown
-    assert "stack-train-00001.arrow cannot be read" in shown
-    assert main(["data", "info", str(tmp_path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["summary"]["finished"] is False
-    assert main(["data", "info", str(tmp_path), "--html", str(tmp_path / "a.html")]) == 2
-    assert "not finished" in capsys.readouterr().err
-
-
 def test_an_empty_folder_holds_no_data_set(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="holds no data set"):
         summarise_folder(tmp_path)
@@ -147,7 +128,7 @@ def test_the_terminal_shows_the_whole(
     shown = capsys.readouterr().out
     assert f"{demos}: 9 episodes" in shown
     assert "written by openvima generate, assets procedural, compat no" in shown
-    assert re.search(r"rotate +3 +\d+ +\d+\.\d +\d+% +\d+ +\d+\.\d% +\d+\n", shown)
+    assert re.search(r"rotate +3 +\d+ +\d+\.\d +\d+ +\d+\.\d% +\d+\n", shown)
     assert re.search(r"spatula  █+ 3 \(33\.3%\)", shown)
     assert "more …" in shown
 
@@ -187,7 +168,7 @@ def drawn_episode(demo: Demonstration) -> str:
 
 
 def drawn_chart(histogram: Histogram) -> str:
-    return render_page("histogram", chart=lay_out_histogram(histogram))
+    return render_page("histogram", chart=histogram)
 
 
 def test_names_from_files_cannot_change_the_page(made_up: MadeUp) -> None:
@@ -226,8 +207,8 @@ def test_arrows_begin_and_end_where_the_action_does(made_up: MadeUp) -> None:
 
 def test_long_histograms_show_both_ends() -> None:
     chart = drawn_chart(Histogram("values", {str(n): 100 - n for n in range(50)}))
-    assert "… 34 more …" in chart
-    assert chart.count("<rect") == 16
+    assert "… 35 more …" in chart
+    assert chart.count("<div") == 15
 
 
 def test_pages_and_samples_that_make_no_sense_are_refused(

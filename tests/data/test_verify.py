@@ -133,7 +133,7 @@ def test_an_oracle_that_acts_differently_is_found_by_replaying(folder: Path) -> 
     other = Action.planar((0.3, 0.1), (0.6, -0.2))
     rewrite(folder, FIRST, lambda demo: dataclasses.replace(demo, actions=(other,) * demo.num_steps))
     found = verify(folder, ALL)
-    assert causes(found) == {FIRST: ["replayed, the oracle acts differently in step 0 (records 0, 1 of 2)"]}
+    assert causes(found) == {FIRST: ["replayed, the oracle acts differently in step 0 (record 0, 1 of 2)"]}
     assert found.num_replayed == 6
 
 
@@ -174,7 +174,7 @@ def test_replaying_names_the_first_difference(
     rewrite(folder, FIRST, change)
     found = causes(verify(folder, ALL))
     assert [text for text in found[FIRST] if text.startswith("replayed")] == [
-        f"replayed, {cause} (records 0, 1 of 2)"
+        f"replayed, {cause} (record 0, 1 of 2)"
     ]
 
 

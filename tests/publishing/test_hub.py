@@ -83,7 +83,7 @@ def test_info_on_a_data_set_of_the_hub_fetches_no_shard(hub: LocalHub, demos: Pa
     fetched = {request.rpartition("/")[2] for request in hub.requests if "/resolve/" in request}
     assert fetched == {MANIFEST_NAME, INDEX_NAME}
     assert main(["data", "info", "hf://owner/demos", "--details", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["summary"]["tasks"]["rotate"]["image_fraction"] > 0
+    assert json.loads(capsys.readouterr().out)["summary"]["tasks"]["rotate"]["bytes"] > 0
 
 
 def test_a_revision_stays_what_it_was_when_the_branch_moves_on(hub: LocalHub, demos: Path) -> None:

@@ -11,7 +11,7 @@ from openvima.atomic_io import atomic_write_file
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
-from openvima.data.summary import Histogram, Summary
+from openvima.data.summary import Summary
 from openvima.errors import AssetError, ConfigError, ShardError
 from openvima.html import render_page, require_extra
 from openvima.multiprocess import Report
@@ -60,9 +60,7 @@ def write_page(summary: Summary, out: Path, *, num_samples: int = 3, report: Rep
         manifest=manifest,
         tiles=tiles,
         tasks=summary.tasks,
-        histograms=[
-            lay_out_histogram(histogram) for histogram in summary.histograms if len(histogram.counts) > 1
-        ],
+        histograms=[histogram for histogram in summary.histograms if len(histogram.counts) > 1],
         episodes=_make_cards(summary, num_samples, report or (lambda done, total, note: None)),
         settings=json.dumps(manifest["config"], indent=2, ensure_ascii=False),
         caches={name: _size(size) for name, size in summary.object_caches.items()},
@@ -107,48 +105,6 @@ def _size(num_bytes: float) -> str:
             return f"{num_bytes:.3g} {unit}"
         num_bytes /= 1000
     return f"{num_bytes:,.1f} GB"
-
-
-_MOST_BARS = 18
-_NUM_FIRST, _NUM_LAST = 10, 6  # of histograms with more bars
-_WIDTH = 400  # units of the drawing, as are all below; about pixels on a phone
-_ROW = 21
-_LETTER = 6.9  # width of an average letter in the widest of usual typefaces
-_LONGEST_LABEL = 220
-_COUNT = 92  # room for a count and its fraction
-_LABEL_GAP = 7
-
-
-def lay_out_histogram(histogram: Histogram) -> dict[str, object]:
-    """Lay out a histogram: a bar per value, with its count and fraction.
-
-    Of many values the first and the last are shown.
-
-    Returns:
-        Values of the template `histogram`.
-    """
-    entries: list[tuple[str, int] | None] = [*histogram.counts.items()]
-    left_out = len(entries) - _NUM_FIRST - _NUM_LAST
-    if len(entries) > _MOST_BARS:
-        entries[_NUM_FIRST : len(entries) - _NUM_LAST] = [None]
-    total, most = sum(histogram.counts.values()), max(histogram.counts.values())
-    label_width = min(_LONGEST_LABEL, _LETTER * max(map(len, histogram.counts)))
-    left = label_width + _LABEL_GAP
-    bars, texts = [], []  # x, y, width; x, y, anchor, colour, text
-    for index, entry in enumerate(entries):
-        middle = _ROW * index + _ROW / 2
-        if entry is None:
-            texts.append((left, middle + 4, "start", "muted", f"… {left_out} more …"))
-            continue
-        label, count = entry
-        width = max(1.0, (_WIDTH - left - _LABEL_GAP - _COUNT) * count / most)
-        bars.append((left, middle - 6, width))
-        texts.append((label_width, middle + 4, "end", "ink", label))
-        texts.append(
-            (left + width + _LABEL_GAP, middle + 4, "start", "muted", f"{count:,} ({count / total:.1%})")
-        )
-    size = (_WIDTH, _ROW * len(entries))
-    return {"title": histogram.title, "size": size, "bars": bars, "texts": texts}
 
 
 _GAP = 2  # pixels between the two views

@@ -11,13 +11,12 @@ import pyarrow as pa
 
 from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset, data_folder
-from openvima.data.schema import COLUMNS, IMAGES
 from openvima.data.shard import Shard
-from openvima.errors import DatasetError, ShardError, echo
+from openvima.errors import DatasetError, echo
 from openvima.hub import dataset_name
 from openvima.multiprocess import Report
 
-_NUM_MEASURED = 3  # episodes of each task to measure the size of images on
+_MOST_ROWS, _NUM_FIRST, _NUM_LAST = 16, 10, 5  # of a histogram; one with more is cut to its ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +31,15 @@ class Histogram:
     title: str
     counts: dict[str, int]
 
+    def rows(self) -> list[tuple[str, int, float, float]]:
+        """Return value, count, its fraction of all and of the largest; 0 where values are left out."""
+        total, most = sum(self.counts.values()), max(self.counts.values())
+        rows = [(label, count, count / total, count / most) for label, count in self.counts.items()]
+        if len(rows) > _MOST_ROWS:
+            num_left_out = len(rows) - _NUM_FIRST - _NUM_LAST
+            rows[_NUM_FIRST:-_NUM_LAST] = [(f"… {num_left_out} more …", 0, 0.0, 0.0)]
+        return rows
+
 
 @dataclass(frozen=True, slots=True)
 class TaskSummary:
@@ -42,8 +50,6 @@ class TaskSummary:
         episodes: Number of episodes.
         steps: Number of steps.
         bytes: Size of their records.
-        image_fraction: Fraction of images in these bytes, measured on a few episodes; 0 if none are stored,
-            None if no shard was read.
         seeds_tried: Seeds that were tried for them.
         success_rate: Fraction of these seeds that gave an episode.
         redraws: Unlucky draws that the sampler threw away.
@@ -53,7 +59,6 @@ class TaskSummary:
     episodes: int
     steps: int
     bytes: int
-    image_fraction: float | None
     seeds_tried: int
     success_rate: float
     redraws: int
@@ -102,35 +107,11 @@ class Summary:
         return {**self.manifest, "summary": summary}
 
 
-@dataclass(frozen=True, slots=True)
-class Unfinished:
-    """Summary of a folder whose writing was interrupted.
-
-    Args:
-        folder: The folder.
-        shards: Number of whole shards.
-        episodes: Episodes in them, by task.
-        damaged: Names of files that are no shards that can be read.
-    """
-
-    folder: Path
-    shards: int
-    episodes: dict[str, int]
-    damaged: tuple[str, ...]
-
-    def to_record(self) -> dict[str, Any]:
-        """Return everything as plain values."""
-        counts = {"shards": self.shards, "episodes": self.episodes, "damaged": list(self.damaged)}
-        return {"summary": {"finished": False, **counts}}
-
-
-def summarise_folder(
-    folder: str | Path, *, details: bool = False, report: Report | None = None
-) -> Summary | Unfinished:
+def summarise_folder(folder: str | Path, *, details: bool = False, report: Report | None = None) -> Summary:
     """Summarise a folder.
 
     Args:
-        folder: A data set, finished or not; or one on the Hub such as "hf://owner/name", of which without
+        folder: A data set, or one on the Hub such as "hf://owner/name", of which without
             details only manifest and index are fetched.
         details: Also count objects, textures and prompt images, for which every shard is read.
         report: Called with shards read, shards in all, and a note.
@@ -142,8 +123,6 @@ def summarise_folder(
     """
     index_only = dataset_name(folder) is not None and not details
     folder = data_folder(folder, shards=not index_only)
-    if not (folder / MANIFEST_NAME).is_file() and any(folder.glob("*.arrow")):
-        return _summarise_unfinished(folder)
     dataset = Dataset(folder, index_only=index_only)  # which also finds missing files
     task_of = np.array(dataset.index.column("task").to_pylist(), dtype=str)
     histograms = [*_index_histograms(dataset.index)]
@@ -152,64 +131,21 @@ def summarise_folder(
     return Summary(
         folder,
         dataset.manifest,
-        tuple(
-            _task_summary(dataset, task, task_of == task, index_only=index_only)
-            for task in dataset.manifest["tasks"]
-        ),
+        tuple(_task_summary(dataset, task, task_of == task) for task in dataset.manifest["tasks"]),
         tuple(histograms),
         _count_failed(folder),
         _measure_caches(folder),
     )
 
 
-def _summarise_unfinished(folder: Path) -> Unfinished:
-    episodes: Counter[str] = Counter()
-    damaged = []
-    paths = sorted(folder.glob("*.arrow"))
-    for path in paths:
-        try:
-            shard = Shard(path)
-        except ShardError:
-            damaged.append(path.name)
-        else:
-            episodes[shard.info.task] += len(shard)
-    return Unfinished(folder, len(paths) - len(damaged), dict(sorted(episodes.items())), tuple(damaged))
-
-
-def _task_summary(dataset: Dataset, task: str, chosen: np.ndarray, *, index_only: bool) -> TaskSummary:
+def _task_summary(dataset: Dataset, task: str, chosen: np.ndarray) -> TaskSummary:
     rows = np.flatnonzero(chosen)
     if not len(rows):
         raise DatasetError(f"{dataset.path} lists the task {echo(task)}, of which it holds no episode.")
     num_bytes = int(dataset.index.column("num_bytes").to_numpy()[rows].sum())
     entry = dataset.manifest["tasks"][task]
-    measured = rows[np.linspace(0, len(rows) - 1, min(_NUM_MEASURED, len(rows))).astype(int)]
     counts = {name: entry[name] for name in ("episodes", "steps", "seeds_tried", "success_rate", "redraws")}
-    fraction = None if index_only else _image_fraction(dataset, measured.tolist())
-    return TaskSummary(task, bytes=num_bytes, image_fraction=fraction, **counts)
-
-
-def _image_fraction(dataset: Dataset, episodes: Iterable[int]) -> float:
-    """Return the fraction of images in the bytes of some records."""
-    without = [name for name in COLUMNS.names if name not in IMAGES]
-    total = rest = 0
-    for episode_index in episodes:
-        info = dataset.shard(dataset.locate(episode_index)[0]).info
-        if not info.images:
-            continue
-        batch = dataset.batch(episode_index)
-        total += _measure(batch, info.compression)
-        rest += _measure(batch.select(without), info.compression)
-    return round(1 - rest / total, 4) if total else 0.0
-
-
-def _measure(batch: pa.RecordBatch, compression: str) -> int:
-    """Size of a record as a shard would hold it."""
-    sink = pa.MockOutputStream()
-    options = pa.ipc.IpcWriteOptions(compression=compression, use_threads=False)
-    with pa.ipc.new_stream(sink, batch.schema, options=options) as writer:
-        before = sink.size()
-        writer.write_batch(batch)
-        return sink.size() - before
+    return TaskSummary(task, bytes=num_bytes, **counts)
 
 
 def _index_histograms(index: pa.Table) -> Iterable[Histogram]:

@@ -1,4 +1,4 @@
-"""Verifying a data folder: manifest, index, shards, object cache, and a sample of replayed episodes.
+"""Verifying a data folder: manifest, index, shards, and a sample of replayed episodes.
 
 Nothing is changed. What is damaged is named, with the command that makes it again.
 """
@@ -7,33 +7,28 @@ import hashlib
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from openvima.catalog.packs import load_assets, recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
-    CACHE_FOLDER,
     FAILED_FOLDER,
     INDEX_NAME,
     MANIFEST_NAME,
     fingerprint,
-    joint_hash,
     parse_index,
     parse_manifest,
     split_index,
 )
-from openvima.data.object_cache import CacheFile
 from openvima.data.planning import COMMAND, generate_command
-from openvima.data.preprocessed import PreprocessedEpisode, preprocess
 from openvima.data.reader import explain_missing
 from openvima.data.records import package_versions
 from openvima.data.replay import ReplayTask, replay_shard
-from openvima.data.shard import Envelope, Shard, list_spans, map_file, remedy
+from openvima.data.shard import Shard, remedy
 from openvima.errors import AssetError, ConfigError, DatasetError, OpenVimaError, ShardError, echo
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, check_workers, imap_unordered
@@ -44,8 +39,6 @@ __all__ = ["Problem", "Verification", "VerifyConfig", "verify"]
 _PUBLISHED = "published"  # domain of imported demonstrations
 _MAX_ROWS_NAMED = 8
 _NOT_AGAIN = "The files are intact, but another machine or other code wrote them. Generate them again."
-_CACHE_REMEDY = "Delete it; `openvima data preprocess` makes it again."
-_IN_ANY_CACHE = ("task", "seed", "end_effector", "actions")  # what depends on no detector
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +95,6 @@ class Verification:
         num_shards: Shards that were checked.
         num_episodes: Episodes that were decoded and compared with their content hashes.
         num_replayed: Episodes that were replayed.
-        num_cache_files: Files of the object cache that were compared with the demonstrations.
     """
 
     folder: Path
@@ -111,7 +103,6 @@ class Verification:
     num_shards: int = 0
     num_episodes: int = 0
     num_replayed: int = 0
-    num_cache_files: int = 0
 
     @property
     def is_clean(self) -> bool:
@@ -126,7 +117,6 @@ class Verification:
             "shards": self.num_shards,
             "episodes": self.num_episodes,
             "replayed": self.num_replayed,
-            "cache_files": self.num_cache_files,
             "problems": [asdict(problem) for problem in self.problems],
             "notes": list(self.notes),
         }
@@ -139,7 +129,7 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     """Find all problems of a data set; nothing is changed.
 
     Args:
-        folder: Folder of demonstrations. Its `failed` episodes and its object cache are checked too.
+        folder: Folder of demonstrations. Its `failed` episodes are checked too.
         config: How thoroughly to verify.
         report: Called with episodes done, episodes in all, and the current stage.
 
@@ -173,12 +163,12 @@ class _ShardTask:
     Args:
         path: The file.
         entry: Its entry in the manifest; None where that cannot be trusted.
-        index: Its part of the index; None where that cannot be trusted.
+        num_episodes: As the index says; 0 where that cannot be trusted.
     """
 
     path: Path
     entry: dict[str, Any] | None
-    index: pa.Table | None
+    num_episodes: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,14 +213,13 @@ class _Verifier:
             cause = "a process was killed while it wrote this, or is writing it. If not, delete it."
             self.notes.append(f"{path}: {cause}")
         tasks = self._shard_tasks(shards)
-        total = sum(0 if task.index is None else task.index.num_rows for task in tasks)
+        total = sum(task.num_episodes for task in tasks)
         results = {task.path.name: found for task, found in self._map(check_shard, tasks, total, "comparing")}
         checked = {task.path.name: results[task.path.name] for task in tasks}
         for name, found in checked.items():
             for cause in found.causes:
                 self._add(name, cause, self._remedy)
         num_replayed = self._replay(checked)
-        num_cache_files = self._check_cache(checked)
         return Verification(
             self.folder,
             tuple(sorted(self.problems)),
@@ -238,7 +227,6 @@ class _Verifier:
             num_shards=len(tasks),
             num_episodes=sum(len(found.content_hashes) for found in checked.values()),
             num_replayed=num_replayed,
-            num_cache_files=num_cache_files,
         )
 
     @property
@@ -297,7 +285,7 @@ class _Verifier:
             _ShardTask(
                 path=self.folder / name,
                 entry=None if manifest is None else manifest["shards"][name],
-                index=None if index is None else parts.get(name, index.slice(0, 0)),
+                num_episodes=parts[name].num_rows if name in parts else 0,
             )
             for name in listed
         ]
@@ -345,35 +333,24 @@ class _Verifier:
             assets = info.assets if asked is None or info.assets == "procedural" else asked
             yield ReplayTask(self.folder / name, info, tuple(row for *_, row in places), assets)
 
-    def _check_cache(self, checked: Mapping[str, _Checked]) -> int:
-        """Compare the object cache with the demonstrations; return the number of files."""
-        tasks, total = [], 0
-        for name, found in sorted(checked.items()):
-            for path in sorted((self.folder / CACHE_FOLDER).glob(f"*/{name}")):
-                if found.info is not None:
-                    content_hash = joint_hash(found.content_hashes)
-                    tasks.append(_CacheTask(path, self.folder / name, content_hash))
-                    total += len(found.content_hashes)
-        num_files = 0
-        for task, causes in self._map(check_cache_file, tasks, total, "comparing the object cache"):
-            num_files += causes is not None
-            for cause in causes or ():
-                self._add(str(task.path.relative_to(self.folder)), cause, _CACHE_REMEDY)
-        return num_files
-
 
 def check_shard(task: _ShardTask, count: Callable[[int], None]) -> _Checked:
     """Check a shard; `count` is called with the number of episodes checked so far."""
-    if causes := list(_find_byte_faults(task)):
-        return _Checked(causes)
+    if not task.path.is_file():
+        return _Checked(["it is missing"])
+    if task.entry is not None:
+        found = fingerprint(task.path)
+        if (found["bytes"], found["sha256"]) != (task.entry["bytes"], task.entry["sha256"]):
+            expected = f"{found['bytes']:,} of {task.entry['bytes']:,}"
+            return _Checked([f"its {expected} bytes are not those that were written"])
     try:
         shard = Shard(task.path)
         hashes = shard.table(["content_hash"]).column(0).to_pylist()
     except ShardError as error:
         return _Checked([_bare_cause(error, task.path)])
-    found = list(_find_record_faults(shard, hashes, count))
-    causes = _by_cause(((row, cause) for row, cause, _ in found), len(shard))
-    is_damaged = any(is_damage for *_, is_damage in found)
+    faults = list(_find_record_faults(shard, hashes, count))
+    causes = _by_cause(((row, cause) for row, cause, _ in faults), len(shard))
+    is_damaged = any(is_damage for *_, is_damage in faults)
     return _Checked(causes) if is_damaged else _Checked(causes, shard.info, hashes)
 
 
@@ -381,23 +358,6 @@ def _bare_cause(error: OpenVimaError, path: Path) -> str:
     """Return a reader's error message without file, record and remedy, which a problem adds."""
     text = str(error).removesuffix(f" {remedy(path.parent)}").removesuffix(".")
     return re.sub(rf"^{re.escape(str(path))}(, record \d+)?: (record \d+ of \d+ is )?", "", text)
-
-
-def _find_byte_faults(task: _ShardTask) -> Iterator[str]:
-    """Yield damage of the bytes, with its place."""
-    if not task.path.is_file():
-        yield "it is missing"
-    elif task.entry is not None:
-        found = fingerprint(task.path)
-        if (found["bytes"], found["sha256"]) == (task.entry["bytes"], task.entry["sha256"]):
-            return
-        content = memoryview(b"") if found["bytes"] == 0 else map_file(task.path)
-        places = [Envelope.from_entry(task.entry).fault_in(content)]
-        if task.index is not None:
-            broken = [row for row, span in enumerate(list_spans(task.index)) if span.fault_in(content)]
-            places += _by_cause(((row, "damaged") for row in broken), task.index.num_rows)
-        where = "; ".join(filter(None, places))
-        yield f"its bytes are not those that were written{f': {where}' if where else ''}"
 
 
 def _find_record_faults(
@@ -438,74 +398,13 @@ def _other_versions(info: ShardInfo) -> str:
     return ", ".join(f"{name} {version}" for name, version in wrote.items())
 
 
-@dataclass(frozen=True, slots=True)
-class _CacheTask:
-    """A file of the object cache, the shard it was made from, and the joint hash of that shard's episodes."""
-
-    path: Path
-    shard: Path
-    content_hash: str
-
-
-def check_cache_file(task: _CacheTask, count: Callable[[int], None]) -> list[str] | None:
-    """Compare a cache file with what its shard gives now.
-
-    Detectors do not run again. Of what they found, only the fields that depend on no detector are compared.
-
-    Args:
-        task: The file.
-        count: Called with the number of episodes compared so far.
-
-    Returns:
-        Problems; None if the file is outdated, for then it is replaced before it is used.
-    """
-    try:
-        cached = CacheFile(task.path)
-    except ShardError as error:
-        return [str(error).removeprefix(f"{task.path} ").split(". ")[0]]
-    if cached.source != task.content_hash:
-        return None
-    shard = Shard(task.shard)
-    if len(cached) != len(shard):
-        return [f"it has {len(cached)} of {len(shard)} episodes"]
-    return _by_cause(_find_cache_differences(cached, shard, count), len(shard))
-
-
-def _find_cache_differences(
-    cached: CacheFile, shard: Shard, count: Callable[[int], None]
-) -> Iterator[tuple[int, str]]:
-    names = _IN_ANY_CACHE if cached.variant else [f.name for f in fields(PreprocessedEpisode)]
-    for row in range(len(shard)):
-        try:
-            ours, theirs = cached[row], preprocess(shard[row], cached.kind)
-        except OpenVimaError as error:
-            yield row, f"it cannot be compared: {error}"
-            continue
-        is_left_out = cached.variant and not ours.num_steps
-        is_equal = ours.prompt.text == theirs.prompt.text and _are_equal(ours, theirs, names)
-        if not is_left_out and not is_equal:
-            yield row, "it differs from the demonstration"
-        count(row + 1)
-
-
-def _are_equal(ours: Any, theirs: Any, names: Iterable[str]) -> bool:
-    """Compare some fields of two records, nested records field by field."""
-    pairs = [(getattr(ours, name), getattr(theirs, name)) for name in names]
-    return all(
-        _are_equal(a, b, [f.name for f in fields(a)]) if is_dataclass(a) else np.array_equal(a, b)
-        for a, b in pairs
-    )
-
-
 def _by_cause(faults: Iterable[tuple[int, str]], num_rows: int) -> list[str]:
     """Group faults of records by cause: one text per cause, with the rows."""
     rows: dict[str, list[int]] = {}
     for row, cause in faults:
         rows.setdefault(cause, []).append(row)
-    return [f"{cause} ({_list_rows(found)} of {num_rows})" for cause, found in rows.items()]
-
-
-def _list_rows(rows: list[int]) -> str:
-    shown = ", ".join(map(str, rows[:_MAX_ROWS_NAMED]))
-    more = f" and {len(rows) - _MAX_ROWS_NAMED} more" if len(rows) > _MAX_ROWS_NAMED else ""
-    return f"record{'s' if len(rows) > 1 else ''} {shown}{more}"
+    return [
+        f"{cause} (record {', '.join(map(str, found[:_MAX_ROWS_NAMED]))}"
+        f"{' …' if len(found) > _MAX_ROWS_NAMED else ''} of {num_rows})"
+        for cause, found in rows.items()
+    ]

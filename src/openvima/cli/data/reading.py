@@ -15,10 +15,9 @@ from openvima.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from openvima.data.summary import Histogram, Summary, Unfinished
+    from openvima.data.summary import Histogram, Summary
 
 _BAR_WIDTH = 40
-_MOST_BARS = 12  # histograms with more are cut to their ends
 _NUM_AT_END = 5
 
 
@@ -36,7 +35,7 @@ def info(
     Example: openvima data info demos --html demos.html
 
     Args:
-        folder: Folder of a data set, finished or not; or hf://OWNER/NAME[@REVISION] on the Hugging Face Hub,
+        folder: Folder of a data set, or hf://OWNER/NAME[@REVISION] on the Hugging Face Hub,
             of which without details only the index is fetched.
         details: Count objects, textures and prompt images too; reads every file.
         html: Write a self-contained page with all of this and sample episodes.
@@ -48,16 +47,14 @@ def info(
     Returns:
         Exit status.
     """
-    from openvima.data.summary import Unfinished, summarise_folder
-    from openvima.errors import ConfigError, DatasetError
+    from openvima.data.summary import summarise_folder
+    from openvima.errors import ConfigError
 
     if html is not None and html.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"--html is {str(html)!r}; give the name of an HTML file, such as demos.html.")
     with progress_bar("files") if details or html else contextlib.nullcontext() as report:
         summary = summarise_folder(folder, details=details or html is not None, report=report)
-    if isinstance(summary, Unfinished) and (html is not None or appearance is not None):
-        raise DatasetError(f"{folder} is not finished; repeat the command that writes it.")
-    if html is not None and not isinstance(summary, Unfinished):
+    if html is not None:
         from openvima.data.page import write_page
 
         with progress_bar("episodes") as report:
@@ -66,8 +63,6 @@ def info(
         _write_appearance(folder, appearance)
     if as_json:
         print(json.dumps(summary.to_record(), indent=2, ensure_ascii=False))
-    elif isinstance(summary, Unfinished):
-        print("\n".join(_unfinished(summary)))
     else:
         for line in [
             *_summary(summary, _shown_name(folder, summary)),
@@ -149,7 +144,7 @@ def _task_table(summary: "Summary") -> "Table":
     from rich.table import Table
 
     table = Table("task", box=None, pad_edge=False, header_style="")
-    for name in ("episodes", "steps", "kB/episode", "images", "seeds tried", "oracle success", "resamples"):
+    for name in ("episodes", "steps", "kB/episode", "seeds tried", "oracle success", "resamples"):
         table.add_column(name, justify="right", no_wrap=True)
     table.columns[0].no_wrap = True
     for task in summary.tasks:
@@ -158,7 +153,6 @@ def _task_table(summary: "Summary") -> "Table":
             f"{task.episodes:,}",
             f"{task.steps:,}",
             f"{task.bytes / task.episodes / 1e3:.1f}",
-            "–" if task.image_fraction is None else f"{task.image_fraction:.0%}",
             f"{task.seeds_tried:,}",
             f"{task.success_rate:.1%}",
             f"{task.redraws:,}",
@@ -168,16 +162,10 @@ def _task_table(summary: "Summary") -> "Table":
 
 def _bars(histogram: "Histogram") -> Iterator[str]:
     yield histogram.title
-    total, most = sum(histogram.counts.values()), max(histogram.counts.values())
     width = max(map(len, histogram.counts))
-    entries = list(histogram.counts.items())
-    left_out = len(entries) - 2 * _NUM_AT_END if len(entries) > _MOST_BARS else 0
-    for place, (label, count) in enumerate(entries):
-        if left_out and place == _NUM_AT_END:
-            yield f"  {'':>{width}}  … {left_out} more …"
-        if not left_out or not _NUM_AT_END <= place < len(entries) - _NUM_AT_END:
-            bar = "█" * max(1, round(_BAR_WIDTH * count / most))
-            yield f"  {label:>{width}}  {bar} {count:,} ({count / total:.1%})"
+    for label, count, share, length in histogram.rows():
+        bar = f"{'█' * max(1, round(_BAR_WIDTH * length))} {count:,} ({share:.1%})" if count else ""
+        yield f"  {label:>{width}}  {bar}".rstrip()
 
 
 def _hints(has_details: bool, html: Path | None) -> Iterator[str]:
@@ -185,18 +173,6 @@ def _hints(has_details: bool, html: Path | None) -> Iterator[str]:
         yield f"\nPage: {html}"
     elif not has_details:
         yield "\n--details counts objects, textures and prompt images too; --html FILE shows episodes."
-
-
-def _unfinished(summary: "Unfinished") -> Iterator[str]:
-    yield (
-        f"{summary.folder}: not finished; {sum(summary.episodes.values()):,} episodes "
-        f"in {summary.shards:,} whole shards so far"
-    )
-    for task, episodes in summary.episodes.items():
-        yield f"{task:<28}{episodes:>10,}"
-    for name in summary.damaged:
-        yield f"{name} cannot be read"
-    yield "Repeating the command that wrote it goes on from there."
 
 
 if TYPE_CHECKING:
@@ -260,17 +236,13 @@ def _number(replay: str) -> int | None:
 def _text(found: "Verification") -> Iterator[str]:
     yield (
         f"{found.folder}: {found.num_shards:,} shards, {found.num_episodes:,} episodes compared with their "
-        f"hashes, {found.num_replayed:,} replayed{_cache_text(found)}"
+        f"hashes, {found.num_replayed:,} replayed"
     )
     yield from (f"note: {note}" for note in found.notes)
     yield _number_of_problems(found)
     for problem in found.problems:
         yield f"  {problem.file}: {problem.cause}"
     yield from (f"  → {remedy}" for remedy in sorted({problem.remedy for problem in found.problems}))
-
-
-def _cache_text(found: "Verification") -> str:
-    return f", {found.num_cache_files:,} cache files compared" if found.num_cache_files else ""
 
 
 def _number_of_problems(found: "Verification") -> str:
