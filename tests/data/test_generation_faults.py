@@ -112,7 +112,7 @@ def _time_of_a_run(server: Server, folder: Path) -> float:
 
 
 def _wait_for_writing(folder: Path) -> None:
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 120
     while not any(folder.glob(".*.tmp")) and not (folder / "dataset.json").exists():
         assert time.monotonic() < deadline
         time.sleep(0.001)
@@ -136,13 +136,15 @@ def test_the_command_killed_with_its_workers_is_continued(whole: Path, tmp_path:
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 60
-    while not any(out.glob("*.arrow")) and process.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    deadline = time.monotonic() + 300
+    try:
+        while not any(out.glob("*.arrow")) and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
     generate(config(out))
     assert contents(out) == contents(whole)
 
