@@ -16,7 +16,7 @@ from openvima.errors import ConfigError, SceneError, WorkerError
 from openvima.multiprocess import imap_unordered
 
 
-def wait_until(condition: Callable[[], bool], timeout_s: float = 30) -> None:
+def wait_until(condition: Callable[[], bool], timeout_s: float = 120) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"

@@ -1,7 +1,9 @@
-"""Random valid actions over all tasks do no harm: finite poses, on the table, well-formed observations."""
+"""Long use does no harm: random valid actions over all tasks, and memory and file handles after resets."""
 
 import itertools
 import math
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from task_cases import random_action
 
 SINKING_M = 0.002  # by which the lowest corner may be below the floor: contacts are springs
 FARTHEST_M = 3.0  # from the robot; nothing slides that far
+NUM_RESETS = 400
+MB = 2**20
 
 
 def assert_possible(scene: Scene, assets: Assets) -> None:
@@ -52,3 +56,24 @@ def test_random_actions_do_no_harm(task: str, num_actions: int) -> None:
             is_over = terminated or truncated
         if not left:
             return
+
+
+def resident_bytes() -> int:
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def num_handles() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+@pytest.mark.slow
+def test_hundreds_of_resets_leave_memory_and_file_handles_flat() -> None:
+    env = TabletopEnv("novel_adj_and_noun")
+    for seed in range(600):  # fills the caches of shapes, textures, hulls and models
+        env.reset(seed=seed)
+    before = resident_bytes(), num_handles()
+    for seed in range(NUM_RESETS):
+        env.reset(seed=1000 + seed)
+    assert num_handles() <= before[1]  # earlier tests may have left some that are closed meanwhile
+    assert resident_bytes() - before[0] < 10 * MB
