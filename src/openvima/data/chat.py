@@ -306,7 +306,7 @@ def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
     packer = zlib.compressobj(1, wbits=-15)
     inserted = packer.compress(repeated) + packer.flush(zlib.Z_FULL_FLUSH)
     data, checksum = [b"\x78\x01"], 1
-    for row in rows:
+    for row in map(bytes, rows):
         data += [packer.compress(row), packer.flush(zlib.Z_FULL_FLUSH), inserted]
         checksum = zlib.adler32(repeated, zlib.adler32(row, checksum))
     data += [packer.flush(), checksum.to_bytes(4, "big")]
@@ -352,5 +352,5 @@ def _unreadable(what: str, detail: str) -> AnswerError:
 
 
 def _is_number(value: object) -> bool:
-    is_one = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_one and -_MOST < value < _MOST  # NaN and infinity are not
+    # Neither NaN nor infinity is less.
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MOST
