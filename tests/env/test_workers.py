@@ -113,18 +113,16 @@ def test_an_error_that_cannot_be_sent_ends_all_too() -> None:
     assert not any(process.is_alive() for process in envs.processes)
 
 
-@pytest.mark.parametrize("is_stepping", [False, True])
 @pytest.mark.slow
-def test_a_killed_worker_is_reported_and_ends_all(is_stepping: bool) -> None:
+def test_a_killed_worker_is_reported_and_ends_all() -> None:
     envs = build(functools.partial(Faulty, step_s=0.3))
     envs.reset(seed=0)
-    if is_stepping:
-        envs.step_async(IDLE)
+    envs.step_async(IDLE)
     victim = envs.processes[1]
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
     with pytest.raises(WorkerError, match=r"sub-environment 1 \(exit code -9\) died; (?!.*__main__)"):
-        envs.step_wait() if is_stepping else envs.step(IDLE)
+        envs.step_wait()
     assert not any(process.is_alive() for process in envs.processes)
     envs.close()
 
@@ -157,23 +155,16 @@ def test_closing_lets_idle_workers_finish_and_stops_busy_ones() -> None:
 
 
 @pytest.mark.slow
-def test_a_call_at_the_wrong_time_is_refused_and_changes_nothing() -> None:
-    envs = build()
-    envs.reset(seed=0)
-    envs.step_async(IDLE)
-    with pytest.raises(gymnasium.error.AlreadyPendingCallError):
-        envs.step_async(IDLE)
-    assert envs.step_wait()[4]["num_steps"].tolist() == [1, 1]
-    envs.close()
-
-
-@pytest.mark.slow
-def test_an_argument_that_cannot_be_sent_is_refused_and_changes_nothing() -> None:
+def test_what_cannot_be_asked_for_is_refused_and_changes_nothing() -> None:
     envs = build()
     envs.reset(seed=0)
     with pytest.raises((AttributeError, pickle.PicklingError)):
         envs.call("prepare", lambda: 0)
     assert envs.get_attr("step_s") == (0.0, 0.0)
+    envs.step_async(IDLE)
+    with pytest.raises(gymnasium.error.AlreadyPendingCallError):
+        envs.step_async(IDLE)
+    assert envs.step_wait()[4]["num_steps"].tolist() == [1, 1]
     envs.close()
 
 
