@@ -27,7 +27,6 @@ from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, unknow
 from openvima.imports import import_extra
 
 POLL_S = 0.2
-PARENT_END_S = 5.0  # grace period for the parent to exit
 MAX_WORKERS = 1024
 _CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 WORKER_VARIABLES = {
@@ -187,19 +186,14 @@ def defer_sigint() -> Iterator[None]:
 def init_worker() -> None:
     """Initialise a worker: ignore SIGINT, and exit with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=exit_with_parent, args=(None,), daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
-def exit_with_parent(timeout_s: float | None = PARENT_END_S) -> None:
-    """Exit this worker once its parent has exited.
-
-    Args:
-        timeout_s: How long to wait for that; None waits for ever.
-    """
+def _exit_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None  # this only runs in workers
-    if wait_for([parent.sentinel], timeout_s):
-        os._exit(1)
+    wait_for([parent.sentinel])
+    os._exit(1)
 
 
 def _start_worker(counters: Any) -> None:

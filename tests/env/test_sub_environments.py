@@ -1,4 +1,4 @@
-"""Sub-environments: their infos, and episodes prepared ahead."""
+"""Episodes prepared ahead."""
 
 import zlib
 from collections.abc import Callable
@@ -7,55 +7,16 @@ from typing import Any  # infos are nested dictionaries
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import create_empty_array
 
 import openvima
 from openvima.env import TabletopEnv, stack_actions
-from openvima.env.sub_environments import SubEnvironments, batch_infos
+from openvima.env.vector import _Part
 from openvima.errors import ConfigError, SamplingError
 from openvima.scene import RenderedPrompt
 from openvima.tasks import sample_episode
 from task_cases import full_repr, random_action
-
-
-class Gathering(VectorEnv):
-    """Only for what it inherits: how infos are gathered."""
-
-    def __init__(self, num_envs: int) -> None:
-        self.num_envs = num_envs
-
-
-def gathered(infos: list[dict[str, Any] | None]) -> dict[str, Any]:
-    batch: dict[str, Any] = {}
-    envs = Gathering(len(infos))
-    for index, info in enumerate(infos):
-        if info is not None:
-            batch = envs._add_info(batch, info, index)
-    return batch
-
-
-def test_infos_are_joined_as_gymnasium_does() -> None:
-    full = {
-        "prompt": "Put it there.",
-        "failure": None,
-        "success": False,
-        "num_steps": 2,
-        "joints": np.arange(6, dtype=np.float32),
-        "scale": np.float32(0.5),
-        "progress": {"goals_met": 0.5, "distance_m": np.nan, "deeper": {"count": 1}},
-        "objects": {}.keys(),
-    }
-    ended = {"final_obs": {"ee": 1}, "final_info": full, **full, "success": True}
-    for infos in ([full, ended], [None, full, ended, None], [ended, None, {"num_steps": 7}], [None, {}], []):
-        ours, theirs = batch_infos(infos), gathered(infos)
-        assert full_repr(ours) == full_repr(theirs)
-        assert dtypes(ours) == dtypes(theirs)
-
-
-def dtypes(batch: dict[str, Any]) -> dict[str, Any]:
-    return {key: dtypes(value) if isinstance(value, dict) else value.dtype for key, value in batch.items()}
-
 
 # Scenes as prompts, several frames, a spatula, clutter, instructions in a row.
 SLOW_TASKS = [
@@ -180,16 +141,16 @@ class Recorder(gymnasium.Env):
         self.num_steps += 1
         return 1, 0.0, self.num_steps == self.length, False, {}
 
-    def prepare(self) -> None:
+    def prepare(self, seed: None) -> None:
         self.record("prepare")
         raise SamplingError("a reset will report it")
 
 
-def recorders(mode: AutoresetMode) -> tuple[SubEnvironments, Callable[[], list[tuple[int, str]]]]:
+def recorders(mode: AutoresetMode) -> tuple[_Part, Callable[[], list[tuple[int, str]]]]:
     """Three environments, of which the last one ends first, and what prepares all that can be."""
     calls: list[tuple[int, str]] = []
     envs = [Recorder(length, calls, index) for index, length in enumerate([9, 9, 1])]
-    played = SubEnvironments(envs, mode, create_empty_array(Recorder.observation_space, 3))
+    played = _Part(envs, [()] * 3, mode, create_empty_array(Recorder.observation_space, 3))
 
     def prepared() -> list[tuple[int, str]]:
         calls.clear()
@@ -203,7 +164,7 @@ def recorders(mode: AutoresetMode) -> tuple[SubEnvironments, Callable[[], list[t
 def test_each_is_prepared_once_and_first_what_the_next_step_resets() -> None:
     played, prepared = recorders(AutoresetMode.NEXT_STEP)
     assert prepared() == []  # no episode has begun
-    played.reset([None, None, None], None)
+    played.reset([None, None, None], np.ones(3, bool))
     played.step(np.zeros(3))
     assert prepared() == [(2, "prepare"), (0, "prepare"), (1, "prepare")]
     assert prepared() == []
@@ -218,7 +179,7 @@ def test_resets_with_seeds_are_not_expected_to_be_followed_by_others(
     mode: AutoresetMode, expected: list[tuple[int, str]]
 ) -> None:
     played, prepared = recorders(mode)
-    played.reset([1, 2, 3], None)
+    played.reset([1, 2, 3], np.ones(3, bool))
     assert prepared() == []
     played.step(np.zeros(3))
     assert prepared() == expected

@@ -10,9 +10,8 @@ if TYPE_CHECKING:
     from openvima.env.composed_objects import SceneObject
     from openvima.env.composing import compose
     from openvima.env.episode_file import load_episode, save_episode
-    from openvima.env.sub_environments import stack_actions
     from openvima.env.tabletop import TabletopEnv, VideoFrame
-    from openvima.env.vector import make_vec
+    from openvima.env.vector import make_vec, stack_actions
 
 __all__ = [
     "EnvConfig",
@@ -36,7 +35,7 @@ _HOMES = {
     "load_episode": "episode_file",
     "make_vec": "vector",
     "save_episode": "episode_file",
-    "stack_actions": "sub_environments",
+    "stack_actions": "vector",
 }
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)  # importing the environment imports MuJoCo and Numba

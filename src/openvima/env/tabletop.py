@@ -22,7 +22,6 @@ from openvima.env.running_episode import (
     ToolRun,
     VideoFrame,
 )
-from openvima.env.sub_environments import reset_option
 from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
 from openvima.html import notebook_html
 from openvima.render.camera import VIEWS, View
@@ -579,6 +578,23 @@ def _check_render_mode(render_mode: str | None) -> None:
 
 def _draw_seed(rng: np.random.Generator) -> int:
     return int(rng.integers(_LARGEST_SEED))
+
+
+def reset_option(options: object, name: str) -> Any:
+    """Return the one option that a reset takes, or None.
+
+    Args:
+        options: None, or a mapping with the option or nothing.
+        name: The option.
+
+    Raises:
+        ConfigError: The options are no mapping, or there is another one.
+    """
+    if not isinstance(options, Mapping | None):
+        raise ConfigError(f"options is a {type(options).__name__}; give None or a mapping with {name!r}.")
+    if unknown := set(options or ()) - {name}:
+        raise ConfigError(f"reset has no option {', '.join(sorted(map(str, unknown)))}; it takes {name!r}.")
+    return (options or {}).get(name)
 
 
 def _episode_option(options: object, assets: Assets) -> Episode | None:
