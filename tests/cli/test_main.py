@@ -2,8 +2,6 @@
 
 import errno
 import importlib
-import sys
-import threading
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -162,21 +160,6 @@ def test_an_interrupted_verb_says_what_that_means(
     assert main([verb]) == 130
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(last)
-
-
-@pytest.mark.parametrize(("error", "num_lines"), [(OSError(errno.EIO, "I/O error", "x"), 1), (KeyError(), 5)])
-def test_a_thread_that_the_system_refuses_something_is_one_line(
-    error: Exception, num_lines: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(words: Sequence[str]) -> int:
-        failure = (type(error), error, None, threading.current_thread())
-        threading.excepthook(threading.ExceptHookArgs(failure))
-        return 0
-
-    monkeypatch.setattr(threading, "excepthook", lambda failure: print("a\nb\nc\nd\ne", file=sys.stderr))
-    monkeypatch.setattr(importlib, "import_module", lambda name: SimpleNamespace(run=run))
-    assert main(["tasks"]) == 0
-    assert len(capsys.readouterr().err.splitlines()) == num_lines
 
 
 def test_what_a_message_quotes_cannot_steer_the_terminal(

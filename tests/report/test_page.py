@@ -81,7 +81,7 @@ def metrics(tmp_path):
 
 @pytest.fixture
 def text(results, clip, metrics, tmp_path) -> str:
-    path = write_report(results, tmp_path / "report.html", metrics=metrics, clips=[clip])
+    path = write_report(results, tmp_path / "report.html", runs=metrics, clips=[clip])
     return path.read_text(encoding="utf-8")
 
 
@@ -176,7 +176,7 @@ def test_charts_take_their_colours_from_the_page(text):
 
 
 def test_equal_results_give_equal_bytes(results, clip, metrics, tmp_path):
-    paths = [write_report(results, tmp_path / name, metrics=metrics, clips=[clip]) for name in ("a", "b")]
+    paths = [write_report(results, tmp_path / name, runs=metrics, clips=[clip]) for name in ("a", "b")]
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
@@ -540,12 +540,10 @@ def test_a_video_that_two_evaluations_made_is_shown_once(results, clip, tmp_path
         ("object 6 (red letter A) left the workspace", "the red letter A left the workspace"),
         (
             "object 6 (a b) is where distractor object 7 (c d) is",
-            "the a b was put where the c d, a distractor, lies",
+            "the a b is where the c d, a distractor, is",
         ),
-        ("object 6 (a b) came before object 7 (c d)", "the a b was moved before the c d"),
-        ("object came before object", "an object was moved before an object"),
-        ("2 goals are met instead of 1", "too much was moved: 2 goals met instead of 1"),
-        ("not done within the step limit: 1 of 3 goals were met", "out of steps, 1 of 3 goals met"),
+        ("object 6 (a b) came before object 7 (c d)", "the a b came before the c d"),
+        ("object came before object", "an object came before an object"),
         ("something of one's own", "something of one's own"),
     ],
 )

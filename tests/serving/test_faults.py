@@ -247,17 +247,6 @@ def test_a_slow_client_is_dropped_with_a_reason_and_holds_up_nobody(impatient_ur
             slow.recv()
 
 
-def test_a_message_of_endless_empty_fragments_ends_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("openvima.serving.server.CLOSE_S", 0.1)
-    frames = [Frame(Opcode.BINARY, b"x", fin=False)] + [Frame(Opcode.CONT, b"", fin=False)] * 1500
-    with serve_in_thread(ForMany()) as url, connect(url, compression=None, proxy=None) as endless:
-        endless.recv()
-        endless.socket.sendall(b"".join(frame.serialize(mask=True) for frame in frames))
-        with pytest.raises(ConnectionClosed, match="1,025 fragments of a short message"):
-            endless.recv()
-        assert plays(url, 6)
-
-
 def test_a_slow_sender_within_the_time_is_served(url: str) -> None:
     frame = Frame(Opcode.BINARY, good_messages()[0]).serialize(mask=True)
     with connect(url, compression=None, proxy=None) as slow:

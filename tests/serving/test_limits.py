@@ -5,13 +5,12 @@ import threading
 import time
 from typing import Any
 
-import numpy as np
 import pytest
 
 from openvima.policies.base import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
-from openvima.serving.protocol import MAX_PIXELS, encode_prompt, pack, unpack
+from openvima.serving.protocol import encode_prompt, pack, unpack
 from openvima.serving.server import Session
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
@@ -74,34 +73,11 @@ def test_every_count_of_a_prompt_is_bounded_before_the_policy_sees_it() -> None:
         (many, "65 images; this policy takes 64"),
         (few, "65 images; this policy takes 64"),
         (full, "400 objects; this policy takes 256"),
-        (prompt_with(objects=records(3, 3)), "two objects have one object_id"),
         (prompt_with(objects=records(256)), "object_id is 256; it must lie in 0 … 255"),
         (prompt_with(objects=records(2**63)), "must lie in 0 … 255"),
     ):
         assert reason in refusal({"type": "reset", "prompts": [sent]})
         assert reason in refusal({**made_up_observation(1), "prompt": sent})
-
-
-def test_objects_are_bounded_over_all_images_of_a_request() -> None:
-    prompts = [prompt_with(objects=records(*range(200)))] * 21
-    reason = "4,200 objects in all; at most 4,096 are allowed"
-    assert reason in refusal({"type": "reset", "prompts": prompts})
-    many = {"top": np.arange(25, dtype=np.uint8)[None]}
-    seen = {"rgb": {"top": np.zeros((3, 1, 25), np.uint8)}, "segm": many, "ee": 0}
-    reason = "1,600 objects in all; at most 1,536 are allowed"
-    assert reason in refusal({"type": "act", "observations": [seen] * 64})
-    session = Session(Untouched(), 64)
-    assert not isinstance(session.read(pack({"type": "act", "observations": [seen] * 61})), str)
-
-
-def test_images_are_bounded_in_size_and_views() -> None:
-    large = {"top": np.zeros((3, 2, MAX_PIXELS // 2 + 1), np.uint8)}
-    left = {"left": np.zeros((3, 4, 8), np.uint8)}
-    for rgb, reason in (
-        (large, "at most 1,048,576 are allowed"),
-        (left, "a view 'left'; allowed: front, top"),
-    ):
-        assert reason in refusal({"type": "act", "observations": [{"rgb": rgb, "ee": 0}]})
 
 
 def test_a_policy_states_its_own_limits() -> None:
@@ -128,13 +104,12 @@ def test_a_request_that_takes_long_to_read_keeps_nobody_waiting(monkeypatch: pyt
 
     monkeypatch.setattr("openvima.serving.server.unpack", slow)
     with serve_in_thread(ForMany()) as url, RemotePolicy(url) as bad, RemotePolicy(url) as good:
-        assert bad._connection is not None
-        bad._connection._socket.send(b"slow")
+        bad._socket.send(b"slow")
         assert reading.wait(10)
         good.reset([made_up_prompt(3)])
         assert told(good.act([made_up_observation(4)])[0]) == (3, 4, 1)
         finished.set()
-        assert "no whole MessagePack" in str(bad._connection._socket.recv())
+        assert "no whole MessagePack" in str(bad._socket.recv())
 
 
 def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCaptureFixture) -> None:

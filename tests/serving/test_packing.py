@@ -1,14 +1,13 @@
 """Messages as bytes: what goes in comes out, and what must not come in does not."""
 
 import pickle
-import tracemalloc
 
 import msgpack
 import numpy as np
 import pytest
 
 from openvima.errors import MessageError
-from openvima.serving.protocol import DTYPES, MAX_LENGTH, MAX_VALUES, pack, unpack
+from openvima.serving.protocol import DTYPES, MAX_LENGTH, pack, unpack
 
 
 def array_message(**changes: object) -> bytes:
@@ -80,51 +79,28 @@ def test_what_cannot_be_sent_is_named(value: object, message: str) -> None:
         (b"\x91" * 5000 + b"\xc0", "no whole MessagePack"),
         (b"\xdd\xff\xff\xff\xff", "no whole MessagePack"),
         (b"\xc6\xff\xff\xff\xff" + b"x", "no whole MessagePack"),
-        (array_message(dtype="|O"), "allowed: .*u1"),
+        (array_message(dtype="|O"), "one of the dtypes .*u1"),
         (array_message(dtype="O"), "dtype"),
         (array_message(dtype="<U3"), "dtype"),
         (array_message(dtype="V6"), "dtype"),
         (array_message(dtype="u1,u1"), "dtype"),
-        (array_message(dtype=["u1"]), "a list"),
-        (array_message(dtype=None), "a NoneType"),
-        (array_message(data="\0" * 6), "byte string"),
-        (array_message(data=[0] * 6), "byte string"),
-        (array_message(data=b"\0" * 5), "takes 6 bytes, got 5"),
+        (array_message(dtype=["u1"]), "dtype"),
+        (array_message(dtype=None), "dtype"),
+        (array_message(data="\0" * 6), "an array is damaged"),
+        (array_message(data=[0] * 6), "an array is damaged"),
+        (array_message(data=b"\0" * 5), "an array is damaged"),
         (array_message(shape=[2**40]), "shape"),
-        (array_message(shape=[2**31 - 1] * 4), "bytes, got 6"),
-        (array_message(shape=[2**31 - 1] * 8), "bytes, got 6"),
+        (array_message(shape=[2**31 - 1] * 4), "an array is damaged"),
+        (array_message(shape=[2**31 - 1] * 8), "an array is damaged"),
         (array_message(shape=[-2, -3]), "shape"),
         (array_message(shape=[6.0]), "shape"),
         (array_message(shape=[True, 6]), "shape"),
-        (array_message(shape=[1] * 40 + [6]), "shape"),
         (array_message(shape={}), "shape"),
         (array_message(shape=6), "shape"),
-        (array_message(more=1), "must have the entries"),
         (msgpack.packb({b"__ndarray__": True}), "must have the entries"),
-        (msgpack.packb({b"__npgeneric__": True, b"data": [1], b"dtype": "<i8"}), "data of a number"),
-        (msgpack.packb({b"__npgeneric__": True, b"data": 1, b"dtype": "O"}), "dtype"),
         (b"\xdc" + MAX_LENGTH.to_bytes(2, "big") + b"\x80" * MAX_LENGTH + b"!", "no whole MessagePack"),
     ],
 )
 def test_what_is_no_message_is_refused_with_a_reason(data: bytes, message: str) -> None:
     with pytest.raises(MessageError, match=message):
         unpack(data)
-
-
-@pytest.mark.slow
-def test_no_message_takes_many_times_its_size() -> None:
-    inner = b"\xdc" + MAX_LENGTH.to_bytes(2, "big")
-    wide = b"\xdc" + (MAX_VALUES // MAX_LENGTH + 8).to_bytes(2, "big")
-    empty_maps = wide + (inner + b"\x80" * MAX_LENGTH) * (MAX_VALUES // MAX_LENGTH + 8)
-    claims = (b"\xdd" + (200_000).to_bytes(4, "big")) * 200  # lists within lists that claim to be long
-    tracemalloc.start()
-    try:
-        with pytest.raises(MessageError, match="values"):
-            unpack(empty_maps)
-        assert tracemalloc.get_traced_memory()[1] < 120e6
-        tracemalloc.reset_peak()
-        with pytest.raises(MessageError):
-            unpack(claims)
-        assert tracemalloc.get_traced_memory()[1] < 120e6
-    finally:
-        tracemalloc.stop()

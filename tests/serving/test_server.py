@@ -121,7 +121,7 @@ def test_two_clients_at_once_do_not_mix(url: str) -> None:
         ({"type": "reset", "prompts": [3]}, "prompt 0 is 3; it must be a map"),
         ({"type": "reset"}, "lacks 'prompts'"),
         ({"type": "dance"}, "type 'reset' or 'act'"),
-        ({"prompt": 3}, "lacks 'rgb', 'ee'"),
+        ({"prompt": 3}, "lacks 'rgb'"),
         ([1, 2], "must be a map"),
         ("a text frame", "binary frames"),
         (b"\xc1", "no whole MessagePack"),
@@ -236,10 +236,8 @@ def test_a_host_that_others_reach_needs_a_token(host: str) -> None:
 
 
 def test_settings_out_of_range_are_named_together_and_tokens_are_not_shown() -> None:
-    with pytest.raises(ConfigError, match=r"port is 70000.*max_episodes is 0"):
+    with pytest.raises(ConfigError, match=r"max_episodes is 0.*port is at most 65535"):
         ServerConfig(port=70000, max_episodes=0)
     assert "secret" not in repr(ServerConfig(token="secret"))
-    with pytest.raises(ConfigError, match=r"no setting of a server 'tokn'\. Did you mean 'token'"):
-        serve(Telltale(), tokn="secret")
     with pytest.raises(PolicyError, match="the policy is a dict without reset and act"):
         serve({})

@@ -228,7 +228,6 @@ def _one_thread() -> "Iterator[None]":
 
 def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
     """Generate enough episodes for the frames."""
-    from openvima.cli.terminal import progress_bar
     from openvima.data import GenerateConfig, generate
 
     config = GenerateConfig(out=folder, level=level, start_seed=seed)

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,14 +16,12 @@ from openvima.cli.terminal import (
     print_left_out,
     print_table,
     progress_bar,
+    rich_table,
 )
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from openvima.evaluation import EvaluationConfig, Results
-    from openvima.evaluation.results import LevelMean
     from openvima.report import VideoSelection
 
 
@@ -323,63 +320,11 @@ def _print_scores(results: "Results", path: Path, *, as_json: bool) -> None:
 
 def print_results(results: "Results") -> None:
     """Print success rates as a table, a row a task and level, a column a policy; then the ablations."""
-    from rich.table import Table
+    from openvima.report.tables import ablation_tables, result_table
 
-    policies = results.policy_names()
-    means = results.means()
-    control = f", control {results.config['control']}" if "control" in results.config else ""
-    table = Table("level", title=f"success rates in % (95 % interval){control}")
-    table.add_column("task", overflow="fold", min_width=12)
-    for policy in policies:
-        table.add_column(policy, justify="right", no_wrap=True)
-    for level in results.levels():
-        for task in results.tasks(level):
-            rows = (results.row(policy, task, level) for policy in policies)
-            table.add_row(level, task, *(_cell(row.rate, row.interval) if row else "–" for row in rows))
-        level_means = (means.get((policy, "", level)) for policy in policies)
-        cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in level_means)
-        table.add_row(level, "mean", *cells, style="bold")
-        oracle_horizon = (_oracle_horizon_mean(results, policy, level) for policy in policies)
-        table.add_row(level, "mean within the oracle's steps", *oracle_horizon, end_section=True)
-    print_table(table, num_heads=2)
-    if any(row.ablation for row in results.rows):
-        print_table(_ablation_table(results, means), num_heads=2)
-
-
-def _ablation_table(results: "Results", means: "Mapping[tuple[str, str, str], LevelMean]") -> "Table":
-    """Level means of each policy, plain and under each ablation."""
-    from rich.table import Table
-
-    from openvima.report.text import ablation_name
-
-    table = Table("policy", "ablation", title="input ablations: means in % (95 % interval)")
-    for level in results.levels():
-        table.add_column(level, justify="right", no_wrap=True)
-    for policy, ablation in dict.fromkeys((row.policy, row.ablation) for row in results.rows):
-        found = ((means.get((policy, ablation, level)), level) for level in results.levels())
-        cells = (_mean_cell(mean, len(results.tasks(level))) if mean else "–" for mean, level in found)
-        table.add_row(policy, ablation_name(ablation) or "–", *cells)
-    return table
-
-
-def _oracle_horizon_mean(results: "Results", policy: str, level: str) -> str:
-    """Mean success rate within the oracle's step limit, which is two steps shorter."""
-    rows = [row for task in results.tasks(level) if (row := results.row(policy, task, level)) is not None]
-    return (
-        f"{100 * sum(row.successes_oracle_horizon / row.episodes for row in rows) / len(rows):.1f}"
-        if rows
-        else "–"
-    )
-
-
-def _mean_cell(mean: "LevelMean", num_tasks: int) -> str:
-    """A mean, with its number of tasks where an ablation applies to some of them only."""
-    count = f", {len(mean.tasks)} tasks" if len(mean.tasks) < num_tasks else ""
-    return _cell(mean.mean, mean.interval) + count
-
-
-def _cell(rate: float, interval: tuple[float, float]) -> str:
-    return f"{100 * rate:.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
+    print_table(rich_table(result_table(results)), num_heads=2)
+    for table in ablation_tables(results):
+        print_table(rich_table(table))
 
 
 def _with_boxes(ablations: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 import argparse
 import importlib
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -45,15 +44,6 @@ VERBS = {
 
 _HELP = ("-h", "--help")
 _MAX_MESSAGE = 4000  # characters
-_MEMORY_REMEDIES = {
-    "train": "lower --loader.batch-size or raise --optimizer.grad-accum-steps",
-    "detector": "lower --loader.batch-size",
-    "evaluate": "lower --batch or --workers",
-    "study": "lower --workers",
-    "generate": "lower --workers",
-    "quickstart": "lower --workers",
-    "data": "lower --workers",
-}
 _RESUMES = "interrupted; complete files were kept, and the same command resumes."
 _INTERRUPTED = {
     **dict.fromkeys(("generate", "data", "train", "detector", "evaluate", "study", "quickstart"), _RESUMES),
@@ -92,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] not in VERBS:
         return _fail(unknown_name("verb", words[0], VERBS), 2)
     one_warning = one_word_warning() if words[0] in _SCORING else nullcontext()
-    with _warnings_in_one_line(), one_warning, _failed_threads_in_one_line():
+    with _warnings_in_one_line(), one_warning:
         return _run(words[0], words[1:])
 
 
@@ -135,7 +125,7 @@ def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, i
     """Return the line that reports an exception, and the exit status; raise it if it is a bug."""
     name, out = type(error).__name__, _out(rest)
     if lacks_memory(error):
-        remedy = _MEMORY_REMEDIES.get(verb, "close other programs")
+        remedy = "lower the size of batches or the number of workers"
         return f"out of memory while working on {out}; {remedy}. Complete files were kept.", 1
     if isinstance(error, OpenVimaError):
         from openvima.cli.options import name_options
@@ -187,24 +177,6 @@ def _warnings_in_one_line() -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = shown
-
-
-@contextmanager
-def _failed_threads_in_one_line() -> Iterator[None]:
-    """Print what the system refused to a thread of a library, such as to write, without its traceback."""
-    shown = threading.excepthook
-
-    def show(failure: threading.ExceptHookArgs) -> None:
-        if isinstance(failure.exc_value, OSError | MemoryError):
-            _fail(f"{failure.exc_type.__name__}: {failure.exc_value}", 0)
-        else:
-            shown(failure)
-
-    threading.excepthook = show
-    try:
-        yield
-    finally:
-        threading.excepthook = shown
 
 
 def _fail(message: str, status: int) -> int:

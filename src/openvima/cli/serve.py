@@ -61,10 +61,10 @@ def main(
     from openvima.policies import load_policy
     from openvima.serving import serve
     from openvima.serving.protocol import TOKEN_VARIABLE, require_extra
-    from openvima.serving.server import server_config
+    from openvima.serving.server import ServerConfig
 
     require_extra()  # before the seconds that loading takes
-    settings = server_config(
+    settings = ServerConfig(
         host=host,
         port=port,
         token=token or os.environ.get(TOKEN_VARIABLE) or None,

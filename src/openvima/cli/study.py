@@ -11,7 +11,6 @@ import tyro
 from openvima.cli.terminal import parse_list, print_table, progress_bar
 
 if TYPE_CHECKING:
-    from openvima.studies import StudyInputs
     from openvima.studies.plan import Plan
 
 
@@ -58,13 +57,14 @@ def main(
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
         device: Where networks are trained and act: cpu or cuda. By default they are trained on a GPU if
             there is one, and act on a CPU.
-        dry_run: Print runs and estimated time, from a measurement of about a minute at nano; write nothing.
+        dry_run: Print the stages; write nothing.
 
     Returns:
         Exit status.
     """
     from openvima.studies import Execution, StudyInputs, check_options, make_study, run_study, scale_named
     from openvima.studies.plan import plan_study
+    from openvima.studies.runner import check_plan
 
     sizes = scale_named(scale)
     if episodes is not None:
@@ -84,7 +84,9 @@ def main(
     command = " ".join([start, *words, "--out DIR"])
     execution = Execution(workers, engine, address)
     if dry_run:
-        _print_estimates(plan_study(study, inputs, out, seeds=seeds, device=device), inputs, workers or 1)
+        found = plan_study(study, inputs, out, seeds=seeds, device=device)
+        check_plan(found, inputs)
+        _print_plan(found)
         return 0
     with progress_bar("stages") as bar:
         page = run_study(
@@ -95,23 +97,19 @@ def main(
     return 0
 
 
-def _print_estimates(plan: "Plan", inputs: "StudyInputs", workers: int) -> None:
-    """Print what would be done, and how long it would take."""
+def _print_plan(plan: "Plan") -> None:
     from rich.table import Table
 
-    from openvima.studies.estimate import estimate
-    from openvima.studies.results import duration
-    from openvima.studies.runner import check_plan
+    from openvima.evaluation.config import plan as plan_evaluation
 
-    check_plan(plan, inputs)
-    estimates = estimate(plan, lambda text: print(f"measuring: {text}", file=sys.stderr))
-    table = Table("stage", title="estimated time, from a short measurement on this machine")
-    table.add_column("number", justify="right")
-    table.add_column("time", justify="right")
-    for found in estimates:
-        table.add_row(found.what, f"{found.count}", duration(found.seconds))
-    total = sum(found.seconds for found in estimates)
-    table.add_row("all, in one process", "", duration(total), style="bold")
-    if workers > 1:
-        table.add_row(f"with {workers} workers, at best", "", duration(total / workers), style="bold")
-    print_table(table, num_heads=1)
+    table = Table("stage", "folder")
+    for demonstrations, out in plan.data.items():
+        table.add_row(
+            f"{demonstrations.episodes:,} demonstrations of {len(demonstrations.tasks)} tasks", f"{out}"
+        )
+    for training in (*plan.initial, *plan.trainings):
+        table.add_row(f"training of {training.config.preset}", f"{training.config.out}")
+    for evaluation in plan.evaluations:
+        episodes = sum(batch.episodes for batch in plan_evaluation(evaluation.config))
+        table.add_row(f"evaluation in {episodes:,} episodes", f"{evaluation.config.out}")
+    print_table(table)

@@ -1,16 +1,14 @@
 """What commands read and print: options that hold several values, streams of any encoding, progress, tables.
 
-Progress is shown on stderr: bars for `report(done, total, note)` callbacks, and a table for generating. Where
-stderr is no terminal, both are lines: one at each stage, one a minute and one at the end.
+Progress is shown on stderr: bars for `report(done, total, note)` callbacks. Where stderr is no terminal,
+these are lines: one at each stage, one a minute and one at the end.
 """
 
-import codecs
 import io
 import os
 import re
 import sys
 import time
-import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,51 +61,11 @@ def parse_shard_range(text: str | None) -> tuple[int, int] | None:
     return None if found is None else (int(found[1]), int(found[2]))
 
 
-_ALIKE = {
-    **dict.fromkeys("–−—", "-"),
-    **dict.fromkeys("“”„", '"'),
-    **dict.fromkeys("‘’", "'"),
-    **dict.fromkeys("─━═╌╴╶╸╺", "-"),
-    **dict.fromkeys("│┃║", "|"),
-    "×": "x",
-    "·": ".",
-    "•": "*",
-    "→": "->",
-    "≈": "~",
-    "≤": "<=",
-    "°": " deg",
-    "±": "+-",
-}
-
-
 def accept_any_text() -> None:
-    """Let stdout and stderr replace letters that their encoding lacks, instead of failing.
-
-    Undecodable bytes of file names are written as they are.
-    """
-    codecs.register_error("openvima.alike", _alike)
+    """Let stdout and stderr escape letters that their encoding lacks, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="openvima.alike")
-
-
-def _alike(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Replace the first letter of an encoding error by similar ASCII letters."""
-    if not isinstance(error, UnicodeEncodeError):
-        return codecs.backslashreplace_errors(error)
-    letter = error.object[error.start]
-    if "\udc80" <= letter <= "\udcff":  # as `os.fsdecode` stands for a byte
-        return bytes([ord(letter) - 0xDC00]), error.start + 1
-    return _ascii(letter), error.start + 1
-
-
-def _ascii(letter: str) -> str:
-    if letter in _ALIKE:
-        return _ALIKE[letter]
-    if "\u2500" <= letter <= "\u257f":  # box drawing
-        return "+"
-    plain = unicodedata.normalize("NFKD", letter)
-    return "".join(c for c in plain if c.isascii()) or "?"
+            stream.reconfigure(errors="backslashreplace")
 
 
 Report = Callable[[int, int, str], None]
@@ -170,7 +128,7 @@ def progress_bar(label: str) -> Iterator[Report]:
         progress.stop()
 
 
-def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> Callable[..., None]:
+def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> Report:
     """Return a progress callback that prints lines: at each stage, once a minute, and at the end.
 
     Args:
@@ -232,10 +190,6 @@ class Pace:
         return f"{text}, {speed}{left}"
 
 
-def _percent(part: int, whole: int) -> str:
-    return f"{100 * part / whole:.1f} %" if whole else ""
-
-
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
@@ -246,6 +200,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from openvima.report import table as report
+
 PIPE_WIDTH = 150  # characters, where nothing says how wide the reader is
 
 
@@ -255,6 +211,23 @@ def table_console() -> "Console":
 
     console = Console(highlight=False)
     return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=PIPE_WIDTH)
+
+
+def rich_table(table: "report.Table") -> "Table":
+    """Return a table of `openvima.report` for the terminal."""
+    from rich.table import Table
+
+    shown = Table(title=table.caption)
+    for number, name in enumerate(table.columns):
+        is_text = number == 0 or all(isinstance(line.cells[number - 1], str) for line in table.lines)
+        justify, overflow = ("left", "fold") if is_text else ("right", "ellipsis")
+        shown.add_column(name, justify=justify, overflow=overflow, no_wrap=not is_text)
+    for line in table.lines:
+        if line.starts_group:
+            shown.add_section()
+        cells = (cell if isinstance(cell, str) else cell.brief for cell in line.cells)
+        shown.add_row(line.name, *cells)
+    return shown
 
 
 def print_left_out(tasks: Sequence[str], prompts: str, levels: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ import yaml
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog import LEVELS, Assets, load_assets, object_spec, texture_spec
-from openvima.env.composed_objects import MAX_ENTRIES, WORKSPACE, odd_character, shown
+from openvima.env.composed_objects import WORKSPACE, shown
 from openvima.env.composing import MAX_STEPS, composed, read_photo
 from openvima.errors import InputFileError, OpenVimaError, SceneError, echo, unknown_name
 from openvima.input_files import as_path, read_json, read_yaml
@@ -56,7 +56,6 @@ _KINDS: dict[Any, tuple[type, ...]] = {  # classes of fields that take several; 
 }
 _IMAGES = tuple[tuple[str, PromptFill], ...]  # a mapping in files
 _MAX_NUMBER = 100.0  # metres, radians and factors
-_MAX_CHARS = 4096
 _WORD = re.compile(r"\w[\w.+-]{0,99}")
 
 
@@ -83,10 +82,6 @@ def save_episode(episode: Episode, path: str | Path) -> Path:
     if not same:
         raise InputFileError("the episode cannot be saved, for it would not be loaded equal.")
     text = json.dumps(values, indent=1, ensure_ascii=False) + "\n" if is_json else yaml_text(values)
-    if (size := len(text.encode())) > MAX_EPISODE_BYTES:
-        raise InputFileError(
-            f"the episode cannot be saved: it takes {size} bytes, and {MAX_EPISODE_BYTES} are allowed."
-        )
     return atomic_write_file(path, text)
 
 
@@ -255,10 +250,8 @@ def _record(value: Any, kind: Any, where: str) -> Any:
 
 
 def _tuple(value: Any, kind: Any, where: str) -> tuple[Any, ...]:
-    if not isinstance(value, list | tuple) or len(value) > MAX_ENTRIES:
-        raise InputFileError(
-            f"{where} is {shown(value)}; it must be a list of at most {MAX_ENTRIES} entries."
-        )
+    if not isinstance(value, list | tuple):
+        raise InputFileError(f"{where} is {shown(value)}; it must be a list.")
     kinds = _entry_kinds(kind, len(value))
     if len(kinds) != len(value):
         raise InputFileError(f"{where} has {len(value)} entries; it must have {len(kinds)}.")
@@ -273,11 +266,7 @@ def _scalar(value: Any, kind: Any, where: str) -> Any:
         return value
     if kind is float and type(value) in (int, float) and abs(value) <= _MAX_NUMBER:  # NaN is not
         return float(value)
-    if kind is str and isinstance(value, str) and len(value) <= _MAX_CHARS:
-        if odd := odd_character(value, allowed="\t\n"):
-            raise InputFileError(
-                f"{where} is {shown(value)}, with the character {odd}, which is not for text."
-            )
+    if kind is str and isinstance(value, str):
         return value
     if kind is bytes and isinstance(value, str):
         try:
@@ -288,7 +277,7 @@ def _scalar(value: Any, kind: Any, where: str) -> Any:
         float: f"a number from {-_MAX_NUMBER:g} to {_MAX_NUMBER:g}",
         int: "a whole number",
         bool: "true or false",
-        str: f"text of at most {_MAX_CHARS} characters",
+        str: "text",
         bytes: "base64 text",
     }[kind]
     raise InputFileError(f"{where} is {shown(value)}; it must be {allowed}.")

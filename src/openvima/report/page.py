@@ -3,12 +3,12 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.config import DEFAULT_BATCH
-from openvima.evaluation.results import EpisodeOutcome, Results
+from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
 from openvima.input_files import as_path, names_of
@@ -16,18 +16,9 @@ from openvima.policies.naming import UNTRAINED, VLM
 from openvima.report import figures, published, tables, text
 from openvima.report.ablations import ablated_policies, rate_figures
 from openvima.report.curves import read_run_charts
-from openvima.report.published import published_task_table
-from openvima.report.tables import family_table, level_drop_table, level_figure
-from openvima.report.text import Confirmation, plain_reason
+from openvima.report.text import Confirmation
 from openvima.video.encoder import Clip
 
-_FUNCTIONS = (  # that the templates in `html/templates/report/` call
-    *(text.percent, text.exact, text.points, text.points_span, text.probability, text.span, text.counted),
-    *(text.answers, text.listed, text.role, text.finding, text.ablation_name, text.ablation_descriptions),
-    *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
-    *(published.published_rate, published.published_coverage, published.published_rows),
-    *(published.leading_models, figures.rate_figure_html, figures.table_html, text.plain_reason),
-)
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
     "prompts": "multimodal",
@@ -49,7 +40,6 @@ def write_report(
     out: str | Path,
     *,
     command: str = "",
-    metrics: str | Path | None = None,
     runs: str | Path | Sequence[str | Path] = (),
     clips: Sequence[Clip] = (),
     comparisons: Sequence[Comparison] | None = None,
@@ -63,8 +53,7 @@ def write_report(
         results: What was found.
         out: The HTML file to write.
         command: The command that repeats the evaluation; by default composed from `results.config`.
-        metrics: `metrics.jsonl` of the training run, for its curves.
-        runs: Folders of training runs, for theirs.
+        runs: Folders of training runs, or their `metrics.jsonl`, for their curves.
         clips: Recorded episodes.
         comparisons: Policies to compare; by default those of `comparison.default_pairs`.
         notes: Warnings to put at the top.
@@ -82,27 +71,21 @@ def write_report(
         comparisons = compare_pairs(results, default_pairs(results))
     with_published = with_published and published.is_comparable(results)
     out = as_path(out)
-    records = [*map(as_path, [*([metrics] if metrics else []), *names_of(runs)])]
+    records = [as_path(run) for run in names_of(runs)]
     clips = list({clip.file_name: clip for clip in clips}.values())
     videos = video_ids(clips)
     listed, num_episodes = listed_episodes(results, videos)
     page = render_page(
         "report",
-        **{function.__name__: function for function in _FUNCTIONS},
-        disagreements=disagreements,
-        level_names=text.LEVEL_NAMES,
-        level_meanings=text.LEVEL_MEANINGS,
+        text=text,
+        tables=tables,
+        figures=figures,
+        published=published,
         published_column=with_published
         and any(published.published_tasks(row.level).get(row.task) for row in results.rows),
-        published_model=" ".join(published.BESIDE),
-        reliability=published.RELIABILITY,
-        by_task=published.BY_TASK,
         results=results,
         means=results.means(),
         colours=text.series_colours(results),
-        headline=text.headline(results),
-        summary=text.findings(results),
-        measured=text.measured(results),
         notes=notes,
         clips=clips,
         videos=videos,
@@ -113,10 +96,10 @@ def write_report(
         all_confirmed=bool(confirmations) and all(each.confirmed for each in confirmations),
         ablations=ablated_policies(results),
         rate_figures=rate_figures(results),
-        families=family_table(results, published=with_published),
-        level_figure=level_figure(results, published=with_published),
-        level_drop=level_drop_table(results, published=with_published),
-        published_tasks=published_task_table(results) if with_published else None,
+        families=tables.family_table(results, published=with_published),
+        level_figure=tables.level_figure(results, published=with_published),
+        level_drop=tables.level_drop_table(results, published=with_published),
+        published_tasks=published.published_task_table(results) if with_published else None,
         published_results=published.published_rows(results, published.published_models())
         if with_published
         else [],
@@ -184,35 +167,6 @@ def _policy_word(name: str, what: Mapping[str, Any]) -> str:
 MOST_EPISODES = 4000  # that are listed; of more, failures alone
 
 
-class ListedEpisode(NamedTuple):
-    """One episode, how it ended, and the id of its video on the page; that is empty without one."""
-
-    policy: str
-    level: str
-    task: str
-    outcome: EpisodeOutcome
-    video: str
-
-    @property
-    def reason(self) -> str:
-        """Why it failed, in plain English; empty on success."""
-        return plain_reason(self.outcome.reason)
-
-    @property
-    def cause(self) -> str:
-        """The same without the names of objects, for a menu."""
-        return plain_reason(self.outcome.kind)
-
-
-class Disagreement(NamedTuple):
-    """Seeds of a task and level that only one of two policies solved."""
-
-    task: str
-    level: str
-    only_a: tuple[int, ...]
-    only_b: tuple[int, ...]
-
-
 def video_ids(clips: Sequence[Clip]) -> dict[tuple[str, str, str, int], str]:
     """Name each video of the page, by policy, task, level and seed."""
     return {(c.policy, c.task, c.level, c.seed): f"video-{number}" for number, c in enumerate(clips, 1)}
@@ -220,7 +174,7 @@ def video_ids(clips: Sequence[Clip]) -> dict[tuple[str, str, str, int], str]:
 
 def listed_episodes(
     results: Results, videos: Mapping[tuple[str, str, str, int], str]
-) -> tuple[list[ListedEpisode], int]:
+) -> tuple[list[tuple[Row, EpisodeOutcome, str]], int]:
     """List the episodes without input ablations, failures first.
 
     Args:
@@ -228,29 +182,16 @@ def listed_episodes(
         videos: Ids of the videos on the page.
 
     Returns:
-        At most `MOST_EPISODES` episodes, and how many there are.
+        At most `MOST_EPISODES` episodes, each with its row and the id of its video, or an empty one; and how many
+        there are.
     """
     episodes = [
-        ListedEpisode(r.policy, r.level, r.task, o, videos.get((r.policy, r.task, r.level, o.seed), ""))
-        for r in results.rows
-        if not r.ablation
-        for o in r.outcomes
+        (row, outcome, videos.get((row.policy, row.task, row.level, outcome.seed), ""))
+        for row in results.rows
+        if not row.ablation
+        for outcome in row.outcomes
     ]
-    ranked = sorted(episodes, key=lambda episode: episode.outcome.success)
+    ranked = sorted(episodes, key=lambda episode: episode[1].success)
     if len(ranked) > MOST_EPISODES:
-        ranked = [episode for episode in ranked if not episode.outcome.success][:MOST_EPISODES]
+        ranked = [episode for episode in ranked if not episode[1].success][:MOST_EPISODES]
     return ranked, len(episodes)
-
-
-def disagreements(results: Results, comparison: Comparison) -> list[Disagreement]:
-    """List the episodes that only one of two policies solved; none for scores under an input ablation."""
-    found = []
-    for difference in comparison.tasks:
-        rows = [results.row(name, difference.task, difference.level) for name in (comparison.a, comparison.b)]
-        solved = [{o.seed: o.success for o in row.outcomes} for row in rows if row is not None]
-        if len(solved) == 2 and (difference.only_a or difference.only_b):
-            a, b = solved
-            only_a = tuple(seed for seed in a if a[seed] and b.get(seed) is False)
-            only_b = tuple(seed for seed in b if b[seed] and a.get(seed) is False)
-            found.append(Disagreement(difference.task, difference.level, only_a, only_b))
-    return found

@@ -56,6 +56,12 @@ class Estimate:
         """Its interval in words: "59.6 to 98.2"."""
         return " to ".join(map(self._percentage, self.interval))
 
+    @property
+    def brief(self) -> str:
+        """The number with its interval in whole percent, for a terminal: "86.7 (60–98)"."""
+        low, high = (round(100 * end) for end in self.interval)
+        return f"{self.written} ({low}–{high}){f' {self.mark}' if self.mark else ''}"
+
     def _percentage(self, fraction: float) -> str:
         return f"{100 * fraction:{'+' if self.signed else ''}.1f}".replace("-", "−")
 

@@ -80,6 +80,20 @@ def _by_task(counts: Counter[str]) -> str:
     return f"{named} and {counted(rest, 'other task')}" if rest > 0 else named
 
 
+def disagreements(results: Results, comparison: Comparison) -> list[tuple[str, str, list[int], list[int]]]:
+    """List task, level and the seeds that only one of two policies solved; none for input ablations."""
+    found = []
+    for difference in comparison.tasks:
+        rows = [results.row(name, difference.task, difference.level) for name in (comparison.a, comparison.b)]
+        solved = [{o.seed for o in row.outcomes if o.success} for row in rows if row is not None]
+        played = [{o.seed for o in row.outcomes} for row in rows if row is not None]
+        if len(solved) == 2 and (difference.only_a or difference.only_b):
+            only_a = sorted(solved[0] & played[1] - solved[1])
+            only_b = sorted(solved[1] & played[0] - solved[0])
+            found.append((difference.task, difference.level, only_a, only_b))
+    return found
+
+
 FAMILIES = (  # in the paper's order
     "simple_object_manipulation",
     "visual_goal_reaching",
@@ -251,18 +265,13 @@ def paper_tables(
     means = results.means()
     published = published and is_comparable(results)
     by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
-    with_ablations = [
-        _ablation_table(results, means, policy)
-        for policy in results.policy_names()
-        if any(row.policy == policy and row.ablation for row in results.rows)
-    ]
     chosen = [
         _mean_table(results, means, published=published),
         level_drop_table(results, published=published),
         family_table(results, published=published),
         *by_policy,
         published_task_table(results) if published else None,
-        *with_ablations,
+        *ablation_tables(results),
         *map(rate_table, rate_figures(results)),
         *map(_difference_table, comparisons),
     ]
@@ -320,6 +329,32 @@ def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
             "read off figures, to about 0.2 points, those with ~ to about 0.5."
         )
     return Table("levels", caption, ("policy", *levels), tuple(lines))
+
+
+def result_table(results: Results) -> Table:
+    """Success rates of all policies by level and task, with the mean of each level."""
+    policies, means = results.policy_names(), results.means()
+    lines: list[Line] = []
+    for level in results.levels():
+        tasks = results.tasks(level)
+        for task in tasks:
+            rows = [results.row(policy, task, level) for policy in policies]
+            cells = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
+            lines.append(Line(level, (task, *cells), starts_group=bool(lines) and task == tasks[0]))
+        own = [_mean_cell(means.get((policy, "", level)), len(tasks)) for policy in policies]
+        lines.append(Line(level, ("mean", *own)))
+        if horizon := oracle_horizon_means(results, level):
+            cells = [Estimate(*mean) if mean else "–" for mean in horizon]
+            lines.append(Line(level, ("mean within the oracle's steps", *cells)))
+    control = f", control {results.config['control']}" if "control" in results.config else ""
+    caption = f"success rates in % (95 % interval){control}"
+    return Table("results", caption, ("level", "task", *policies), tuple(lines))
+
+
+def ablation_tables(results: Results) -> list[Table]:
+    """Level means of each policy that was evaluated with input ablations, plain and under each of them."""
+    ablated = dict.fromkeys(row.policy for row in results.rows if row.ablation)
+    return [_ablation_table(results, results.means(), policy) for policy in ablated]
 
 
 def _task_table(results: Results, means: _Means, policy: str) -> Table:

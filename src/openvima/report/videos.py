@@ -104,7 +104,7 @@ def evaluate_and_report(
                 results,
                 config.out / REPORT_NAME,
                 command=default_command(results, config.policies),
-                metrics=find_metrics(served.sources),
+                runs=find_metrics(served.sources),
                 clips=_recorded(recording_jobs(served, videos, results), served, note),
                 confirmations=[
                     Confirmation.of(results, "DIR", confirmed=is_marked_verified(config.out)),
@@ -226,16 +226,13 @@ def record_clip(job: Job, count: Callable[[int], None]) -> Clip:
     )
 
 
-def find_metrics(sources: Sequence[PolicySource]) -> Path | None:
-    """The training record of the first trained policy that has one."""
-    for source in sources:
-        if source.source in BUNDLED:  # a name, not a path
-            continue
-        folder = Path(source.source)
-        for place in (folder, folder.parent, folder.parent.parent):
-            if source.kind == "run" and (place / METRICS_FILE).is_file():
-                return place / METRICS_FILE
-    return None
+def find_metrics(sources: Sequence[PolicySource]) -> list[Path]:
+    """Return the training record of the first trained policy that has one."""
+    folders = [
+        Path(source.source) for source in sources if source.kind == "run" and source.source not in BUNDLED
+    ]
+    places = [place for folder in folders for place in (folder, folder.parent, folder.parent.parent)]
+    return [place / METRICS_FILE for place in places if (place / METRICS_FILE).is_file()][:1]
 
 
 def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int) -> Job:

@@ -7,9 +7,8 @@ counts only after it was compared with the bytes that are there.
 """
 
 import ipaddress
-import math
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -25,16 +24,10 @@ DTYPES = {
     dtype.str: dtype
     for dtype in map(np.dtype, ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f2", "f4", "f8"))
 }
-MAX_AXES = 8
-# A million empty maps are a megabyte of MessagePack and 72 MB of Python. These bound what a message can take
-# beyond its own size: the values in all its lists and maps; and those of one, as older versions of msgpack
-# set memory aside for what a list claims to hold. A batch of 256 episodes has some 170,000 values.
-MAX_VALUES = 1_000_000
-MAX_LENGTH = 4096
+MAX_LENGTH = 4096  # of a list or map: older versions of msgpack set memory aside for what one claims to hold
 
 _ARRAY = b"__ndarray__"
 _NUMBER = b"__npgeneric__"  # a single number of numpy, as some clients send it
-_ARRAY_KEYS = frozenset((_ARRAY, b"data", b"dtype", b"shape"))
 
 
 def require_extra() -> None:
@@ -61,8 +54,6 @@ def pack(message: object) -> bytes:
     try:
         packed = msgpack.packb(message, default=_pack_array)
     except (TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, MessageError):
-            raise
         raise MessageError(f"the message cannot be packed: {error}") from error
     assert isinstance(packed, bytes)
     return packed
@@ -82,12 +73,10 @@ def unpack(data: bytes) -> Any:
     """
     import msgpack
 
-    counter = _ItemCounter()
     try:
         return msgpack.unpackb(
             data,
-            object_hook=counter.map_or_array,
-            list_hook=counter.list,
+            object_hook=_unpack_array,
             max_array_len=MAX_LENGTH,
             max_map_len=MAX_LENGTH,
             max_ext_len=0,
@@ -99,82 +88,34 @@ def unpack(data: bytes) -> Any:
         raise MessageError(f"these {len(data):,} bytes are no whole MessagePack message: {reason}") from error
 
 
-class _ItemCounter:
-    """Counts the values of a message while it is read."""
-
-    def __init__(self) -> None:
-        self._num_values = 0
-
-    def list(self, values: list) -> list:
-        self._count(len(values))
-        return values
-
-    def map_or_array(self, entries: dict) -> Any:
-        self._count(len(entries))
-        if _ARRAY in entries:
-            return _unpack_array(entries)
-        return _unpack_number(entries) if _NUMBER in entries else entries
-
-    def _count(self, number: int) -> None:
-        self._num_values += number + 1
-        if self._num_values > MAX_VALUES:
-            raise MessageError(f"the message holds more than {MAX_VALUES:,} values; arrays count as few.")
-
-
 def _pack_array(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
-    if not isinstance(value, np.ndarray):
-        raise MessageError(
-            f"a value of type {type(value).__name__} cannot be sent; allowed are plain values, with whole "
-            "numbers of up to 64 bits, and arrays."
+    if not isinstance(value, np.ndarray) or (dtype := value.dtype.newbyteorder("<")).str not in DTYPES:
+        kind = repr(value.dtype.str) if isinstance(value, np.ndarray) else type(value).__name__
+        raise TypeError(
+            f"a value of type {kind} cannot be sent; allowed are plain values, with whole numbers of up to "
+            f"64 bits, and arrays of dtype {', '.join(DTYPES)}."
         )
-    dtype = value.dtype.newbyteorder("<")
-    _checked_dtype(dtype.str)
     data = np.ascontiguousarray(value, dtype).tobytes()
     return {_ARRAY: True, b"data": data, b"dtype": dtype.str, b"shape": list(value.shape)}
 
 
-def _unpack_array(entries: dict) -> np.ndarray:
-    if set(entries) != _ARRAY_KEYS:
-        raise MessageError("an array must have the entries __ndarray__, data, dtype and shape, as bytes.")
-    data, shape = entries[b"data"], entries[b"shape"]
-    dtype = _checked_dtype(entries[b"dtype"])
-    if not isinstance(data, bytes):
-        raise MessageError(f"data of an array is a {type(data).__name__}; it must be a byte string.")
-    if not _is_shape(shape):
+def _unpack_array(entries: dict) -> Any:
+    if _NUMBER in entries:
+        return entries.get(b"data")
+    if _ARRAY not in entries:
+        return entries
+    try:
+        flat = np.frombuffer(entries[b"data"], DTYPES[entries[b"dtype"]])
+        if any(type(length) is not int or length < 0 for length in entries[b"shape"]):
+            raise ValueError("a shape is a list of whole numbers")
+        return flat.reshape(entries[b"shape"]).copy()
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise MessageError(
-            f"shape of an array must be a list of at most {MAX_AXES} whole numbers from 0 to 2**31 - 1."
-        )
-    needed = math.prod(shape) * dtype.itemsize
-    if needed != len(data):
-        raise MessageError(
-            f"an array {dtype.str} of shape {tuple(shape)} takes {needed:,} bytes, got {len(data):,}."
-        )
-    return np.ndarray(shape, dtype, data).copy()
-
-
-def _unpack_number(entries: dict) -> int | float:
-    value = entries.get(b"data")
-    _checked_dtype(entries.get(b"dtype"))
-    if not isinstance(value, int | float):
-        raise MessageError(f"data of a number is a {type(value).__name__}; it must be a number.")
-    return value
-
-
-def _checked_dtype(text: object) -> np.dtype:
-    if not isinstance(text, str) or text not in DTYPES:
-        shown = repr(text[:20]) if isinstance(text, str) else f"a {type(text).__name__}"
-        raise MessageError(f"dtype of an array is {shown}; allowed: {', '.join(DTYPES)}.")
-    return DTYPES[text]
-
-
-def _is_shape(shape: object) -> bool:
-    return (
-        isinstance(shape, list)
-        and len(shape) <= MAX_AXES
-        and all(type(length) is int and 0 <= length < 2**31 for length in shape)  # a bool is no length
-    )
+            f"an array is damaged ({echo(repr(error), 80)}): it must have the entries __ndarray__, data, "
+            f"dtype and shape, as bytes, and one of the dtypes {', '.join(DTYPES)}."
+        ) from None
 
 
 # The number counts versions that do not understand each other: whatever is added, removed or changes its
@@ -184,11 +125,6 @@ POLICY_FAILED = "the policy failed: "  # begins a refusal whose cause is the pol
 TOKEN_VARIABLE = "OPENVIMA_SERVE_TOKEN"  # read by server and client where no token is given
 MODALITIES = ("rgb", "segm", "joints")  # that observations may hold besides `ee`
 DEFAULT_MODALITIES = ("rgb", "segm")  # of policies that name none
-MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
-
-_KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")
-_LENGTHS = {"joints": 6, "tool": len(COMMAND_NAMES)}  # of what observations hold as numbers
-_RECORD_TYPES: dict[str, type] = {"object_id": int, "object": str, "texture": str}
 
 
 def is_loopback(host: str) -> bool:
@@ -227,9 +163,105 @@ def check_token(token: str | None) -> None:
         raise ConfigError("the token must be of printable ASCII characters without spaces, and not empty.")
 
 
+Check = Callable[[Any, str], None]
+Form = type | tuple[str, ...] | list | dict | Check
+_NAMES = {dict: "a map", list: "a list", str: "a text", int: "a whole number", np.ndarray: "an array"}
+
+
+def check_form(value: Any, form: Form, where: str) -> Any:
+    """Check what was sent, with all that it holds, and return it.
+
+    Args:
+        value: What was sent.
+        form: A type; texts to choose from; a list with the form of entries; a map from names to forms, where
+            a question mark ends names that may be missing; or a function that checks.
+        where: How to name it in errors.
+
+    Raises:
+        MessageError: It is something else; the message says what is wrong.
+    """
+    if isinstance(form, tuple):
+        if not isinstance(value, str) or value not in form:
+            raise MessageError(f"{where} is {_shown(value)}; allowed: {', '.join(form)}.")
+    elif isinstance(form, list):
+        for number, entry in enumerate(check_form(value, list, where)):
+            check_form(entry, form[0], f"{where} {number}")
+    elif isinstance(form, dict):
+        known = {name.removesuffix("?"): each for name, each in form.items()}
+        missing = [name for name in form if name not in check_form(value, dict, where) and name in known]
+        unknown = [_shown(name) for name in value if name not in known]
+        if missing or unknown:
+            problem = f"it has {unknown[0]}, which nobody knows" if unknown else f"it lacks {missing[0]!r}"
+            raise MessageError(f"{where}: {problem}; entries: {', '.join(known)}.")
+        for name, entry in value.items():
+            check_form(entry, known[name], f"{where}: {name}")
+    elif not isinstance(form, type):
+        form(value, where)
+    elif not isinstance(value, form) or (form is int and isinstance(value, bool)):
+        raise MessageError(f"{where} is {_shown(value)}; it must be {_NAMES[form]}.")
+    return value
+
+
+def _array(dtype: str, *shape: int) -> Check:
+    """Check arrays of a shape, where 0 stands for any length."""
+
+    def check(value: Any, where: str) -> None:
+        array = check_form(value, np.ndarray, where)
+        fits = array.ndim == len(shape) and all(n in (0, m) for n, m in zip(shape, array.shape, strict=True))
+        if array.dtype != dtype or not fits or not np.isfinite(array).all():
+            wanted = "".join(f"{length or 'any'}, " for length in shape)
+            raise MessageError(
+                f"{where} is {array.dtype} {array.shape}; it must be {dtype} ({wanted[:-1]}), all finite."
+            )
+
+    return check
+
+
+def _id(value: Any, where: str) -> None:
+    if not 0 <= check_form(value, int, where) <= 255:
+        raise MessageError(f"{where} is {value}; it must lie in 0 … 255.")
+
+
+_IMAGES = {
+    "rgb": {f"{view}?": _array("uint8", 3, 0, 0) for view in VIEWS},
+    "segm": {f"{view}?": _array("uint8", 0, 0) for view in VIEWS},
+}
+_PROMPT: dict = {
+    "text": str,
+    "images?": [
+        {
+            "name": str,
+            "kind": ("object", "scene"),
+            **_IMAGES,
+            "objects?": [{"object_id": _id, "object": str, "texture": str}],
+        }
+    ],
+}
+_OBSERVATION: dict = {
+    "rgb": _IMAGES["rgb"],
+    "ee": int,
+    "segm?": _IMAGES["segm"],
+    "joints?": _array("float32", 6),
+}
+_TOOL = _array("float32", len(COMMAND_NAMES))
+
+
 def encode_prompt(prompt: RenderedPrompt) -> dict[str, Any]:
     """Turn a prompt into plain values and arrays."""
-    return {"text": prompt.text, "images": [_encode_image(image) for image in prompt.images.values()]}
+    images = [
+        {
+            "name": image.name,
+            "kind": image.kind,
+            "rgb": dict(image.rgb),
+            "segm": dict(image.segm),
+            "objects": [
+                {"object_id": each.object_id, "object": each.object, "texture": each.texture}
+                for each in image.objects
+            ],
+        }
+        for image in prompt.images.values()
+    ]
+    return {"text": prompt.text, "images": images}
 
 
 def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
@@ -242,19 +274,14 @@ def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
     Raises:
         MessageError: It is no prompt; the message says what is wrong.
     """
-    fields = _map(message, where, required=("text",), optional=("images",))
-    text = _typed(fields["text"], str, f"{where}: text")
-    images = [
-        _decode_image(image, f"{where}: image {number}")
-        for number, image in enumerate(_typed(fields.get("images", []), list, f"{where}: images"))
-    ]
-    by_name = {image.name: image for image in images}
-    if len(by_name) < len(images):
+    fields, by_name = check_form(message, _PROMPT, where), {}
+    for number, image in enumerate(fields.get("images", [])):
+        _check_sizes(image, f"{where}: image {number}")
+        objects = tuple(ObjectRecord(**record) for record in image.get("objects", ()))
+        by_name[image["name"]] = PromptImage(**{**image, "objects": objects})
+    if len(by_name) < len(fields.get("images", [])):
         raise MessageError(f"{where}: two images have one name; each placeholder has one image.")
-    for number, image in enumerate(images):
-        if len({record.object_id for record in image.objects}) < len(image.objects):
-            raise MessageError(f"{where}: image {number}: two objects have one object_id.")
-    return RenderedPrompt(text, by_name)
+    return RenderedPrompt(fields["text"], by_name)
 
 
 def encode_observation(observation: Mapping | None) -> dict[str, Any] | None:
@@ -262,7 +289,7 @@ def encode_observation(observation: Mapping | None) -> dict[str, Any] | None:
     if observation is None:
         return None
     parts = {part: dict(observation[part]) for part in ("rgb", "segm") if part in observation}
-    parts |= {part: observation[part] for part in _LENGTHS if part in observation}
+    parts |= {part: observation[part] for part in ("joints", "tool") if part in observation}
     return {**parts, "ee": int(observation["ee"])}
 
 
@@ -281,18 +308,8 @@ def decode_observation(
     """
     if message is None:
         return None
-    required = ("rgb", "ee", "tool") if control == END_EFFECTOR else ("rgb", "ee")
-    fields = _map(message, where, required=required, optional=("segm", "joints"))
-    _check_views(fields, where)
-    for part in (part for part in _LENGTHS if part in fields):
-        numbers = _typed(fields[part], np.ndarray, f"{where}: {part}")
-        shape = (_LENGTHS[part],)
-        if numbers.shape != shape or numbers.dtype != np.float32 or not np.isfinite(numbers).all():
-            raise MessageError(
-                f"{where}: {part} is {numbers.dtype} {numbers.shape}; it must be float32 {shape}, all finite."
-            )
-    if type(fields["ee"]) is not int:  # a bool is no number of a tool
-        raise MessageError(f"{where}: ee is {_shown(fields['ee'])}; it must be a whole number.")
+    fields = check_form(message, _OBSERVATION | ({"tool": _TOOL} if control == END_EFFECTOR else {}), where)
+    _check_sizes(fields, where)
     return fields
 
 
@@ -311,7 +328,7 @@ def encode_action(action: Any, control: str = PRIMITIVES) -> Any:
     return {str(key): np.asarray(value) for key, value in action.items()}
 
 
-def decode_action(message: object, where: str = "action", *, control: str = PRIMITIVES) -> Any:
+def decode_action(message: Any, where: str = "action", *, control: str = PRIMITIVES) -> Any:
     """Read an action out of a message. Whether it is one that can be done, the environment says.
 
     Args:
@@ -325,12 +342,10 @@ def decode_action(message: object, where: str = "action", *, control: str = PRIM
     Raises:
         MessageError: It is something else.
     """
-    if message is None:
-        return None
-    if control == END_EFFECTOR:
-        return _typed(message, np.ndarray, where)
-    for key, value in _typed(message, dict, where).items():
-        _typed(value, np.ndarray, f"{where}: {_shown(key)}")
+    if message is None or control == END_EFFECTOR:
+        return message if message is None else check_form(message, np.ndarray, where)
+    for key, value in check_form(message, dict, where).items():
+        check_form(value, np.ndarray, f"{where}: {_shown(key)}")
     return message
 
 
@@ -344,9 +359,7 @@ def check_control(control: object, whose: str) -> str:
     Raises:
         MessageError: There is no such control.
     """
-    if not isinstance(control, str) or control not in CONTROLS:
-        raise MessageError(f"{whose} has control {_shown(control)}; allowed: {', '.join(CONTROLS)}.")
-    return control
+    return check_form(control, CONTROLS, f"control of {whose}")
 
 
 def check_modalities(names: object, whose: str) -> tuple[str, ...]:
@@ -365,28 +378,6 @@ def check_modalities(names: object, whose: str) -> tuple[str, ...]:
             f"{whose} has modalities {echo(repr(names))}; servers get rgb and, if asked, segm and joints."
         )
     return tuple(name for name in MODALITIES if name in listed)
-
-
-def read_list(
-    message: object, kind: str, field: str, max_length: int, *, optional: tuple[str, ...] = ()
-) -> list:
-    """Take the list out of a request or reply.
-
-    Args:
-        message: What was sent: {"type": kind, field: [...]}.
-        kind: The type that it has, which was looked at before.
-        field: Name of the list.
-        max_length: Entries that it may have at most.
-        optional: What else the message may hold.
-
-    Raises:
-        MessageError: The list is missing or too long, or there is something else.
-    """
-    fields = _map(message, kind, required=("type", field), optional=optional)
-    values = _typed(fields[field], list, f"{kind}: {field}")
-    if len(values) > max_length:
-        raise MessageError(f"{kind} has {len(values)} {field}; at most {max_length} are allowed.")
-    return values
 
 
 def check_protocol(protocol: object, *, theirs: str, ours: str) -> None:
@@ -413,88 +404,15 @@ def type_of(message: object) -> str | None:
     return kind if isinstance(kind, str) else None
 
 
-def _encode_image(image: PromptImage) -> dict[str, Any]:
-    records = [{key: getattr(record, key) for key in _RECORD_TYPES} for record in image.objects]
-    rgb, segm = dict(image.rgb), dict(image.segm)
-    return {"name": image.name, "kind": image.kind, "rgb": rgb, "segm": segm, "objects": records}
-
-
-def _decode_image(message: object, where: str) -> PromptImage:
-    fields = _map(message, where, required=("name", "kind", "rgb", "segm"), optional=("objects",))
-    name = _typed(fields["name"], str, f"{where}: name")
-    given = fields["kind"] if isinstance(fields["kind"], str) else None
-    kind: Literal["object", "scene"] | None = next((k for k in _KINDS if k == given), None)
-    if kind is None:
-        raise MessageError(f"{where}: kind is {_shown(fields['kind'])}; allowed: {', '.join(_KINDS)}.")
-    _check_views(fields, where)
-    records = _typed(fields.get("objects", []), list, f"{where}: objects")
-    objects = tuple(_decode_record(record, f"{where}: object {n}") for n, record in enumerate(records))
-    return PromptImage(name, kind, fields["rgb"], fields["segm"], objects)
-
-
-def _decode_record(message: object, where: str) -> ObjectRecord:
-    fields = _map(message, where, required=tuple(_RECORD_TYPES))
-    for key, kind in _RECORD_TYPES.items():
-        _typed(fields[key], kind, f"{where}: {key}")
-    if not 0 <= fields["object_id"] <= 255:
-        raise MessageError(f"{where}: object_id is {fields['object_id']}; it must lie in 0 … 255.")
-    return ObjectRecord(**fields)
-
-
-def _check_views(fields: Mapping[str, Any], where: str) -> None:
-    """Check `rgb` and `segm`: uint8 images of one size a view, with at most `MAX_PIXELS`."""
-    sizes: dict[object, tuple[int, ...]] = {}
-    for part in (part for part in ("rgb", "segm") if part in fields):
-        for view, image in _typed(fields[part], dict, f"{where}: {part}").items():
-            if view not in VIEWS:
-                raise MessageError(f"{where}: {part} has a view {_shown(view)}; allowed: {', '.join(VIEWS)}.")
-            array = _typed(image, np.ndarray, f"{where}: {part} {_shown(view)}")
-            lead = (3,) if part == "rgb" else ()
-            size = array.shape[len(lead) :]
-            whole = array.dtype == np.uint8 and len(size) == 2 and array.shape[: len(lead)] == lead
-            if not whole or sizes.setdefault(view, size) != size:
-                wanted = "(3, height, width)" if lead else "(height, width), as rgb has them"
-                raise MessageError(
-                    f"{where}: {part} {_shown(view)} is {array.dtype} {array.shape}; it must be uint8 "
-                    f"{wanted}."
-                )
-            if math.prod(size) > MAX_PIXELS:
-                raise MessageError(
-                    f"{where}: {part} {_shown(view)} has {size[0]} × {size[1]} pixels; at most "
-                    f"{MAX_PIXELS:,} are allowed."
-                )
-
-
-def _map(
-    message: object, where: str, *, required: tuple[str, ...], optional: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """Check that something is a map with these entries and no others."""
-    fields = _typed(message, dict, where)
-    missing = [key for key in required if key not in fields]
-    unknown = [key for key in fields if key not in required + optional]
-    if missing or unknown:
-        problems = [*(["it lacks " + _listed(missing)] if missing else [])]
-        problems += [f"it has {_listed(unknown)}, which nobody knows"] if unknown else []
-        raise MessageError(f"{where}: {' and '.join(problems)}; entries: {', '.join(required + optional)}.")
-    return fields
-
-
-def _typed(value: object, kind: type, where: str) -> Any:
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        names = {dict: "a map", list: "a list", str: "a text", int: "a whole number", np.ndarray: "an array"}
-        raise MessageError(f"{where} is {_shown(value)}; it must be {names[kind]}.")
-    return value
-
-
-def _listed(keys: Iterable[object]) -> str:
-    shown = [_shown(key) for key in keys]
-    return ", ".join(shown[:5]) + (" …" if len(shown) > 5 else "")
+def _check_sizes(fields: Mapping[str, Any], where: str) -> None:
+    """Check that segmentations are as large as the images."""
+    for view, segm in fields.get("segm", {}).items():
+        if view in fields["rgb"] and segm.shape != fields["rgb"][view].shape[1:]:
+            raise MessageError(f"{where}: segm {view!r} is {segm.shape}; it must be as large as rgb.")
 
 
 def _shown(value: object) -> str:
     """Name a value in an error: short, whatever was sent."""
     if value is None or isinstance(value, bool | int | float):
         return repr(value)
-    if isinstance(value, str | bytes):
-        return repr(value[:40])
-    return f"a {type(value).__name__}"
+    return repr(value[:40]) if isinstance(value, str | bytes) else f"a {type(value).__name__}"

@@ -11,15 +11,13 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-import numpy as np
-
 from openvima import __version__
-from openvima.errors import ConfigError, MessageError, OpenVimaError, echo, unknown_name
+from openvima.errors import ConfigError, MessageError, OpenVimaError, echo
 from openvima.policies.base import Policy, PromptLimits
 from openvima.policies.loading import checked_policy
 from openvima.scene import RenderedPrompt
@@ -31,6 +29,7 @@ from openvima.serving.protocol import (
     PROTOCOL,
     TOKEN_VARIABLE,
     check_control,
+    check_form,
     check_modalities,
     check_protocol,
     check_token,
@@ -39,7 +38,6 @@ from openvima.serving.protocol import (
     encode_action,
     is_loopback,
     pack,
-    read_list,
     require_extra,
     type_of,
     unpack,
@@ -50,12 +48,8 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-# Objects in the images of a request, on average over the largest batch. The benchmark's hardest prompts have
-# 20, and demonstrations as prompts three times as many; its observations have 9, and ids of arm and table.
-MAX_IN_PROMPTS, MAX_IN_VIEW = 64, 24
 _MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
 HEALTH_PATH = "/healthz"
-MAX_FRAGMENTS = 1024  # of a message, besides one for each KiB: each costs time, and empty ones have no size
 CLOSE_S = 2.0  # for the other side to say goodbye
 _LOG = logging.getLogger(__name__)
 _TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
@@ -98,18 +92,14 @@ class ServerConfig:
     prompts: str = "multimodal"
 
     def __post_init__(self) -> None:
+        numbers = ("port", "max_message_bytes", "max_episodes", "max_connections", "idle_s", "num_threads")
         problems = [
-            f"{name} is {value:g}; it must lie within {least:,} and {most:,}."
-            for name, value, least, most in (
-                ("port", self.port, 0, 65535),
-                ("max_message_bytes", self.max_message_bytes, 1024, 2**32),
-                ("max_episodes", self.max_episodes, 1, MAX_LENGTH),
-                ("max_connections", self.max_connections, 1, 10_000),
-                ("idle_s", self.idle_s, 0.01, 10**6),
-                ("num_threads", self.num_threads, 1, 1024),
-            )
-            if not least <= value <= most
+            f"{name} is {value:g}; it must be a positive number."
+            for name in numbers
+            if (value := getattr(self, name)) < 0 or (value == 0 and name != "port")
         ]
+        if max(self.port - 65535, self.max_episodes - MAX_LENGTH) > 0:
+            problems.append(f"port is at most 65535 and max_episodes at most {MAX_LENGTH}.")
         if self.token is None and not is_loopback(self.host):
             problems.append(
                 f"host is {self.host!r}, which other machines may reach; give a token with --token or "
@@ -119,18 +109,6 @@ class ServerConfig:
             raise ConfigError(" ".join(problems))
         check_token(self.token)
         check_prompts(self.prompts)
-
-
-def server_config(**settings: Any) -> ServerConfig:
-    """Return the config with these fields.
-
-    Raises:
-        ConfigError: There is no such field, or as for `ServerConfig`.
-    """
-    known = [field.name for field in fields(ServerConfig)]
-    if unknown := [name for name in settings if name not in known]:
-        raise ConfigError(" ".join(unknown_name("setting of a server", name, known) for name in unknown))
-    return ServerConfig(**settings)
 
 
 def is_own_page(headers: Mapping[str, str], *, any_host: bool) -> bool:
@@ -207,19 +185,15 @@ class Session:
         message = unpack(data)
         kind = type_of(message)
         if kind == "reset":
-            assert isinstance(message, dict)  # it has a type
-            protocol = message.get("protocol", PROTOCOL)
-            check_protocol(protocol, theirs="the client", ours="this server")
-            prompts = read_list(message, "reset", "prompts", self._max_episodes, optional=("protocol",))
-            return partial(self._begin, self._decoded(prompts))
+            check_protocol(message.get("protocol", PROTOCOL), theirs="the client", ours="this server")
+            sent = self._listed(message, {"type": str, "prompts": list, "protocol?": str}, "prompts")
+            return partial(self._begin, self._decoded(sent))
         if kind == "act":
-            seen = read_list(message, "act", "observations", self._max_episodes)
+            seen = self._listed(message, {"type": str, "observations": list}, "observations")
             observations = [
                 decode_observation(one, f"observation {n}", control=self._control)
                 for n, one in enumerate(seen)
             ]
-            num_ids = sum(_num_ids(one["segm"]) for one in observations if one and "segm" in one)
-            self._check_objects(num_ids, MAX_IN_VIEW)
             return partial(self._act, observations)
         if isinstance(message, dict) and "type" not in message:
             prompt = message.pop("prompt", None)
@@ -230,21 +204,17 @@ class Session:
             f"a request must be a map with type 'reset' or 'act', or an observation ({PROTOCOL})."
         )
 
+    def _listed(self, message: object, form: dict, field: str) -> list:
+        values = check_form(message, form, "the request")[field]
+        if len(values) > self._max_episodes:
+            raise MessageError(f"there are {len(values)} {field}; at most {self._max_episodes} are allowed.")
+        return values
+
     def _decoded(self, sent: Sequence[object]) -> list[RenderedPrompt]:
         prompts = [decode_prompt(prompt, f"prompt {n}") for n, prompt in enumerate(sent)]
         for prompt in prompts:
             self._limits.check(prompt)
-        num_objects = sum(len(image.objects) for prompt in prompts for image in prompt.images.values())
-        self._check_objects(num_objects, MAX_IN_PROMPTS)
         return [describe(prompt, self._prompts) for prompt in prompts]
-
-    def _check_objects(self, count: int, per_episode: int) -> None:
-        allowed = max(256, per_episode * self._max_episodes)  # of a single one as many as an image may have
-        if count > allowed:
-            raise MessageError(
-                f"the images have {count:,} objects in all; at most {allowed:,} are allowed. "
-                "Send fewer episodes."
-            )
 
     def _begin(self, prompts: Sequence[RenderedPrompt]) -> dict[str, Any]:
         if not prompts:
@@ -282,19 +252,8 @@ class Session:
         return self._actions([observation])[0]
 
 
-def _num_ids(segm: Mapping[str, np.ndarray]) -> int:
-    """Count the values of a segmentation, in the view with most of them."""
-    return max(
-        (int(np.count_nonzero(np.bincount(ids.ravel(), minlength=256))) for ids in segm.values()), default=0
-    )
-
-
 def _refusal(error: OpenVimaError) -> str:
     return echo(f"{type(error).__name__}: {error}", _MAX_REFUSAL)
-
-
-if TYPE_CHECKING:
-    pass
 
 
 def serve(
@@ -324,7 +283,7 @@ def serve(
         KeyboardInterrupt: By Ctrl-C, after all connections were closed.
     """
     require_extra()
-    server = _PolicyServer(policy, server_config(port=port, **settings), about or {})
+    server = _PolicyServer(policy, ServerConfig(port=port, **settings), about or {})
     asyncio.run(server.run(ready or (lambda url: None), asyncio.Event()))
 
 
@@ -353,35 +312,28 @@ def serve_in_thread(
         MissingExtraError: As for `serve`.
     """
     require_extra()
-    server = _PolicyServer(policy, server_config(port=port, **settings), about or {})
-    url: Future[str] = Future()
-    loop: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+    server = _PolicyServer(policy, ServerConfig(port=port, **settings), about or {})
+    started: Future[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
 
     async def run() -> None:
-        stop = asyncio.Event()
-        loop.set_result((asyncio.get_running_loop(), stop))
-        await server.run(url.set_result, stop)
+        loop, stop = asyncio.get_running_loop(), asyncio.Event()
+        await server.run(lambda url: started.set_result((url, loop, stop)), stop)
 
     def work() -> None:
         try:
             asyncio.run(run())
         except BaseException as error:
-            if url.done():
+            if started.done():
                 raise
-            url.set_exception(error)
+            started.set_exception(error)
 
     thread = threading.Thread(target=work, name="openvima-serve", daemon=True)
     thread.start()
+    url, loop, stop = started.result()
     try:
-        address = url.result()
-    except BaseException:
-        thread.join()
-        raise
-    try:
-        yield address
+        yield url
     finally:
-        running, stop = loop.result()
-        running.call_soon_threadsafe(stop.set)
+        loop.call_soon_threadsafe(stop.set)
         thread.join()
 
 
@@ -499,7 +451,7 @@ class _PolicyServer:
         while True:
             async with asyncio.timeout(self._config.idle_s):
                 await connection.send(reply)
-                data = await _whole_message(connection)
+                data = await connection.recv()
             answer = await loop.run_in_executor(self._readers, session.read, data)
             del data  # it may be large, and the policy may be busy with others
             if not isinstance(answer, str):
@@ -507,20 +459,6 @@ class _PolicyServer:
             reply = answer
             if isinstance(reply, str):
                 _LOG.warning("%s: refused: %s", _name(connection), reply)
-
-
-async def _whole_message(connection: "ServerConnection") -> bytes | str:
-    """Receive a message of limited size and number of fragments."""
-    from websockets.frames import CloseCode
-
-    parts: list[Any] = []
-    allowed = float(MAX_FRAGMENTS)
-    async for part in connection.recv_streaming():
-        parts.append(part)
-        allowed += len(part) / 1024
-        if len(parts) > allowed:
-            await connection.close(CloseCode.POLICY_VIOLATION, f"{len(parts):,} fragments of a short message")
-    return type(parts[0])().join(parts)
 
 
 def _set_threads(num_threads: int) -> None:

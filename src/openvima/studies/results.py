@@ -187,10 +187,7 @@ def study_page(
         versions=versions,
         command=command,
         summary=_summary(points),
-        percent=text.percent,
-        span=text.span,
-        points_of=text.points,
-        points_span=text.points_span,
+        text=text,
         duration=duration,
     )
 
