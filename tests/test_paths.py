@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from openvima.cli.main import main
-from openvima.cli.terminal import parse_sources
 from openvima.data import Dataset, GenerateConfig, verify
 from openvima.data.lerobot import LerobotConfig
 from openvima.data.published import ImportConfig
@@ -142,30 +141,11 @@ def test_a_file_of_settings_names_the_home(home: Path) -> None:
 
 
 def test_an_existing_path_is_a_policy_whatever_it_is_named(home: Path) -> None:
-    for name in ("lr=0.001", "a,b", "a=1,b=2", "mine"):
+    for name in ("lr=0.001", "mine"):
         (home / "runs" / name).mkdir(parents=True)
-    (home / "my,policies.py").write_text("", encoding="utf-8")
-    given = (
-        "runs/lr=0.001,mine=runs/a,b,oracle, runs/a=1,b=2 ,mine2=runs/mine,x=my,policies.py:make,~/runs/mine"
-    )
-    words = parse_sources(given)
-    assert words[:3] == ("runs/lr=0.001", "mine=runs/a,b", "oracle")
-    assert words[3:] == ("runs/a=1,b=2", "mine2=runs/mine", "x=my,policies.py:make", "~/runs/mine")
-    sources = policy_sources(words[:-1])
-    assert [source.name for source in sources] == ["lr-0.001", "mine", "oracle", "a-1-b-2", "mine2", "x"]
-    paths = ["runs/lr=0.001", "runs/a,b", "oracle", "runs/a=1,b=2", "runs/mine", "my,policies.py:make"]
-    assert [source.source for source in sources] == paths
-    (home / "oracle,random").mkdir()
-    assert parse_sources("oracle,random,nano") == ("oracle,random", "nano")
-
-
-def test_names_that_are_no_paths_are_split(home: Path) -> None:
-    assert parse_sources("oracle, random,,mine=run") == ("oracle", "random", "mine=run")
-    assert parse_sources("a.py:make,b.py:make") == ("a.py:make", "b.py:make")
-    (home / "my policies.py").write_text("", encoding="utf-8")
-    words = ("my policies.py:make", "other=./my policies.py:Mine")
-    assert parse_sources(",".join(words)) == words
-    assert parse_sources("") == ()
+    sources = policy_sources(["runs/lr=0.001", "mine2=runs/mine", "x=./my policies.py:make"])
+    assert [source.name for source in sources] == ["lr-0.001", "mine2", "x"]
+    assert [source.source for source in sources] == ["runs/lr=0.001", "runs/mine", "./my policies.py:make"]
 
 
 def test_batches_of_other_processes_have_whole_paths(home: Path) -> None:

@@ -131,7 +131,7 @@ def test_words_that_a_policy_never_saw_are_one_line_and_the_verb_goes_on(
             "cannot write here: No space left on device. F",
         ),
         (OSError(errno.EDQUOT, "Disk quota exceeded", "a/b"), "cannot write a/b: Disk quota exceeded. Free"),
-        (MemoryError("Unable to allocate 9 GiB"), "out of memory while working on here; lower --workers"),
+        (MemoryError("Unable to allocate 9 GiB"), "out of memory while working on here; lower the size"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out of memory while working on here"),
         (RuntimeError("CUDA out of memory."), "out of memory while working on here"),
         (ValueError("Error: engine error: Could not allocate memory"), "out of memory while working on here"),

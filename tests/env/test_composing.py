@@ -71,10 +71,9 @@ def test_scale_and_fixed_can_be_given() -> None:
             [*OBJECTS, ("star", "blue", (0.52, 0.2))],
             ["'c' (blue star)", "'b' (green bowl)", "cm²", "0 is allowed"],
         ),
-        ([("heart", "red", (float("nan"), 0.1))], ["object 0 ('a'): position is [nan, 0.1]", "finite"]),
+        ([("heart", "red", (float("nan"), 0.1))], ["object 0 ('a'): position is nan", "a number from"]),
         ([("heart", "red", (0.5, 0.1), 1e9)], ["yaw_deg is 1000000000.0", "-3600 to 3600"]),
         ([SceneObject("heart", "red", (0.5, 0.1), scale=9)], ["scale is 9", "0.5 to 2"]),
-        ([("red", "heart", (0.5, 0.1))], ["'red' is a texture", "the object comes first"]),
         ([("heart", "red")], ["object 0 ('a') has 2 entries", "(object, texture, (x, y)[, yaw_deg])"]),
         ([], ["0 objects", "1 to 64"]),
         ([SceneObject("pan", "red", (0.5, 0.1), name="../x")], ["'../x'", "letters"]),
@@ -260,14 +259,6 @@ def test_a_prompt_of_a_yaml_block_is_one_line(tmp_path: Path) -> None:
         "objects:\n- [heart, red, [0.5, 0.0]]\nprompt: |\n  Lift the {a}\n  and wait.\n", encoding="utf-8"
     )
     assert openvima.load_episode(tmp_path / "scene.yaml").problem.prompt.text == "Lift the {a} and wait."
-
-
-@pytest.mark.parametrize(
-    ("odd", "name"), [("\x1b", r"U\+001B"), ("\x9b", r"U\+009B"), ("\ud800", r"U\+D800")]
-)
-def test_characters_that_are_not_for_text_are_named(odd: str, name: str) -> None:
-    with pytest.raises(SceneError, match=f"with the character {name}, which is not for text"):
-        compose(OBJECTS, f"Look {odd}[2J.")
 
 
 NAMED = re.compile(r"(object|image|goal) ('\w+'|\d+)")  # how errors name what is wrong

@@ -11,7 +11,7 @@ import yaml
 from PIL import Image
 
 import openvima
-from openvima.errors import ConfigError, InputFileError, OpenVimaError
+from openvima.errors import InputFileError, OpenVimaError
 from openvima.evaluation import play
 from openvima.scene import PhotoImage, Pose, Prompt, Scene
 from openvima.tasks import list_tasks, sample_episode, task_spec
@@ -63,8 +63,6 @@ def test_reset_takes_episodes_files_and_values(tmp_path: Path) -> None:
     for given in (openvima.compose(**values), path, str(path), values):
         _, info = env.reset(options={"episode": given})
         assert (info["task"], info["prompt"]) == ("composed", "Lift the {a}.")
-    with pytest.raises(ConfigError, match="option 'episode' is a int"):
-        env.reset(options={"episode": 3})
     with pytest.raises(InputFileError, match="needs an episode file"):
         env.reset(options={"episode": {**values, "images": {"a": "x.png"}}})
 
@@ -129,9 +127,6 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path: Path) -> None:
     goal = replace(episode.problem.goals[0], target=Pose((np.inf, 0.0, 0.0)))
     problem = episode.problem
     for unfit, message in (
-        (prompted("\x1b[2J"), r"U\+001B, which is not for text"),
-        (prompted("\ud800"), r"U\+D800, which is not for text"),
-        (prompted("x" * 5000), "text of at most 4096 characters"),
         (replace(episode, problem=replace(problem, scene=away)), "x must lie in"),
         (replace(episode, problem=replace(problem, goals=(goal,))), "a number from -100 to 100"),
         (replace(episode, max_steps=10**6), "max_steps is 1000000"),
@@ -142,7 +137,7 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path: Path) -> None:
             openvima.save_episode(unfit, tmp_path / "e.yaml")
     photos = tuple((f"p{n}", PhotoImage(48, 48, bytes(48 * 48 * 3))) for n in range(30))
     large = replace(problem, prompt=Prompt(" ".join(f"{{{name}}}" for name, _ in photos), photos))
-    with pytest.raises(InputFileError, match=r"it takes \d+ bytes, and 262144 are allowed"):
+    with pytest.raises(InputFileError, match=r"takes \d+ bytes; at most 262144 can be loaded"):
         openvima.save_episode(replace(episode, problem=large), tmp_path / "e.yaml")
     assert not (tmp_path / "e.yaml").exists()
 

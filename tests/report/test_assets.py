@@ -105,9 +105,9 @@ def test_training_curves_are_those_of_the_first_trained_policy(tmp_path):
     oracle = PolicySource("oracle", "oracle")
     run = PolicySource("mine", str(tmp_path))
     checkpoint = PolicySource("mine", str(tmp_path / "checkpoints" / "step-1"))
-    assert report_videos.find_metrics([oracle, run]) == tmp_path / "metrics.jsonl"
-    assert report_videos.find_metrics([checkpoint]) == tmp_path / "metrics.jsonl"
-    assert report_videos.find_metrics([oracle]) is None
+    assert report_videos.find_metrics([oracle, run]) == [tmp_path / "metrics.jsonl"]
+    assert report_videos.find_metrics([checkpoint]) == [tmp_path / "metrics.jsonl"]
+    assert report_videos.find_metrics([oracle]) == []
 
 
 def test_a_missing_extra_is_named_before_any_episode(tmp_path, monkeypatch):

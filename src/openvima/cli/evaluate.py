@@ -12,7 +12,6 @@ import tyro
 from openvima.cli.terminal import (
     parse_list,
     parse_shard_range,
-    parse_sources,
     print_left_out,
     print_table,
     progress_bar,
@@ -215,7 +214,7 @@ def main(
 
     ablations = parse_list(ablation.ablations) + (IN_CONTEXT,) * ablation.in_context
     config = EvaluationConfig(
-        policies=parse_sources(policy),
+        policies=parse_list(policy),
         tasks=parse_list(tasks),
         levels=parse_list(levels),
         episodes=episodes,

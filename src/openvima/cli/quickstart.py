@@ -84,7 +84,7 @@ def _generate(folder: Path, demonstrations: int, seed: int, workers: int) -> Pat
         tasks=TASKS, episodes=demonstrations, out=folder, workers=workers, start_seed=seed
     )
     with progress_bar("1/3 demonstrations") as report:
-        return generate(config, lambda progress: report(progress.done, progress.total, ""))
+        return generate(config, report)
 
 
 def _train(data: Path, run: Path, seed: int) -> Path:

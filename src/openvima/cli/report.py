@@ -25,7 +25,6 @@ def main(
     out: Path | None = None,
     compare: str | None = None,
     runs: tuple[Path, ...] = (),
-    metrics: Path | None = None,
     markdown: bool = False,
     latex: bool = False,
     tables: Literal["all", "levels"] = "all",
@@ -45,8 +44,7 @@ def main(
             folder if there are several.
         compare: Policies with commas in between; each is compared with the first, seed by seed.
             POLICY:ABLATION stands for its score under an ablation.
-        runs: Folders of training runs whose learning curves to show.
-        metrics: The same for a single metrics.jsonl.
+        runs: Folders of training runs, or their metrics.jsonl, whose learning curves to show.
         markdown: Print tables in Markdown for a paper.
         latex: Print tables in LaTeX for a paper; they need the package booktabs.
         tables: Which tables to write in Markdown or LaTeX: all, or levels, a compact one of the means by
@@ -95,13 +93,12 @@ def main(
             for difference in comparison.means:
                 print(finding(comparison, difference), file=said)
     if out is not None or not prints:
-        records = [*runs, *([metrics] if metrics else [])]
         path = _page(
             evaluations,
             merged,
             comparisons,
             out or _default_out(evaluations),
-            records,
+            runs,
             published=published,
             confirmations=confirmations,
         )

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from openvima.cli.terminal import parse_sources
+from openvima.cli.terminal import parse_list
 
 
 def main(
@@ -69,7 +69,7 @@ def main(
 
     config = StudioConfig(
         path,
-        parse_sources(policies),
+        parse_list(policies),
         record_demonstrations,
         EnvConfig(assets, compat, prompts, task_options),
         device,

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -22,8 +21,6 @@ def main(
     *,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     level: str | None = None,
-    gallery: Path | None = None,
-    assets: str = "procedural",
 ) -> int:
     """List the tasks: prompt, tool, levels, steps and success rate of the oracle; or describe one.
 
@@ -33,9 +30,6 @@ def main(
         name: Task to describe, with its options for --task-options.
         as_json: Print JSON instead of a table.
         level: List the tasks of this level only: train, L1 to L8.
-        gallery: Write an HTML page with an image of each task into this folder.
-        assets: Asset pack of the gallery: procedural, original, the folder of a checkout of VIMA-Bench, or
-            FILE.py:FUNCTION, which registers assets of your own.
 
     Returns:
         Exit status.
@@ -43,8 +37,6 @@ def main(
     from openvima.tasks import task_spec
     from openvima.tasks.registry import tasks_of
 
-    if gallery is not None:
-        return _write_gallery(gallery, assets, level)
     if name is not None:
         return _describe(task_spec(name), as_json=as_json)
     specs = [task_spec(name) for name in tasks_of(level)]
@@ -139,13 +131,3 @@ def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
     episodes = sum(level["episodes"] for level in record.values())
     solved = sum(level["successes"] for level in record.values())
     return f"{100 * solved / episodes:.2f}" if episodes else "–"
-
-
-def _write_gallery(folder: Path, assets: str, level: str | None) -> int:
-    from openvima.cli.terminal import progress_bar
-    from openvima.env import EnvConfig
-    from openvima.report.task_gallery import save_task_gallery
-
-    with progress_bar("tasks") as report:
-        print(save_task_gallery(folder, env_config=EnvConfig(assets), level=level, report=report))
-    return 0

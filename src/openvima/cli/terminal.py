@@ -15,32 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from openvima.errors import ConfigError
-from openvima.input_files import expand_home
-from openvima.user_code import is_code
+from openvima.multiprocess import Report
 
 
 def parse_list(text: str) -> tuple[str, ...]:
     """Split an option such as "rotate,twist"."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
-
-
-def parse_sources(text: str) -> tuple[str, ...]:
-    """Split policies, such as "oracle,mine=runs/first"; an existing path is one of them, with its commas."""
-    words, found = text.split(","), []
-    while words:
-        counts = range(len(words), 0, -1)
-        count = next((n for n in counts if _is_path(",".join(words[:n]).strip())), 1)
-        found.append(",".join(words[:count]).strip())
-        del words[:count]
-    return tuple(filter(None, found))
-
-
-def _is_path(word: str) -> bool:
-    """Whether a policy, perhaps with a name before it, is an existing path, or code in one."""
-    given = expand_home(word)
-    named = re.fullmatch(r"\w[\w.+-]*=(.*)", given)
-    texts = (given, *(named.groups() if named else ()))
-    return any(os.path.exists(text.rpartition(":")[0] if is_code(text) else text) for text in texts)
 
 
 def parse_tasks(text: str) -> tuple[str, ...] | None:
@@ -68,7 +48,6 @@ def accept_any_text() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-Report = Callable[[int, int, str], None]
 LINE_S = 60.0  # between two lines of a stage, where stderr is no terminal
 
 

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
-from openvima.errors import ConfigError, echo
 from openvima.scene.action import PRIMITIVES, check_control
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.options import TaskOptions
@@ -51,11 +50,6 @@ class EnvConfig:
         Raises:
             ConfigError: A setting is invalid, or the record is of an unsupported version.
         """
-        if record.get("difficulty", "easy") != "easy":
-            raise ConfigError(
-                f"the recorded difficulty is {echo(repr(record['difficulty']))}, which now is a task option; "
-                "repeat the command with --task-options difficulty=…."
-            )
         return EnvConfig(**{name: record[name] for name in ENV_SETTINGS if name in record})
 
     def make(self, task: str, level: str, *, domain: str, realtime: bool = False) -> "TabletopEnv":

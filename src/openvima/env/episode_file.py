@@ -5,7 +5,7 @@ Only the recorded fields are read, each with its type; names, ids and places mus
 """
 
 import base64
-import binascii
+import contextlib
 import json
 import re
 import typing
@@ -82,6 +82,8 @@ def save_episode(episode: Episode, path: str | Path) -> Path:
     if not same:
         raise InputFileError("the episode cannot be saved, for it would not be loaded equal.")
     text = json.dumps(values, indent=1, ensure_ascii=False) + "\n" if is_json else yaml_text(values)
+    if (size := len(text.encode())) > MAX_EPISODE_BYTES:
+        raise InputFileError(f"the episode takes {size} bytes; at most {MAX_EPISODE_BYTES} can be loaded.")
     return atomic_write_file(path, text)
 
 
@@ -204,37 +206,54 @@ def _without_none(kind: Any) -> Any:
     return kind
 
 
+_NAMES = {
+    float: f"a number from {-_MAX_NUMBER:g} to {_MAX_NUMBER:g}",
+    int: "a whole number",
+    bool: "true or false",
+    str: "text",
+    bytes: "base64 text",
+}
+
+
 def _decode(value: Any, kind: Any, where: str) -> Any:
     """Return the value of an annotation; the inverse of `_encode`, for values that nobody has checked."""
-    if kind in _KINDS:
-        if not isinstance(value, Mapping) or not isinstance(value.get("type"), str):
-            raise InputFileError(f"{where} must be a mapping with a type.")
-        known = {each.__name__: each for each in _KINDS[kind]}
-        if value["type"] not in known:
-            raise InputFileError(f"{where}: {unknown_name('type', value['type'], known)}")
-        return _record({k: v for k, v in value.items() if k != "type"}, known[value["type"]], where)
     if (inner := _without_none(kind)) is not kind:
         return None if value is None else _decode(value, inner, where)
-    if is_dataclass(kind):
-        return _record(value, kind, where)
-    if kind == _IMAGES:
-        if not isinstance(value, Mapping):
-            raise InputFileError(
-                f"{where} is {shown(value)}; it must be a mapping of placeholders to images."
-            )
+    origin, wanted = typing.get_origin(kind), "a mapping"
+    if isinstance(value, Mapping) and kind == _IMAGES:
         return tuple((name, _decode(fill, PromptFill, f"{where}.{name}")) for name, fill in value.items())
-    if typing.get_origin(kind) is tuple:
-        return _tuple(value, kind, where)
-    if typing.get_origin(kind) is typing.Literal:
-        if value not in typing.get_args(kind):
-            raise InputFileError(f"{where} is {shown(value)}; allowed: {', '.join(typing.get_args(kind))}.")
-        return value
-    return _scalar(value, kind, where)
+    if isinstance(value, Mapping) and (kind in _KINDS or is_dataclass(kind)):
+        return _record(value, kind, where)
+    if origin is tuple and kind != _IMAGES:
+        wanted = "a list"
+        if isinstance(value, list | tuple):
+            kinds = _entry_kinds(kind, len(value))
+            if len(kinds) == len(value):
+                pairs = enumerate(zip(value, kinds, strict=True))
+                return tuple(_decode(entry, each, f"{where}[{n}]") for n, (entry, each) in pairs)
+            wanted = f"a list of {len(kinds)}"
+    elif origin is typing.Literal:
+        if value in typing.get_args(kind):
+            return value
+        wanted = f"one of {', '.join(typing.get_args(kind))}"
+    elif kind in _NAMES:
+        wanted = _NAMES[kind]
+        if kind is float and type(value) in (int, float) and abs(value) <= _MAX_NUMBER:  # NaN is not
+            return float(value)
+        if kind is bytes and isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                return base64.b64decode(value, validate=True)
+        if kind in (int, bool, str) and type(value) is kind:
+            return value
+    raise InputFileError(f"{where} is {shown(value)}; it must be {wanted}.")
 
 
-def _record(value: Any, kind: Any, where: str) -> Any:
-    if not isinstance(value, Mapping):
-        raise InputFileError(f"{where} is {shown(value)}; it must be a mapping.")
+def _record(value: Mapping[str, Any], kind: Any, where: str) -> Any:
+    if kind in _KINDS:
+        known = {each.__name__: each for each in _KINDS[kind]}
+        if value.get("type") not in known:
+            raise InputFileError(f"{where}: {unknown_name('type', value.get('type'), known)}")
+        kind, value = known[value["type"]], {k: v for k, v in value.items() if k != "type"}
     hints = typing.get_type_hints(kind)
     if unknown := [name for name in value if name not in hints]:
         raise InputFileError(f"{where}: {unknown_name('field', unknown[0], hints)}")
@@ -247,40 +266,6 @@ def _record(value: Any, kind: Any, where: str) -> Any:
         raise
     except OpenVimaError as error:
         raise InputFileError(f"{where}: {error}") from None
-
-
-def _tuple(value: Any, kind: Any, where: str) -> tuple[Any, ...]:
-    if not isinstance(value, list | tuple):
-        raise InputFileError(f"{where} is {shown(value)}; it must be a list.")
-    kinds = _entry_kinds(kind, len(value))
-    if len(kinds) != len(value):
-        raise InputFileError(f"{where} has {len(value)} entries; it must have {len(kinds)}.")
-    pairs = zip(value, kinds, strict=True)
-    return tuple(_decode(entry, entry_kind, f"{where}[{n}]") for n, (entry, entry_kind) in enumerate(pairs))
-
-
-def _scalar(value: Any, kind: Any, where: str) -> Any:
-    if kind is bool and isinstance(value, bool):
-        return value
-    if kind is int and type(value) is int:
-        return value
-    if kind is float and type(value) in (int, float) and abs(value) <= _MAX_NUMBER:  # NaN is not
-        return float(value)
-    if kind is str and isinstance(value, str):
-        return value
-    if kind is bytes and isinstance(value, str):
-        try:
-            return base64.b64decode(value, validate=True)
-        except (binascii.Error, ValueError):
-            pass
-    allowed = {
-        float: f"a number from {-_MAX_NUMBER:g} to {_MAX_NUMBER:g}",
-        int: "a whole number",
-        bool: "true or false",
-        str: "text",
-        bytes: "base64 text",
-    }[kind]
-    raise InputFileError(f"{where} is {shown(value)}; it must be {allowed}.")
 
 
 def _check(episode: Episode) -> None:

@@ -8,8 +8,6 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from openvima.errors import UnknownTaskError, echo
-
 if TYPE_CHECKING:
     from openvima.env.tabletop import TabletopEnv
 
@@ -42,8 +40,6 @@ def make(task: str, **options: object) -> "TabletopEnv":
     """
     from openvima.env.tabletop import TabletopEnv
 
-    if not isinstance(task, str):
-        raise UnknownTaskError(f"task is {echo(repr(task))}; give one name. `make_vec` takes several.")
     name = task.removeprefix("openvima/").removesuffix(f"-v{ENVIRONMENT_VERSION}")
     return TabletopEnv(name, **options)  # type: ignore[arg-type]  # checked by the constructor
 

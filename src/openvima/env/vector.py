@@ -236,6 +236,10 @@ class TabletopVectorEnv(VectorEnv):
             process.join()
             pipe.close()
 
+    def __del__(self) -> None:
+        if not self.closed:
+            self.close()
+
     def _ask(self, name: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Call a method of every `_Part`; return the answers, or raise the first exception among them."""
         if self.closed:

@@ -32,7 +32,7 @@ from openvima.evaluation.rollout_policies import (
 )
 from openvima.evaluation.sources import object_record
 from openvima.input_files import names_of
-from openvima.multiprocess import imap_unordered
+from openvima.multiprocess import Report, imap_unordered
 from openvima.policies.base import Policy, require_torch
 from openvima.policies.loading import load_policy
 from openvima.policies.naming import PolicyRef
@@ -41,7 +41,6 @@ from openvima.serving.chat import VlmPolicy
 from openvima.user_code import is_code, source_hash
 from openvima.video.encoder import FOLDER
 
-Report = Callable[[int, int, str], None]
 LOG_NAME = "evaluation_log.json"
 _PARTS = "parts"
 _ANSWERS = "answers"  # in the record of a policy: what is known once it was played

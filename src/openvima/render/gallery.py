@@ -29,6 +29,7 @@ from openvima.catalog.objects import REGISTERED_OBJECTS
 from openvima.catalog.textures import REGISTERED_TEXTURES
 from openvima.errors import AssetError
 from openvima.html import render_page, require_extra
+from openvima.multiprocess import Report
 from openvima.render import channels_last
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Drawable, Rasteriser
@@ -106,20 +107,12 @@ def _antialias(image: np.ndarray, samples: int) -> np.ndarray:
     return np.rint(np.concatenate([colour, sums[..., 3:] / samples**2], axis=2)).astype(np.uint8)
 
 
-Report = Callable[[int, int, str], None]
 Card = dict[str, object]  # values of the template's macro `card`
 
 PICTURES = "pictures"
 _SWATCH_PX = 240
 _SAMPLE_OBJECT = "round"  # shows each texture on a large flat face and a curved wall
 _HEROES = ("wooden", "yellow", "cyan", "tiger", "blue and purple stripe", "orange", "brick", "pink")
-_PALETTES = (
-    ("red", "tiger", "yellow and blue stripe", "red and green polka dot", "blue swirl", "green paisley"),
-    ("green", "magma", "red and purple stripe", "blue and purple polka dot", "red swirl", "purple paisley"),
-    ("blue", "granite", "green and purple stripe", "polka dot", "purple swirl", "yellow paisley"),
-    ("purple", "rainbow", "dark red and blue stripe", "checkerboard", "dark green swirl", "red paisley"),
-    ("dark blue", "tiles", "red and yellow stripe", "yellow and purple polka dot", "plastic", "blue paisley"),
-)
 _KINDS = {
     "kit": "flat prism",
     "box": "box of the sampled size",
@@ -137,7 +130,6 @@ _CATEGORIES = {
     "neutral": "Neutral",
     "registered": "Registered",
 }
-_ROLES_OUTSIDE_POOLS = {"line": "the line that sweeps must not touch or cross"}
 
 
 def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) -> tuple[Path, tuple[str, ...]]:
@@ -215,8 +207,6 @@ class _Artist:
 def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> Card:
     hero = _HEROES[index % len(_HEROES)]
     views = [artist.thumbnail(spec.name, hero, view, detail=2) for view in VIEWS]
-    palette = _PALETTES[index % len(_PALETTES)]
-    strip = [artist.thumbnail(spec.name, name, "front") for name in palette]
     facts = {
         "size": _extent(artist, spec),
         "mass": f"{1000 * spec.mass_kg:g} g",
@@ -227,17 +217,13 @@ def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> Card:
         "moved": _levels_where(lambda pool: spec.name in pool.dragged_objects),
         "base": _levels_where(lambda pool: spec.name in pool.base_objects),
     }
-    unused = "" if any(rows.values()) or spec.kind == "registered" else "used by no task"
-    note = _ROLES_OUTSIDE_POOLS.get(spec.name, unused)
     return {
         "id": _slug(spec.name),
         "name": spec.name,
         "kind": _KINDS[spec.kind],
         "views": views,
-        "strip": strip,
         "facts": facts,
         "roles": rows,
-        "note": note,
     }
 
 
@@ -258,19 +244,13 @@ def _texture_card(artist: _Artist, spec: TextureSpec) -> Card:
         "moved": _levels_where(lambda pool: spec.name in pool.dragged_textures),
         "base": _levels_where(lambda pool: spec.name in pool.base_textures),
     }
-    if spec.name == NEUTRAL_TEXTURE:
-        note = "prompt images that show a shape only"
-    else:
-        note = "" if any(rows.values()) or spec.category == "registered" else "used by no task"
     return {
         "id": _slug(f"texture {spec.name}"),
         "name": spec.name,
         "kind": "",
         "views": [artist.swatch(spec.name), artist.thumbnail(_SAMPLE_OBJECT, spec.name, "front")],
-        "strip": [],
         "facts": facts,
         "roles": rows,
-        "note": note,
     }
 
 

@@ -182,8 +182,8 @@ def listed_episodes(
         videos: Ids of the videos on the page.
 
     Returns:
-        At most `MOST_EPISODES` episodes, each with its row and the id of its video, or an empty one; and how many
-        there are.
+        At most `MOST_EPISODES` episodes, each with its row and the id of its video, or an empty one; and how
+        many there are.
     """
     episodes = [
         (row, outcome, videos.get((row.policy, row.task, row.level, outcome.seed), ""))

@@ -5,7 +5,7 @@ import re
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import product
 from pathlib import Path
 
 from openvima.atomic_io import folder_lock
@@ -15,7 +15,7 @@ from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
-from openvima.multiprocess import imap_unordered
+from openvima.multiprocess import Report, imap_unordered
 from openvima.policies.naming import BUNDLED, ORACLE, PolicyRef
 from openvima.report.curves import METRICS_FILE
 from openvima.report.page import default_command, write_report
@@ -25,8 +25,6 @@ from openvima.video.encoder import Clip, load_clips, png, save_clips
 REPORT_NAME = "report.html"
 MOST_VIDEOS = 40  # for each of `per_task`; one takes about a second
 _EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +69,7 @@ def require_extra() -> None:
 def evaluate_and_report(
     config: EvaluationConfig,
     videos: VideoSelection = DEFAULT_VIDEOS,
-    progress: Progress | None = None,
+    progress: Report | None = None,
     on_results: Callable[[Results], None] | None = None,
 ) -> Path:
     """Evaluate policies, record some of the episodes and write `report.html`: `openvima evaluate`.
@@ -161,26 +159,22 @@ def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Re
 
     Of each task and level: the first `videos.per_task` solved episodes and failures of every trained policy.
     Of the oracle the first solved ones of each task. Without trained policies and oracle, of all policies.
-    Failures come first, policies take turns, and the budget ends the list. Then the requested episodes, of
+    Failures come first, and the budget ends the list. Then the requested episodes, of
     every policy.
     """
     sources, requested = config.sources, requested_episodes(config, videos)
-    failed: list[list[Job]] = []
-    solved: list[list[Job]] = []
-    for source in [source for source in sources if source.kind in (*TRAINED_KINDS, ORACLE)] or sources:
-        failed.append([])
-        solved.append([])
+    shown = [source for source in sources if source.kind in (*TRAINED_KINDS, ORACLE)] or list(sources)
+    jobs: list[Job] = []
+    for success in (False, True):
         for task in results.tasks():
-            levels = (results.row(source.name, task, level) for level in results.levels())
-            rows = [row for row in levels if row is not None]
-            for row in rows[:1] if source.kind == ORACLE else rows:
-                for success, jobs_of in ((True, solved), (False, failed)):
-                    seeds = [outcome.seed for outcome in row.outcomes if outcome.success == success]
-                    if success or source.kind != ORACLE:
-                        first = seeds[: videos.per_task]
-                        jobs_of[-1] += [_job(config, results, source, row, seed) for seed in first]
-    turns = (turn for of_kind in (failed, solved) for turn in zip_longest(*of_kind))
-    jobs = [job for turn in turns for job in turn if job is not None][: MOST_VIDEOS * videos.per_task]
+            levels = [level for level in results.levels() if task in results.tasks(level)]
+            for level, source in product(levels, shown):
+                row = results.row(source.name, task, level)
+                if row is None or (source.kind == ORACLE and not (success and level == levels[0])):
+                    continue
+                seeds = [outcome.seed for outcome in row.outcomes if outcome.success == success]
+                jobs += [_job(config, results, source, row, seed) for seed in seeds[: videos.per_task]]
+    jobs = jobs[: MOST_VIDEOS * videos.per_task]
     for source in sources:
         for task, level, seed in requested:
             row = results.row(source.name, task, level)

@@ -15,7 +15,7 @@ from openvima.errors import ConfigError, InputFileError, differences
 from openvima.evaluation.results import Results
 from openvima.evaluation.runner import evaluate_prepared, prepare
 from openvima.input_files import as_path, read_json
-from openvima.multiprocess import check_workers, imap_unordered
+from openvima.multiprocess import Report, check_workers, imap_unordered
 from openvima.policies.base import require_torch
 from openvima.report.videos import require_extra
 from openvima.studies.plan import COST_FILE, Evaluation, Plan, Subset, Training, plan_study, record_of
@@ -29,8 +29,6 @@ PAGE_FILE = "report.html"
 SCHEMA = 1
 _MAX_DIFFERENCES = 3  # in a message
 _MAX_SETTINGS_BYTES = 1 << 20
-
-Report = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +212,7 @@ class _Runner:
             engine=self.execution.engine,
             address=self.execution.address,
         )
-        generate(config, lambda p: self._say(f"generating, {p.done:,} of {p.total:,}"))
+        generate(config, lambda done, total, _: self._say(f"generating, {done:,} of {total:,}"))
 
     def _sample(self, subset: Subset) -> None:
         if is_finished(subset.out):
