@@ -14,7 +14,7 @@ import pytest
 
 from naive import interleaved
 from openvima.data import Dataset, Demonstration, Shard, ShardWriter
-from openvima.data.encoding import Encoder, ShardInfo
+from openvima.data.encoding import ShardInfo, encode
 from openvima.data.manifest import INDEX_SCHEMA, finish_folder
 from openvima.data.records import pixels, planes
 from openvima.data.schema import ARRAYS, COLUMNS, SCHEMA_VERSION, VIEWS
@@ -43,7 +43,7 @@ def shard(tmp_path: Path, made_up: MadeUp, demo: Demonstration, info: ShardInfo)
 
 
 def test_every_column_is_read_alone(shard: Shard, demo: Demonstration) -> None:
-    row = Encoder().encode(demo).to_pylist()[0]
+    row = encode(demo).to_pylist()[0]
     for name in COLUMNS.names:
         (value,) = shard.read(1, [name]).values()
         if name in ARRAYS:
@@ -172,20 +172,12 @@ def test_many_open_shards_need_no_open_files(tmp_path: Path, demo: Demonstration
 
 def test_colours_are_joined_and_parted_pixel_by_pixel() -> None:
     given = np.random.default_rng(0).integers(0, 256, (3, 3, 128, 256), dtype=np.uint8)
-    joined = pixels(given, np.empty((3, 128, 256, 3), np.uint8))
+    joined = pixels(given)
     assert np.array_equal(joined[:, :5], interleaved(given[:, :, :5]))
     odd = [np.asfortranarray(image) for image in given]
-    assert np.array_equal(pixels(odd, np.empty_like(joined)), joined)
+    assert np.array_equal(pixels(odd), joined)
     assert np.array_equal(planes(joined), given)
     assert planes(joined).flags.c_contiguous
-
-
-def test_memory_that_is_used_again_changes_nothing(made_up: MadeUp) -> None:
-    encoder = Encoder()
-    shapes = [(4, 3), (0, 0), (2, 2), (2, 2), (5, 4), (2, 2)]
-    for seed, (num_steps, num_images) in enumerate(shapes):
-        demo = made_up(seed, num_steps=num_steps, num_images=num_images)
-        assert encoder.encode(demo).equals(Encoder().encode(demo))
 
 
 def test_the_schema_says_how_images_are_shaped() -> None:

@@ -6,13 +6,12 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from typing import Any, Literal, get_origin
 
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.records import Demonstration, ImageBuffers, make_columns, planes
+from openvima.data.records import Demonstration, make_columns, planes
 from openvima.data.schema import ARRAYS, CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION, VIEWS
 from openvima.env.config import ENV_SETTINGS, EnvConfig, without_published
 from openvima.errors import ShardError, unknown_name
@@ -36,10 +35,8 @@ _MAX_FUNCTION = 200  # characters
 _WORD = re.compile(r"\w[\w .+-]{0,100}")
 _NAMES = COLUMNS.names
 _TYPES: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in _NAMES}
-# Columns with few values, then other texts, records and numbers, which are made at once.
-_REPEATED = ("task", "level", "domain", "steps", "max_steps", "redraws", "success", "failure", "reason")
-_REPEATED = (*_REPEATED, "end_effector")
-_OTHER_NAMES = [name for name in _NAMES if name not in (*IMAGES, *NUMBERS, *_REPEATED)]
+# Texts, records and single numbers, which are made at once: each call into Arrow takes microseconds.
+_OTHER_NAMES = [name for name in _NAMES if name not in (*IMAGES, *NUMBERS)]
 _OTHERS = pa.struct([COLUMNS.field(name) for name in _OTHER_NAMES])
 
 SkipKind = Literal["failed", "unsolved", "no_action", "not_sampled"]
@@ -166,74 +163,39 @@ def _is_function(assets: str) -> bool:
     return len(assets) <= _MAX_FUNCTION and is_code(assets) and "/" not in assets and assets.isprintable()
 
 
-class Encoder:
-    """Makes rows of demonstrations, one at a time, in memory that it uses again.
-
-    Each call into Arrow costs some microseconds, so that arrays are kept together with the memory that they
-    show, which is filled anew for each row.
+def encode(
+    demo: Demonstration,
+    skipped: Sequence[Skipped] = (),
+    *,
+    schema: pa.Schema = COLUMNS,
+    with_images: bool = True,
+) -> pa.RecordBatch:
+    """Make one row of a demonstration.
 
     Args:
+        demo: The demonstration.
+        skipped: Seeds tried just before it in vain.
         schema: `COLUMNS`, perhaps with metadata.
         with_images: Store what the cameras saw and the prompt shows; the content hash counts them either way.
+
+    Returns:
+        A record batch of one row with the columns of `schema.COLUMNS`.
     """
-
-    def __init__(self, schema: pa.Schema = COLUMNS, *, with_images: bool = True) -> None:
-        self._schema, self._with_images = schema, with_images
-        self._images = ImageBuffers()
-        self._kept: dict[tuple[str, int], tuple[np.ndarray, pa.ListArray]] = {}
-
-    def encode(self, demo: Demonstration, skipped: Sequence[Skipped] = ()) -> pa.RecordBatch:
-        """Make one row of a demonstration.
-
-        Args:
-            demo: The demonstration.
-            skipped: Seeds tried just before it in vain.
-
-        Returns:
-            A record batch of one row with the columns of `schema.COLUMNS`, good until the next call.
-        """
-        columns = make_columns(demo, self._images)
-        others = {
-            **columns.records,
-            "content_hash": columns.content_hash,
-            "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
-        }
-        cells: dict[str, pa.Array] = {name: _make_value_cell(name, others[name]) for name in _REPEATED}
-        made = pa.array([others], type=_OTHERS)
-        cells |= {name: made.field(number) for number, name in enumerate(_OTHER_NAMES)}
-        for name, rows in columns.numbers.items():
-            if name == "joint_paths":
-                cells[name] = _make_paths_cell(rows, columns.path_lengths)
-            else:
-                cells[name] = self._number_cell(name, rows)
-        for name, images in columns.images.items():
-            cells[name] = self._image_cell(name, images if self._with_images else images[:0])
-        return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=self._schema)
-
-    def _number_cell(self, name: str, rows: np.ndarray) -> pa.ListArray:
-        """A column of one row that lists numbers, which are copied."""
-        key = name, len(rows)
-        if key not in self._kept:
-            memory = np.empty_like(rows)
-            self._kept[key] = memory, _make_cell(_make_rows(memory, _TYPES[name].value_type), _TYPES[name])
-        memory, cell = self._kept[key]
-        np.copyto(memory, rows)
-        return cell
-
-    def _image_cell(self, name: str, images: np.ndarray) -> pa.ListArray:
-        """A column of one row that lists images; those of `ImageBuffers` lie where others lay before."""
-        key, memory = (name, len(images)), images.base
-        if memory is None or not self._images.owns(name, memory):
-            return _make_cell(_make_rows(images, _TYPES[name].value_type), _TYPES[name])
-        if key not in self._kept or self._kept[key][0] is not memory:
-            self._kept[key] = memory, _make_cell(_make_rows(images, _TYPES[name].value_type), _TYPES[name])
-        return self._kept[key][1]
-
-
-@lru_cache(maxsize=4096)
-def _make_value_cell(name: str, value: str | int | bool) -> pa.Array:
-    """A column of one row that holds a value which many rows share."""
-    return pa.array([value], type=COLUMNS.field(name).type)
+    columns = make_columns(demo)
+    others = {
+        **columns.records,
+        "content_hash": columns.content_hash,
+        "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
+    }
+    made = pa.array([others], type=_OTHERS)
+    cells: dict[str, pa.Array] = {name: made.field(number) for number, name in enumerate(_OTHER_NAMES)}
+    images = {name: array if with_images else array[:0] for name, array in columns.images.items()}
+    for name, rows in {**columns.numbers, **images}.items():
+        if name == "joint_paths":
+            cells[name] = _make_paths_cell(rows, columns.path_lengths)
+        else:
+            cells[name] = _make_cell(_make_rows(rows, _TYPES[name].value_type), _TYPES[name])
+    return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=schema)
 
 
 def _make_rows(rows: np.ndarray, dtype: pa.FixedSizeListType) -> pa.Array:

@@ -135,8 +135,8 @@ class CacheFile:
             self._lists = {
                 name: _unpack(rows.column(name), fields) for name, fields in _lists(about["kind"]).items()
             }
-            self._scalars = {name: rows.column(name) for name in _SCALARS}
-            self._checksums = rows.column(_CHECKSUM)
+            self._scalars = {name: rows.column(name).to_pylist() for name in _SCALARS}
+            self._checksums = rows.column(_CHECKSUM).to_pylist()
         except DAMAGE_ERRORS as error:
             raise ShardError(
                 _describe_damage(path, str(error).splitlines()[0] if str(error) else "empty")
@@ -153,8 +153,8 @@ class CacheFile:
             start, end = ends[row : row + 2].tolist()
             for name, flat in fields.items():
                 arrays[name] = flat[start:end]
-        scalars = tuple([column[row].as_py() for column in self._scalars.values()])
-        if _checksum(scalars, arrays.values()) != self._checksums[row].as_py():
+        scalars = tuple([column[row] for column in self._scalars.values()])
+        if _checksum(scalars, arrays.values()) != self._checksums[row]:
             raise ShardError(
                 _describe_damage(self.path, f"the checksum of row {row} of {len(self)} is wrong")
             )
@@ -197,8 +197,8 @@ class CacheFile:
 
     def texts(self, name: str) -> set[str]:
         """Return the different texts of a column."""
-        column = self._scalars[name]
-        return set((column if pa.types.is_string(column.type) else column.flatten()).unique().to_pylist())
+        values = self._scalars[name]
+        return {text for value in values for text in ([value] if isinstance(value, str) else value)}
 
 
 def write_cache_file(

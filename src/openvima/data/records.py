@@ -14,7 +14,7 @@ import numpy as np
 import xxhash
 
 from openvima import __version__
-from openvima.data.schema import ARRAYS, IMAGE_SHAPE, VIEWS
+from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.errors import brief_repr
 from openvima.html import notebook_html
 from openvima.scene import (
@@ -244,45 +244,14 @@ class Columns:
     content_hash: str
 
 
-class ImageBuffers:
-    """Reusable memory for the images of an episode: allocating costs more than filling."""
-
-    def __init__(self) -> None:
-        self._arrays: dict[str, np.ndarray] = {}
-
-    def images(self, name: str, count: int) -> np.ndarray:
-        """Return room for images, valid until the next call.
-
-        Args:
-            name: Column that they are for; each has its own memory.
-            count: Number of images.
-
-        Returns:
-            An array of uint8 with the shape of the column.
-        """
-        _, shape = ARRAYS[name]
-        if name not in self._arrays or count > len(self._arrays[name]):
-            self._arrays[name] = np.empty((count, *shape), np.uint8)
-        return self._arrays[name][:count]
-
-    def owns(self, name: str, memory: np.ndarray) -> bool:
-        """Tell whether an array is the present memory of a column."""
-        return self._arrays.get(name) is memory
-
-
-def make_columns(demo: Demonstration, buffers: ImageBuffers | None = None) -> Columns:
-    """Return the columns of a demonstration.
-
-    Args:
-        demo: The demonstration.
-        buffers: Memory for its images; None gives them their own.
-    """
+def make_columns(demo: Demonstration) -> Columns:
+    """Return the columns of a demonstration."""
     records, arrays = _records(demo), _arrays(demo)
     path_lengths = [len(path) for path in demo.joint_paths]
     described = {**records, "assets": demo.assets, "path_lengths": path_lengths}
     digest = xxhash.xxh3_128(_JSON.encode(described).encode())
     images = {}
-    for name, array in itertools.chain(arrays.items(), _images(demo, buffers or ImageBuffers())):
+    for name, array in itertools.chain(arrays.items(), _images(demo)):
         digest.update(array.nbytes.to_bytes(8, "little"))
         digest.update(array.reshape(-1).view(np.uint8).data)  # while it is in the CPU cache
         if name not in arrays:
@@ -347,37 +316,38 @@ def _arrays(demo: Demonstration) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _images(demo: Demonstration, buffers: ImageBuffers) -> Iterator[tuple[str, np.ndarray]]:
+def _images(demo: Demonstration) -> Iterator[tuple[str, np.ndarray]]:
     shown = list(demo.prompt.images.values())
     for view in VIEWS:
-        name = f"prompt_rgb_{view}"
-        yield name, pixels([image.rgb[view] for image in shown], buffers.images(name, len(shown)))
+        yield f"prompt_rgb_{view}", pixels([image.rgb[view] for image in shown])
     for view in VIEWS:
-        name = f"prompt_segm_{view}"
-        room = buffers.images(name, len(shown))
-        yield name, np.stack([image.segm[view] for image in shown], out=room) if shown else room
+        segm = [image.segm[view] for image in shown]
+        yield f"prompt_segm_{view}", np.stack(segm) if shown else np.empty((0, *IMAGE_SHAPE), np.uint8)
     for view in VIEWS:
-        name = f"rgb_{view}"
-        yield name, pixels(demo.rgb[view], buffers.images(name, len(demo.rgb[view])))
+        yield f"rgb_{view}", pixels(demo.rgb[view])
     for view in VIEWS:
         yield f"segm_{view}", np.ascontiguousarray(demo.segm[view])
 
 
-def pixels(planes: np.ndarray | Sequence[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Copy images so that their colours come last.
+def pixels(planes: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
+    """Return images with their colours last.
 
     Args:
         planes: N images of shape (3, 128, 256), uint8.
-        out: Where to, shape (N, 128, 256, 3), uint8, contiguous; also what is returned.
+
+    Returns:
+        A copy of shape (N, 128, 256, 3), uint8, contiguous.
     """
     from openvima.data.kernels import join_colours  # Numba takes a moment to be imported
 
+    joined = np.empty((len(planes), *IMAGE_SHAPE, 3), np.uint8)
+    flat = joined.reshape(-1, 3 * _NUM_PIXELS)
     parts = [planes] if isinstance(planes, np.ndarray) else [image[np.newaxis] for image in planes]
-    joined, end = out.reshape(len(out), 3 * _NUM_PIXELS), 0
+    end = 0
     for part in parts:
         start, end = end, end + len(part)
-        join_colours(np.ascontiguousarray(part).reshape(-1, 3, _NUM_PIXELS), joined[start:end])
-    return out
+        join_colours(np.ascontiguousarray(part).reshape(-1, 3, _NUM_PIXELS), flat[start:end])
+    return joined
 
 
 def planes(pixels: np.ndarray) -> np.ndarray:

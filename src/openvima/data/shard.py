@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import pyarrow as pa
 
 from openvima.atomic_io import NO_SPACE, atomic_write
-from openvima.data.encoding import Encoder, ShardInfo, Skipped, decode, decode_actions, decode_columns
+from openvima.data.encoding import ShardInfo, Skipped, decode, decode_actions, decode_columns, encode
 from openvima.data.records import Demonstration, Step, make_columns, planes
 from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION, VIEWS
 from openvima.errors import DatasetError, ShardError, unknown_name
@@ -344,7 +344,7 @@ class ShardWriter:
     def __init__(self, path: Path, info: ShardInfo) -> None:
         self.path = path
         self._schema = COLUMNS.with_metadata(info.to_metadata())
-        self._encoder = Encoder(self._schema, with_images=info.images)
+        self._has_images = info.images
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
         self._closing = contextlib.ExitStack()
@@ -360,7 +360,7 @@ class ShardWriter:
             demo: The demonstration.
             skipped: Seeds tried just before it in vain.
         """
-        self._writer.write_batch(self._encoder.encode(demo, skipped))
+        self._writer.write_batch(encode(demo, skipped, schema=self._schema, with_images=self._has_images))
 
     def copy(self, batch: pa.RecordBatch) -> None:
         """Append one episode as another shard holds it.
