@@ -18,7 +18,6 @@ from openvima.data.object_cache import (
     write_cache_file,
 )
 from openvima.data.preprocessed import preprocess
-from openvima.data.verification import verify
 from openvima.errors import DatasetError, WorkerError
 from openvima.perception.boxes import object_iou
 from openvima.perception.objects import GROUND_TRUTH, observe
@@ -147,7 +146,6 @@ def test_a_cache_may_hold_a_fraction_of_the_demonstrations(copy: Path) -> None:
     others = open_object_cache(tasks, folder=copy / "other", boxes=replace(CLUMSY, fraction=0.5))
     names = {(e.task, e.seed) for e in others if e.num_steps}
     assert names == {(e.task, e.seed) for e in part if e.num_steps and e.task == "rotate"}
-    assert not verify(copy).problems
 
 
 def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
@@ -165,18 +163,6 @@ def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> 
 def test_whole_frames_have_no_boxes(demos: Path) -> None:
     with pytest.raises(DatasetError, match="whole frames have none"):
         open_object_cache(Dataset(demos), "frames", boxes=CLUMSY)
-
-
-def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> None:
-    cache = open_object_cache(Dataset(copy), boxes=CLUMSY)
-    assert not verify(copy).problems
-    path = cache.folder / "rotate-train-00000.arrow"
-    rows = [row for row, episode in enumerate(cache) if episode.task == "rotate"][:2]
-    changed = [replace(cache[row], actions=cache[row].actions + 0.1) for row in rows]
-    write_cache_file(path, changed, "objects", CacheFile(path).source, "clumsy-1")
-    (problem,) = verify(copy).problems
-    assert "it differs from the demonstration" in problem.cause
-    assert problem.file.endswith("objects-v7-clumsy-1/rotate-train-00000.arrow")
 
 
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

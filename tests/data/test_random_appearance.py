@@ -17,7 +17,6 @@ from openvima.data.rerender import (
     RandomAppearance,
     with_random_appearance,
 )
-from openvima.data.verification import verify
 from openvima.errors import DatasetError
 from openvima.scene import Placement, Problem, SceneImage
 from openvima.tasks import sample_episode
@@ -194,7 +193,6 @@ def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFi
     times = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
     open_object_cache(Dataset(copy), appearance=0)
     assert times == {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
-    assert not verify(copy).problems
     for wrong in (["--rerendered", "-1"], ["--rerendered", "0", "--boxes", "detector"]):
         assert main(["data", "preprocess", str(copy), *wrong]) == 2
         assert "it must be 0 or more, and without --boxes" in capsys.readouterr().err
