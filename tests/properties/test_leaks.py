@@ -60,10 +60,16 @@ def excess(counts: collections.Counter[tuple[int, int]]) -> float:
     return (statistic - freedom) / (2 * freedom) ** 0.5 if freedom else 0.0
 
 
-@pytest.mark.parametrize("task", REPRESENTATIVE_TASKS)
+@pytest.mark.parametrize(
+    ("task", "level"),
+    [
+        *((task, task_spec(task).levels[0]) for task in REPRESENTATIVE_TASKS),
+        *((task, "L5") for task in ("rearrange", "visual_manipulation")),
+    ],
+)
 @pytest.mark.slow
-def test_no_rank_in_any_order_predicts_the_answer(task: str) -> None:
-    found = ranks(task, task_spec(task).levels[0])
+def test_no_rank_in_any_order_predicts_the_answer(task: str, level: str) -> None:
+    found = ranks(task, level)
     assert {kind: excess(counts) for kind, counts in found.items() if excess(counts) > LIMIT} == {}
 
 
