@@ -1,6 +1,7 @@
 """Level L7: sentences of the grammar mean one thing, which a resolver that reads them finds as well."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -143,6 +144,6 @@ def _shows_what_is_moved(prompt: Prompt, problem: Problem) -> bool:
         ({"num_objects": 3}, "num_objects is 3"),
     ],
 )
-def test_options_out_of_range_are_refused(option: dict[str, int], message: str) -> None:
+def test_options_out_of_range_are_refused(option: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         sample_episode("refer_by_number", seed=0, **option)

@@ -72,14 +72,14 @@ def referring_problem(
         named = [fill.placement for fill in fills.values() if isinstance(fill, ObjectImage)]
         target = table.choose([p for p in loose if p not in named])
         fills["target"], moved, base = ObjectImage(target), (target,), meaning.meant[0]
-    elif base:
-        fills["base"] = ObjectImage(base)
+    if base:
+        if command == "put":
+            fills["base"] = ObjectImage(base)
+        tolerance = TOLERANCE if len(moved) == 1 else SEVERAL
+        goals = [AtPose(p.id, base.pose, tolerance, relative_to=base.id) for p in moved]
     else:
         fills["angle"] = angle_deg = table.choose(ANGLES_DEG)
         goals = [rotation_goal(p, angle_deg, position_m=TOLERANCE.position_m) for p in moved]
-    if base:
-        tolerance = TOLERANCE if len(moved) == 1 else SEVERAL
-        goals = [AtPose(p.id, base.pose, tolerance, relative_to=base.id) for p in moved]
     others = tuple(p.id for p in table.placements if p not in moved and p is not base)
     return Problem(
         scene=table.scene(),
