@@ -138,7 +138,7 @@ def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue(monkey
         name = "empty"
         geometry = texture = refused
 
-    monkeypatch.setattr(outlines, "_OUTLINES", {})
+    monkeypatch.setattr(outlines, "_outlines", dict)
     looks = RandomAppearanceAssets(Empty())
     rng = np.random.default_rng(0)
     for kind in ("shape", "container", "grating", "eared container", "texture"):

@@ -160,7 +160,7 @@ def test_closed_environments_leave_no_file_handles() -> None:
         envs.close()
         del envs
         counts.append(num_handles())
-    assert counts[0] == counts[1]  # the first starts the process that looks after shared resources
+    assert counts[1] <= counts[0]  # the first starts the process that looks after shared resources
 
 
 @pytest.mark.slow

@@ -124,7 +124,7 @@ def test_other_folders_and_files_here_do_not_replace_it(bundled: Path) -> None:
     load_policy(SMALL)
     batch = Batch(SMALL, SMALL, "rotate", "L1", first_seed=0, episodes=1)
     assert batch.with_whole_paths().source == SMALL
-    assert find_metrics(policy_sources((SMALL,))) is None
+    assert not find_metrics(policy_sources((SMALL,)))
 
 
 def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(bundled: Path, capsys) -> None:

@@ -596,4 +596,6 @@ def _episode_option(options: object, assets: Assets) -> Episode | None:
         return load_episode(episode, assets=assets)
     if isinstance(episode, Mapping):
         return episode_from_values(episode, assets=assets)
+    if not isinstance(episode, Episode | None):
+        raise ConfigError(f"option 'episode' is {episode!r}; give an Episode, a file or the values of one.")
     return episode
