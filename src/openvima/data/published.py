@@ -444,7 +444,8 @@ def _find_broken(block: Block) -> list[Broken] | None:
         )
     source = open_source(block.source)
     found = [read_place(source, place) for place in block.places if place.folder not in present]
-    return found if all(isinstance(entry, Broken) for entry in found) else None
+    broken = [entry for entry in found if isinstance(entry, Broken)]
+    return broken if len(broken) == len(found) else None
 
 
 def _check_folder(folder: Path, blocks: Sequence[Block]) -> None:

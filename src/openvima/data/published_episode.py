@@ -288,11 +288,13 @@ def _actions(fields: Fields) -> tuple[Action, ...]:
     columns = {}
     for key, length in ACTION_SHAPES.items():
         rows = as_array(fields[key])[:, :length].astype(np.float32)
-        low, high = (WORKSPACE_LOW, WORKSPACE_HIGH) if length == 2 else (-1.0, 1.0)
-        inside = (rows >= np.float32(low)) & (rows <= np.float32(high))  # what is no number is not
+        bounds = (WORKSPACE_LOW, WORKSPACE_HIGH) if length == 2 else (-1.0, 1.0)
+        low, high = np.array(bounds, np.float32)
+        inside = (rows >= low) & (rows <= high)  # what is no number is not
         if rows.shape[1:] != (length,) or not inside.all():
             raise MemberError(
-                f"{key} is {rows.tolist()!s:.80}; it must be of shape (T, {length}), within {low} … {high}."
+                f"{key} is {rows.tolist()!s:.80}; it must be of shape (T, {length}), within {bounds[0]} … "
+                f"{bounds[1]}."
             )
         columns[key] = list(map(tuple, rows.tolist()))
     steps = tuple(

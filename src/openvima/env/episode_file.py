@@ -238,7 +238,8 @@ def _decode(value: Any, kind: Any, where: str) -> Any:
         wanted = f"one of {', '.join(typing.get_args(kind))}"
     elif kind in _NAMES:
         wanted = _NAMES[kind]
-        if kind is float and type(value) in (int, float) and abs(value) <= _MAX_NUMBER:  # NaN is not
+        is_float = kind is float and not isinstance(value, bool)
+        if is_float and isinstance(value, int | float) and abs(value) <= _MAX_NUMBER:  # NaN is not
             return float(value)
         if kind is bytes and isinstance(value, str):
             with contextlib.suppress(ValueError):

@@ -443,7 +443,7 @@ def _checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
     if seed is None:
         return [None] * num_envs
     if isinstance(seed, Sequence | np.ndarray):
-        seeds = [None if entry is None else checked_seed(entry) for entry in seed]
+        seeds: list[int | None] = [None if entry is None else checked_seed(entry) for entry in seed]
     else:
         seeds = [checked_seed(checked_seed(seed) + index) for index in range(num_envs)]
     if len(seeds) != num_envs:
