@@ -148,14 +148,20 @@ def leftmost_first(episode: PreprocessedEpisode) -> PreprocessedEpisode:
     for pick in picks:  # an object that moves again begins the next stage
         stage.append((stage[-1] if stage else 0) + (pick in moved))
         moved = {pick} if pick in moved else moved | {pick}
-    tables = episode.objects.split(episode.objects_per_step)
+    objects, step = episode.objects, np.repeat(steps, episode.objects_per_step)
+    points = unproject(objects.grasps[:, TOP], CAMERAS["top"])
+    near = [  # of each action, where another object is at its place, in all steps
+        objects.masks[:, TOP] & (objects.ids != pick) & (np.linalg.norm(points - place, axis=1) < _OCCUPIED_M)
+        for pick, place in zip(picks, episode.actions[:, PLACE], strict=True)
+    ]
+
+    def is_free(action: int, now: int) -> bool:  # nothing is at its place that leaves it before
+        there_now, there_then = (set(objects.ids[near[action] & (step == t)].tolist()) for t in (now, action))
+        return there_now <= there_then
+
     labels = [
         min(
-            (
-                s
-                for s in steps[t:]
-                if stage[s] == stage[t] and (s == t or _is_free(episode, s, tables[t], tables[s]))
-            ),
+            (s for s in steps[t:] if stage[s] == stage[t] and is_free(s, t)),
             key=lambda s: episode.actions[s, PICK][1],
         )
         for t in steps
@@ -167,18 +173,6 @@ def leftmost_first(episode: PreprocessedEpisode) -> PreprocessedEpisode:
         place_ids=episode.place_ids[labels],
         executed=episode.actions,
     )
-
-
-def _is_free(episode: PreprocessedEpisode, step: int, now: ObjectTable, then: ObjectTable) -> bool:
-    """Whether the place of a later action is taken now by no object that leaves it before."""
-    place = episode.actions[step, PLACE]
-
-    def ids_near(objects: ObjectTable) -> set[int]:
-        points = unproject(objects.grasps[:, TOP], CAMERAS["top"])
-        near = (np.linalg.norm(points - place, axis=1) < _OCCUPIED_M) & objects.masks[:, TOP]
-        return set(objects.ids[near].tolist()) - {int(episode.pick_ids[step])}
-
-    return ids_near(now) <= ids_near(then)
 
 
 Transform: TypeAlias = Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
