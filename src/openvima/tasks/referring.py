@@ -112,20 +112,20 @@ def _place_objects(
     if not are_distinct((*textures, *(base.texture for base in bases))):
         raise SamplingError(f"{', '.join(textures)} are not clearly distinct.")
     appearances = list(itertools.product(shapes.tolist(), textures))
-    looks = [appearances[index] for index in table.rng.permutation(len(appearances))]
+    chosen = [appearances[index] for index in table.rng.permutation(len(appearances))]
     placed: list[Placement] = []
     while len(placed) < count:
         scale = table.choose(SCALES)
         placed.append(
             table.place_one(
                 "object",
-                lambda: looks[len(placed)],
+                lambda: chosen[len(placed)],
                 tries=_TRIES,
                 scale=(scale, scale, scale),
                 apart_m=_APART_M,
             )
         )
-    absent = [replace(placed[0], id=0, object=shape, texture=texture) for shape, texture in looks[count:]]
+    absent = [replace(placed[0], id=0, object=shape, texture=texture) for shape, texture in chosen[count:]]
     return placed, absent
 
 
