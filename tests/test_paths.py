@@ -11,7 +11,7 @@ from openvima.data import Dataset, GenerateConfig, verify
 from openvima.data.lerobot import LerobotConfig
 from openvima.data.published import ImportConfig
 from openvima.data.subsets import MergeConfig, SubsetConfig
-from openvima.errors import CheckpointError, UnknownPolicyError
+from openvima.errors import InputFileError, UnknownPolicyError
 from openvima.evaluation import EvaluationConfig, Results, score
 from openvima.evaluation.config import plan
 from openvima.evaluation.sources import policy_sources
@@ -159,7 +159,7 @@ def test_a_detector_lies_at_home(home: Path) -> None:
 
     (home / "boxes").mkdir()
     assert detector_folder("~/boxes") == home / "boxes"
-    with pytest.raises(CheckpointError, match="no folder"):
+    with pytest.raises(InputFileError, match="no folder"):
         detector_folder("~/others")
 
 

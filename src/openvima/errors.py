@@ -15,7 +15,7 @@ class OpenVimaError(Exception):
 
 
 class UnknownNameError(OpenVimaError, KeyError):
-    """An unknown name."""
+    """A name of a task, object, texture or policy that does not exist."""
 
     def __str__(self) -> str:  # KeyError would print the repr of the message
         return str(self.args[0]) if self.args else ""
@@ -25,20 +25,8 @@ class UnknownTaskError(UnknownNameError):
     """There is no task of that name."""
 
 
-class UnknownObjectError(UnknownNameError):
-    """There is no object of that name in the catalogue."""
-
-
-class UnknownTextureError(UnknownNameError):
-    """There is no texture of that name in the catalogue."""
-
-
 class UnknownPolicyError(UnknownNameError):
     """There is no policy, preset or run folder of that name."""
-
-
-class LevelError(OpenVimaError, ValueError):
-    """A level that does not exist, or at which a task is not defined."""
 
 
 class SamplingError(OpenVimaError, ValueError):
@@ -46,11 +34,7 @@ class SamplingError(OpenVimaError, ValueError):
 
 
 class ShapeError(OpenVimaError, ValueError):
-    """An array of the wrong shape or dtype."""
-
-
-class CameraError(OpenVimaError, ValueError):
-    """A point that the camera cannot project, such as one behind it."""
+    """An array of the wrong shape or dtype, or with values that its meaning excludes."""
 
 
 class AssetError(OpenVimaError, ValueError):
@@ -61,12 +45,8 @@ class SceneError(OpenVimaError, ValueError):
     """A scene, placement or pose that cannot exist."""
 
 
-class ReachError(OpenVimaError, ValueError):
-    """The arm cannot reach a tool pose."""
-
-
 class ActionError(OpenVimaError, ValueError):
-    """An action out of bounds, of wrong shape or dtype, or not finite. Nothing was moved."""
+    """An action out of bounds or reach, of wrong shape or dtype, or not finite. Nothing was moved."""
 
 
 class EpisodeError(OpenVimaError, RuntimeError):
@@ -89,16 +69,8 @@ class FolderLockedError(OpenVimaError, RuntimeError):
     """Another process is writing to the folder."""
 
 
-class ShardError(OpenVimaError, ValueError):
-    """A file of demonstrations is damaged, truncated or of another format."""
-
-
 class DatasetError(OpenVimaError, ValueError):
-    """A data folder is incomplete, of another version or unsuitable for the command."""
-
-
-class MemberError(OpenVimaError, ValueError):
-    """An episode of the published data set is damaged, incomplete or unsafe to unpickle."""
+    """Demonstrations or results are damaged, incomplete, of another version or unsuitable for the command."""
 
 
 class PromptError(OpenVimaError, ValueError):
@@ -113,24 +85,12 @@ class PolicyRaisedError(PolicyError):
     """The code of a policy raised in `reset` or `act`."""
 
 
-class DetectionError(OpenVimaError, ValueError):
-    """An invalid detection: a box outside the image, or a score that is not a number."""
-
-
 class InputFileError(OpenVimaError, ValueError):
-    """A file to read is no regular file, too large, nested too deep or of another format."""
-
-
-class CheckpointError(OpenVimaError, ValueError):
-    """A checkpoint is damaged or does not match the model."""
-
-
-class HubError(OpenVimaError, ValueError):
-    """The Hugging Face Hub has no such repository or revision, refuses, or cannot be reached."""
+    """A file or checkpoint is no regular file, too large, damaged, of another format or does not fit."""
 
 
 class ConfigError(OpenVimaError, ValueError):
-    """An option out of range, or options that contradict each other."""
+    """An option or level that does not exist or is out of range, or options that contradict each other."""
 
 
 class MessageError(OpenVimaError, ValueError):
@@ -138,7 +98,7 @@ class MessageError(OpenVimaError, ValueError):
 
 
 class ServerError(OpenVimaError, ConnectionError):
-    """A policy server cannot be reached, was lost, refuses a request or speaks another protocol."""
+    """A policy server or the Hugging Face Hub cannot be reached, was lost or refuses a request."""
 
 
 class AnswerError(OpenVimaError, ValueError):

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
-from openvima.errors import HubError, echo
+from openvima.errors import ServerError, echo
 from openvima.imports import import_extra
 
 HubKind = Literal["model", "dataset"]
@@ -74,7 +74,7 @@ def fetch(name: HubName, files: Sequence[str], *, kind: HubKind = "model", into:
 
     Raises:
         MissingExtraError: `huggingface_hub` is not installed.
-        HubError: There is no such repository, or it cannot be reached.
+        ServerError: There is no such repository, or it cannot be reached.
     """
     hub = _client(f"to fetch {name} from the Hugging Face Hub")
     place = {} if into is None else {"local_dir": into}
@@ -114,7 +114,7 @@ def commit(
 
     Raises:
         MissingExtraError: `huggingface_hub` is not installed.
-        HubError: The Hub refuses, for example without a token that may write, or cannot be reached.
+        ServerError: The Hub refuses, for example without a token that may write, or cannot be reached.
     """
     hub = _client(f"to push to {name} on the Hugging Face Hub")
     api = hub.HfApi(library_name="openvima")
@@ -143,7 +143,7 @@ def _failures(what: str) -> Iterator[None]:
         yield
     except Exception as error:  # the client passes on those of its HTTP library, which has changed before
         reasons = [_first_line(each) for each in (error, error.__cause__) if each is not None]
-        raise HubError(f"{what} failed: {'; '.join(reasons)}") from error
+        raise ServerError(f"{what} failed: {'; '.join(reasons)}") from error
 
 
 def _first_line(error: BaseException) -> str:

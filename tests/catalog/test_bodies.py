@@ -7,7 +7,7 @@ from openvima.catalog.bodies import build_geometry
 from openvima.catalog.geometry import CollisionBox, CollisionHull
 from openvima.catalog.objects import OBJECTS, object_spec
 from openvima.catalog.outlines import outline, signed_area
-from openvima.errors import AssetError, UnknownObjectError
+from openvima.errors import AssetError, UnknownNameError
 
 ALL = list(OBJECTS)
 KIT = [name for name in ALL if OBJECTS[name].kind == "kit"]
@@ -130,7 +130,7 @@ def test_unusable_sizes_and_objects_are_refused():
         build_geometry("block", (0.07, 0.07, 0.0))
     with pytest.raises(AssetError, match="factors must be above 0"):
         build_geometry("ring", (0.1, 0.1, 0.1), (1.0, 0.0, 1.0))
-    with pytest.raises(UnknownObjectError, match="Did you mean 'ring'"):
+    with pytest.raises(UnknownNameError, match="Did you mean 'ring'"):
         build_geometry("rign", (0.1, 0.1, 0.1))
 
 

@@ -11,7 +11,7 @@ import pytest
 from openvima.catalog.objects import OBJECTS, object_spec
 from openvima.catalog.procedural import procedural_assets
 from openvima.catalog.textures import TEXTURES, texture_spec
-from openvima.errors import UnknownObjectError, UnknownTextureError
+from openvima.errors import UnknownNameError
 
 
 def test_there_are_31_objects_with_distinct_names_and_ids():
@@ -27,7 +27,7 @@ def test_nine_objects_have_no_rotational_symmetry():
 
 
 def test_an_unknown_object_is_refused_with_the_nearest_name():
-    with pytest.raises(UnknownObjectError, match="Did you mean 'letter A'"):
+    with pytest.raises(UnknownNameError, match="Did you mean 'letter A'"):
         object_spec("leter A")
 
 
@@ -75,7 +75,7 @@ def test_dark_colours_are_rounded_down():
 
 
 def test_an_unknown_texture_is_refused_with_the_nearest_name():
-    with pytest.raises(UnknownTextureError, match="Did you mean 'red swirl'"):
+    with pytest.raises(UnknownNameError, match="Did you mean 'red swirl'"):
         texture_spec("red swril")
 
 

@@ -12,7 +12,7 @@ from openvima.catalog.bodies import block, container, line, square, three_sided_
 from openvima.catalog.mesh_files import parse_obj
 from openvima.catalog.original import _FIXED_MESHES, OriginalAssets, image_file
 from openvima.catalog.textures import texture_spec
-from openvima.errors import AssetError, UnknownObjectError, UnknownTextureError
+from openvima.errors import AssetError, UnknownNameError
 
 PACK = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
 ASSETS_FOLDER = PACK / "vima_bench/tasks/assets"
@@ -173,9 +173,9 @@ def test_golden_damaged_files_are_named(copied_pack, share) -> None:
 
 @needs_pack
 def test_golden_pack_refuses_what_the_catalogue_does_not_have(pack) -> None:
-    with pytest.raises(UnknownObjectError, match="letter A"):
+    with pytest.raises(UnknownNameError, match="letter A"):
         pack.geometry("leter A", (1.0, 1.0, 1.0))
-    with pytest.raises(UnknownTextureError, match="red swirl"):
+    with pytest.raises(UnknownNameError, match="red swirl"):
         pack.texture("red swril")
 
 

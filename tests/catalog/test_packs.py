@@ -8,7 +8,7 @@ import pytest
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
 from openvima.catalog.procedural import ProceduralAssets
-from openvima.errors import AssetError, UnknownTextureError
+from openvima.errors import AssetError, UnknownNameError
 
 SIZE = (0.16, 0.16, 0.05)
 
@@ -64,7 +64,7 @@ def test_objects_of_one_size_share_their_shape():
 
 
 def test_an_unknown_texture_is_refused():
-    with pytest.raises(UnknownTextureError, match="Did you mean 'tiger'"):
+    with pytest.raises(UnknownNameError, match="Did you mean 'tiger'"):
         ProceduralAssets().texture("tigre")
 
 

@@ -13,7 +13,7 @@ from openvima.catalog.partitions import (
     tasks_at,
 )
 from openvima.catalog.textures import TEXTURES
-from openvima.errors import LevelError, UnknownTaskError
+from openvima.errors import ConfigError, UnknownTaskError
 
 
 def test_levels_hold_13_13_13_12_and_4_tasks_and_clutter_the_trained_ones():
@@ -51,7 +51,7 @@ def test_the_second_level_exchanges_the_textures_of_the_roles():
 
 def test_a_task_absent_from_a_level_is_refused_with_its_levels():
     with pytest.raises(
-        LevelError, match=r"sweep_without_exceeding is not defined at level L3; .* train, L1, L2"
+        ConfigError, match=r"sweep_without_exceeding is not defined at level L3; .* train, L1, L2"
     ):
         pool("sweep_without_exceeding", "L3")
     assert levels_of("same_texture") == ("L4",)
@@ -60,7 +60,7 @@ def test_a_task_absent_from_a_level_is_refused_with_its_levels():
 def test_unknown_tasks_and_levels_are_refused():
     with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
         pool("rotat", "train")
-    with pytest.raises(LevelError, match="Allowed: train, L1, L2, L3, L4"):
+    with pytest.raises(ConfigError, match="Allowed: train, L1, L2, L3, L4"):
         tasks_at("L9")
 
 

@@ -23,7 +23,7 @@ from openvima.catalog.random_shapes import (
     random_round_container,
     random_square_container,
 )
-from openvima.errors import UnknownTextureError
+from openvima.errors import UnknownNameError
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
 
@@ -153,5 +153,5 @@ def test_names_of_the_catalogue_go_through(looks):
     assert looks.texture("red swirl") is base.texture("red swirl")
     assert looks.geometry("letter A", SIZE) is base.geometry("letter A", SIZE)
     assert not is_random("red swirl")
-    with pytest.raises(UnknownTextureError):
+    with pytest.raises(UnknownNameError):
         looks.texture("random texture seven")

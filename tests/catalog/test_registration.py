@@ -22,7 +22,7 @@ from openvima.catalog import (
 )
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.original import OriginalAssets
-from openvima.errors import AssetError, ConfigError, LevelError, ShapeError, UnknownObjectError
+from openvima.errors import AssetError, ConfigError, ShapeError, UnknownNameError
 from user_shapes import CORNERS, TRIANGLES, boxes, restored_assets
 
 SIZE = (0.06, 0.04, 0.02)
@@ -218,7 +218,7 @@ def test_published_tasks_keep_their_pools() -> None:
     before = pool("rotate", "train")
     with pytest.raises(ConfigError, match="published task 'rotate'"):
         register_brick(tasks=("rotate",))
-    with pytest.raises(LevelError, match="no level 'L9'"):
+    with pytest.raises(ConfigError, match="no level 'L9'"):
         register_brick(tasks=("mine",), levels=("L9",))
     for names in ({"tasks": None}, {"levels": None}, {"tasks": "mine"}):
         with pytest.raises(ConfigError, match=r"tasks and levels of object 'brick' are .*; give lists"):
@@ -235,7 +235,7 @@ def test_published_tasks_keep_their_pools() -> None:
 
 
 def test_an_unknown_object_is_told_how_to_be_registered() -> None:
-    with pytest.raises(UnknownObjectError, match="your own need `register_object`"):
+    with pytest.raises(UnknownNameError, match="your own need `register_object`"):
         object_spec("brick")
 
 

@@ -16,7 +16,7 @@ from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate, replay, rerender
 from openvima.data.verification import VerifyConfig, verify
 from openvima.env import EnvConfig, TabletopEnv
-from openvima.errors import AssetError, ConfigError, UnknownObjectError
+from openvima.errors import AssetError, ConfigError, UnknownNameError
 from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.evaluation.config import plan
 from openvima.evaluation.verification import verify_results
@@ -164,7 +164,7 @@ def test_runs_check_text_forms_and_options_with_the_assets_of_the_run(tmp_path: 
 def test_an_object_that_is_not_registered_is_named_with_the_remedy() -> None:
     register_bar_task()
     env = TabletopEnv("move_bar")
-    with pytest.raises(UnknownObjectError, match=r"no object 'test bar'.*your own need `register_object`"):
+    with pytest.raises(UnknownNameError, match=r"no object 'test bar'.*your own need `register_object`"):
         env.reset(seed=0)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from openvima import __version__
 from openvima.cli.main import VERBS, main
-from openvima.errors import ConfigError, ShardError
+from openvima.errors import ConfigError, DatasetError
 from openvima.policies.tokenizer import WordTokenizer
 
 
@@ -136,7 +136,7 @@ def test_words_that_a_policy_never_saw_are_one_line_and_the_verb_goes_on(
         (RuntimeError("CUDA out of memory."), "out of memory while working on here"),
         (ValueError("Error: engine error: Could not allocate memory"), "out of memory while working on here"),
         (ImportError("x.so: failed to map segment from shared object"), "out of memory while working on"),
-        (ShardError("a.arrow: Memory mapping file failed: Cannot allocate memory"), "out of memory while"),
+        (DatasetError("a.arrow: Memory mapping file failed: Cannot allocate memory"), "out of memory while"),
     ],
     ids=["disk", "quota", "memory", "torch", "cuda", "mujoco", "library", "arrow"],
 )

@@ -19,7 +19,7 @@ from openvima.data.appearances import (
     training_appearances,
 )
 from openvima.data.manifest import MANIFEST_NAME
-from openvima.errors import LevelError
+from openvima.errors import ConfigError
 from small_data_sets import seeds_of
 
 TASKS = ("rearrange", "visual_manipulation", "novel_noun", "sweep_without_exceeding")
@@ -110,7 +110,7 @@ def test_other_tasks_and_levels_are_named(record: dict[str, Any]) -> None:
     problems = find_leaks(changed)
     assert "follow_motion is none of the training tasks." in problems
     assert "rearrange has episodes of level L1." in problems
-    with pytest.raises(LevelError):
+    with pytest.raises(ConfigError):
         training_appearances("follow_motion")
 
 

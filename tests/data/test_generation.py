@@ -18,7 +18,7 @@ from openvima.data.encoding import Skipped
 from openvima.data.planning import SEEDS_PER_EPISODE, SPARE_SEEDS
 from openvima.data.subsets import SubsetConfig, sample
 from openvima.env import TabletopEnv
-from openvima.errors import DatasetError, OracleError, SamplingError, ShardError
+from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.scene import Outcome
 from small_data_sets import TASKS, config, contents
 
@@ -304,6 +304,6 @@ def test_a_damaged_record_is_not_copied_into_a_larger_shard(tmp_path: Path) -> N
     content = bytearray((tmp_path / "rotate-train-00000.arrow").read_bytes())
     content[Dataset(tmp_path).index.column("offset")[1].as_py() + 5000] ^= 1
     (tmp_path / "rotate-train-00000.arrow").write_bytes(content)
-    with pytest.raises(ShardError, match="record 1 "):
+    with pytest.raises(DatasetError, match="record 1 "):
         generate(config(tmp_path, episodes=4, **settings))
     assert (tmp_path / "rotate-train-00000.arrow").read_bytes() == content

@@ -19,7 +19,7 @@ import generation_server
 from openvima.cli.main import main
 from openvima.data import Dataset, generate
 from openvima.data.verification import verify
-from openvima.errors import DatasetError, ShardError, StorageError
+from openvima.errors import DatasetError, StorageError
 from small_data_sets import TASKS, config, contents
 
 NUM_KILLS = 3  # for each of two beginnings
@@ -192,10 +192,10 @@ def test_a_truncated_shard_stops_generating_and_reading(whole: Path, tmp_path: P
     shard = tmp_path / "rotate-train-00000.arrow"
     shard.write_bytes(shard.read_bytes()[:-1])
     dataset = Dataset(tmp_path)
-    with pytest.raises(ShardError, match="truncated"):
+    with pytest.raises(DatasetError, match="truncated"):
         _ = dataset[0]
     assert dataset[2].task == "rotate"  # of another shard
-    with pytest.raises(ShardError, match="openvima data verify"):
+    with pytest.raises(DatasetError, match="openvima data verify"):
         generate(config(tmp_path))
 
 

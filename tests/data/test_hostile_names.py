@@ -16,7 +16,7 @@ from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.data.verification import VerifyConfig, verify
-from openvima.errors import DatasetError, OpenVimaError, ShardError
+from openvima.errors import DatasetError, OpenVimaError
 from small_data_sets import contents, edit_manifest, with_plain_images, write_folder
 
 SHARD = "stack-train-00000.arrow"
@@ -100,7 +100,7 @@ def test_a_shard_that_calls_itself_a_path_is_refused(
     path = tmp_path / "a.arrow"
     with ShardWriter(path, replace(info, **{field: "../../outside/x"})) as writer:
         writer.write(with_plain_images(made_up(0)))
-    with pytest.raises(ShardError, match=rf"its {field} is '\.\./\.\./outside/x', which is no plain name"):
+    with pytest.raises(DatasetError, match=rf"its {field} is '\.\./\.\./outside/x', which is no plain name"):
         Shard(path)
 
 

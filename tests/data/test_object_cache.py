@@ -13,7 +13,7 @@ import pytest
 from openvima.data import Dataset, GenerateConfig, generate, object_cache
 from openvima.data.object_cache import CacheFile, ObjectCache, open_object_cache
 from openvima.data.preprocessed import preprocess
-from openvima.errors import DatasetError, ShardError
+from openvima.errors import DatasetError
 from openvima.perception.preprocessing import KINDS, image_names, split_prompt
 
 TASKS = ("rotate", "rearrange_then_restore")
@@ -91,7 +91,7 @@ def test_a_truncated_file_is_made_anew(copy: Path, size: int) -> None:
     path = next(iter(sorted(cache.folder.iterdir())))
     whole = path.read_bytes()
     path.write_bytes(whole[:size])
-    with pytest.raises(ShardError, match="is no readable file"):
+    with pytest.raises(DatasetError, match="is no readable file"):
         CacheFile(path)
     with pytest.raises(DatasetError, match="lacks 1 shards"):
         ObjectCache(Dataset(copy))
@@ -100,9 +100,9 @@ def test_a_truncated_file_is_made_anew(copy: Path, size: int) -> None:
 
 
 def test_a_shard_of_demonstrations_is_no_cache_file(copy: Path) -> None:
-    with pytest.raises(ShardError, match="is no readable file"):
+    with pytest.raises(DatasetError, match="is no readable file"):
         CacheFile(next(copy.glob("*.arrow")))
-    with pytest.raises(ShardError, match="is no readable file"):
+    with pytest.raises(DatasetError, match="is no readable file"):
         CacheFile(copy / "gone.arrow")
 
 
@@ -136,7 +136,7 @@ def test_damage_is_found_or_harmless(copy: Path, kind) -> None:
         try:
             file = CacheFile(path)
             episodes = [file[row] for row in range(len(file))]
-        except ShardError:
+        except DatasetError:
             continue
         for row, episode in enumerate(episodes):
             assert_equal(episode, cache[row])
@@ -153,7 +153,7 @@ def test_a_damaged_row_is_named_where_others_are_read(copy: Path, part: str) -> 
     path.write_bytes(content[:start] + bytes([content[start] ^ 1]) + content[start + 1 :])
     damaged = ObjectCache(Dataset(copy, tasks=["rotate"]))
     assert_equal(damaged[0], cache[0])
-    with pytest.raises(ShardError, match=r"00000\.arrow .* row 1 of 2 is wrong.*`openvima data"):
+    with pytest.raises(DatasetError, match=r"00000\.arrow .* row 1 of 2 is wrong.*`openvima data"):
         damaged[1]
 
 
@@ -161,7 +161,9 @@ def test_files_of_another_version_are_named_and_made_anew(copy: Path, monkeypatc
     monkeypatch.setattr(object_cache, "CACHE_VERSION", 3)
     folder = open_object_cache(Dataset(copy)).folder
     monkeypatch.undo()
-    with pytest.raises(ShardError, match=r"of version '3', not 7\)\. .*`openvima data preprocess` makes it"):
+    with pytest.raises(
+        DatasetError, match=r"of version '3', not 7\)\. .*`openvima data preprocess` makes it"
+    ):
         CacheFile(next(folder.iterdir()))
     with pytest.raises(DatasetError, match=r"lacks 6 shards, .*`openvima data preprocess .*` writes them"):
         ObjectCache(Dataset(copy))
@@ -195,7 +197,7 @@ def test_no_cache_is_made_of_damaged_demonstrations(copy: Path) -> None:
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
-    with pytest.raises(ShardError, match=r"rotate-train-00001\.arrow: record .*\(its checksum is wrong\)"):
+    with pytest.raises(DatasetError, match=r"rotate-train-00001\.arrow: record .*\(its checksum is wrong\)"):
         open_object_cache(Dataset(copy))
     with pytest.raises(DatasetError, match="lacks"):
         ObjectCache(Dataset(copy))

@@ -9,7 +9,7 @@ import pytest
 from openvima.data import GenerateConfig, plan
 from openvima.data.planning import MAX_EPISODES, MAX_FIRST_SEED, generate_command, shard_episodes
 from openvima.env import EnvConfig
-from openvima.errors import ConfigError, LevelError, UnknownTaskError
+from openvima.errors import ConfigError, UnknownTaskError
 from openvima.tasks.sampling import MAX_SEED
 from small_data_sets import config
 
@@ -83,7 +83,7 @@ def test_the_command_of_a_record_has_its_settings(tmp_path: Path) -> None:
 
 
 def test_a_level_that_does_not_exist_is_told(tmp_path: Path) -> None:
-    with pytest.raises(LevelError, match="no level 'L9'"):
+    with pytest.raises(ConfigError, match="no level 'L9'"):
         GenerateConfig(tmp_path, level="L9").resolved_tasks()
 
 
@@ -92,7 +92,7 @@ def test_settings_are_checked_together(tmp_path: Path) -> None:
         config(tmp_path, episodes=0, workers=0)
     with pytest.raises(UnknownTaskError, match="rotate"):
         plan(config(tmp_path, tasks=("rotat",)))
-    with pytest.raises(LevelError):
+    with pytest.raises(ConfigError):
         plan(config(tmp_path, level="L7"))
 
 

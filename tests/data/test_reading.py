@@ -18,7 +18,7 @@ from openvima.data.encoding import ShardInfo, encode
 from openvima.data.manifest import INDEX_SCHEMA, finish_folder
 from openvima.data.records import pixels, planes
 from openvima.data.schema import ARRAYS, COLUMNS, SCHEMA_VERSION, VIEWS
-from openvima.errors import DatasetError, ShardError
+from openvima.errors import DatasetError
 from small_data_sets import write_folder
 
 MadeUp = Callable[..., Demonstration]
@@ -96,7 +96,7 @@ def test_damage_in_other_columns_is_not_met(tmp_path: Path, demo: Demonstration,
     content[middle : middle + 8192] = bytes(8192)
     path.write_bytes(content)
     damaged = Shard(path)
-    with pytest.raises(ShardError):
+    with pytest.raises(DatasetError):
         _ = damaged[0]
     assert damaged.read(0, ["prompt"]) == {"prompt": demo.prompt.text}
     assert damaged.step(0, 1, views=["top"]).action == demo.actions[1]
@@ -155,7 +155,7 @@ def test_a_data_set_notices_damage_in_any_column(tmp_path: Path, made_up: MadeUp
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
-    with pytest.raises(ShardError, match="checksum"):
+    with pytest.raises(DatasetError, match="checksum"):
         Dataset(tmp_path).read(0, ["seed"])
 
 

@@ -11,7 +11,7 @@ from openvima.data import Demonstration, Shard, ShardWriter, rollout_oracle
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import package_versions
 from openvima.env.config import EnvConfig
-from openvima.errors import AssetError, ShardError
+from openvima.errors import AssetError, DatasetError
 
 
 def info_of(demo: Demonstration, env_config: EnvConfig) -> ShardInfo:
@@ -87,7 +87,7 @@ def test_files_without_images_are_small(tmp_path: Path, recorded: Demonstration)
 def test_a_difference_names_the_versions_that_wrote_the_file(tmp_path: Path, recorded: Demonstration) -> None:
     info = replace(info_of(recorded, EnvConfig()), versions={**package_versions(), "openvima": "0.0.1"})
     shard = stored(tmp_path / "a.arrow", replace(recorded, seed=1), info)  # the scenes of another seed
-    with pytest.raises(ShardError) as caught:
+    with pytest.raises(DatasetError) as caught:
         _ = shard[0]
     message = str(caught.value)
     assert "a.arrow, record 0: visual_manipulation of seed 1" in message
@@ -99,7 +99,7 @@ def test_a_difference_between_equal_versions_has_other_causes(
     tmp_path: Path, recorded: Demonstration
 ) -> None:
     shard = stored(tmp_path / "a.arrow", replace(recorded, seed=1), info_of(recorded, EnvConfig()))
-    with pytest.raises(ShardError, match=r"all versions as installed.*the task or the asset pack"):
+    with pytest.raises(DatasetError, match=r"all versions as installed.*the task or the asset pack"):
         _ = shard[0]
 
 
@@ -107,7 +107,7 @@ def test_a_task_that_is_gone_is_named(
     tmp_path: Path, made_up: Callable[..., Demonstration], info: ShardInfo
 ) -> None:
     shard = stored(tmp_path / "a.arrow", made_up(), replace(info, assets="procedural", images=False))
-    with pytest.raises(ShardError, match=r"cannot be rerendered.*'stack'.*openvima 0 \(installed"):
+    with pytest.raises(DatasetError, match=r"cannot be rerendered.*'stack'.*openvima 0 \(installed"):
         _ = shard[0]
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from openvima.data import Demonstration, Shard, ShardWriter
 from openvima.data.encoding import ShardInfo, Skipped
-from openvima.errors import ShardError
+from openvima.errors import DatasetError
 
 MadeUp = Callable[..., Demonstration]
 
@@ -106,7 +106,7 @@ def test_no_prefix_of_a_shard_reads_as_whole(tmp_path: Path, made_up: MadeUp, in
     part = tmp_path / "part.arrow"
     for length in (0, 5, 8, len(whole) // 2, len(whole) - 100, len(whole) - 6, len(whole) - 1):
         part.write_bytes(whole[:length])
-        with pytest.raises(ShardError, match=r"part\.arrow.*truncated"):
+        with pytest.raises(DatasetError, match=r"part\.arrow.*truncated"):
             Shard(part)
 
 
@@ -116,7 +116,7 @@ def test_a_shard_damaged_in_the_middle_is_refused(tmp_path: Path, made_up: MadeU
     middle = len(content) // 2
     content[middle : middle + 4096] = bytes(4096)
     path.write_bytes(content)
-    with pytest.raises(ShardError, match="record 0 of 1"):
+    with pytest.raises(DatasetError, match="record 0 of 1"):
         _ = Shard(path)[0]
 
 
@@ -124,12 +124,12 @@ def test_a_foreign_arrow_file_is_refused(tmp_path: Path) -> None:
     table = pa.table({"a": [1]})
     with pa.OSFile(str(tmp_path / "f.arrow"), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
         writer.write_table(table)
-    with pytest.raises(ShardError, match="no demonstrations of this package"):
+    with pytest.raises(DatasetError, match="no demonstrations of this package"):
         Shard(tmp_path / "f.arrow")
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ShardError, match=r"no file .*gone\.arrow"):
+    with pytest.raises(DatasetError, match=r"no file .*gone\.arrow"):
         Shard(tmp_path / "gone.arrow")
 
 

@@ -26,7 +26,7 @@ from openvima.data.subsets import (
     select_sample,
     split,
 )
-from openvima.errors import ConfigError, DatasetError, ShardError
+from openvima.errors import ConfigError, DatasetError
 
 MadeUp = Callable[..., Demonstration]
 WriteFolder = Callable[..., Path]
@@ -298,9 +298,9 @@ def test_damage_of_a_source_is_noticed_and_nothing_is_left(tmp_path: Path, write
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
-    with pytest.raises(ShardError, match=r"demos.stack-train-00000\.arrow"):
+    with pytest.raises(DatasetError, match=r"demos.stack-train-00000\.arrow"):
         merge(MergeConfig((source,), tmp_path / "out"))
-    with pytest.raises(ShardError, match=r"demos.stack-train-00000\.arrow"):
+    with pytest.raises(DatasetError, match=r"demos.stack-train-00000\.arrow"):
         sample(SubsetConfig(source, tmp_path / "out"), 1.0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demos"]
 

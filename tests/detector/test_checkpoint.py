@@ -19,7 +19,7 @@ from openvima.detector.checkpoint import (
 )
 from openvima.detector.config import BackboneConfig, DetectorConfig, detector_config, resnet50
 from openvima.detector.network import MaskRCNN
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import ConfigError, InputFileError
 
 
 def detectron2_layout(num_classes: int = 1) -> dict[str, tuple[int, ...]]:
@@ -95,7 +95,7 @@ def test_weights_of_other_sizes_are_refused_by_name(tiny, tmp_path):
     values = yaml.safe_load(file.read_text())
     values["config"]["box_head_widths"] = [33]
     file.write_text(yaml.safe_dump(values))
-    with pytest.raises(CheckpointError, match=re.escape("box_head.hidden.0.weight is float32 (32, 784)")):
+    with pytest.raises(InputFileError, match=re.escape("box_head.hidden.0.weight is float32 (32, 784)")):
         load_network(tmp_path / "detector")
 
 
@@ -204,23 +204,23 @@ def test_settings_in_the_file_say_how_images_are_prepared(foreign, settings, tmp
 def test_settings_of_another_computation_are_refused(foreign, settings, tmp_path, values, message):
     kinds = "roi_heads.box_predictor.cls_score.weight"  # enough to see the number of kinds
     file = saved({kinds: foreign[kinds]}, settings, tmp_path / "other.pth", values)
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(InputFileError, match=message):
         load_detectron2(file)
 
 
 def test_what_is_no_such_file_is_refused(tiny, tmp_path):
-    with pytest.raises(CheckpointError, match="no file"):
+    with pytest.raises(InputFileError, match="no file"):
         load_detectron2(tmp_path / "none.pth")
     torch.save({"model": MaskRCNN(tiny).state_dict()}, tmp_path / "ours.pth")
-    with pytest.raises(CheckpointError, match="Mask R-CNN of Detectron2"):
+    with pytest.raises(InputFileError, match="Mask R-CNN of Detectron2"):
         load_detectron2(tmp_path / "ours.pth")
     torch.save({"model": re.compile("x")}, tmp_path / "code.pth")
-    with pytest.raises(CheckpointError, match="Nothing in it was executed"):
+    with pytest.raises(InputFileError, match="Nothing in it was executed"):
         load_detectron2(tmp_path / "code.pth")
 
 
 def test_missing_weights_are_told(foreign, tmp_path):
     fewer = {name: tensor for name, tensor in foreign.items() if "mask_fcn2" not in name}
     torch.save(fewer, tmp_path / "part.pth")
-    with pytest.raises(CheckpointError, match=r"missing: mask_head.convs.1.weight, mask_head.convs.1.bias"):
+    with pytest.raises(InputFileError, match=r"missing: mask_head.convs.1.weight, mask_head.convs.1.bias"):
         load_detectron2(tmp_path / "part.pth")

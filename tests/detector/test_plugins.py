@@ -18,7 +18,7 @@ from openvima.detector.plugins import (
     plugged_extractor,
 )
 from openvima.env import TabletopEnv
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import ConfigError, InputFileError
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth
 from small_data_sets import rows_of
 
@@ -58,9 +58,9 @@ def test_an_invalid_source_is_named(hook, message):
 
 
 def test_a_trained_detector_is_found_by_its_folder(tmp_path):
-    with pytest.raises(CheckpointError, match="no folder"):
+    with pytest.raises(InputFileError, match="no folder"):
         plugged_extractor(f"detector={tmp_path / 'none'}")
-    with pytest.raises(CheckpointError, match="no checkpoint"):
+    with pytest.raises(InputFileError, match="no checkpoint"):
         plugged_extractor(f"detector={tmp_path}")
 
 

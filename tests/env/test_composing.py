@@ -16,7 +16,7 @@ from openvima.catalog import OBJECTS as CATALOGUE
 from openvima.catalog import TEXTURES, load_assets
 from openvima.env import TabletopEnv
 from openvima.env.composing import photo_from_bytes
-from openvima.errors import InputFileError, OpenVimaError, SceneError, UnknownObjectError, UnknownTextureError
+from openvima.errors import InputFileError, OpenVimaError, SceneError, UnknownNameError
 from openvima.perception.objects import observe_prompt_image
 from openvima.render.rasteriser import Rasteriser
 from openvima.render.raycast import Hit, first_hit
@@ -86,10 +86,10 @@ def test_what_does_not_fit_is_refused_by_object_and_limit(objects: list, words: 
 
 def test_unknown_names_get_hints() -> None:
     with pytest.raises(
-        UnknownObjectError, match=r"object 0 \('a'\): there is no object 'hart'. Did you mean 'heart'"
+        UnknownNameError, match=r"object 0 \('a'\): there is no object 'hart'. Did you mean 'heart'"
     ):
         compose([("hart", "red", (0.5, 0.0))], "Look.")
-    with pytest.raises(UnknownTextureError, match="Did you mean 'red swirl'"):
+    with pytest.raises(UnknownNameError, match="Did you mean 'red swirl'"):
         compose([("heart", "red swrl", (0.5, 0.0))], "Look.")
     assert "placeholder 'c'" in refusal(OBJECTS, "Put {c}.") and "a, b" in refusal(OBJECTS, "Put {c}.")
     assert "there is no placeholder in the prompt for image 'c'" in refusal(OBJECTS, PROMPT, images={"c": 0})

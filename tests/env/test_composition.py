@@ -16,7 +16,7 @@ from openvima.catalog import load_assets
 from openvima.data.user_demonstrations import check_recordable
 from openvima.env import make_vec
 from openvima.env.composition import Composition, parse_goals
-from openvima.errors import DatasetError, SceneError, UnknownObjectError
+from openvima.errors import DatasetError, SceneError, UnknownNameError
 from openvima.tasks import sample_episode
 from task_cases import REPRESENTATIVE_TASKS, full_repr, random_action
 
@@ -40,7 +40,7 @@ def test_objects_are_added_where_there_is_room_until_there_is_none() -> None:
     with pytest.raises(SceneError, match="no room for a blue pan"):
         for _ in range(20):
             scene = scene.added("pan", "blue", ASSETS)
-    with pytest.raises(UnknownObjectError):
+    with pytest.raises(UnknownNameError):
         scene.added("pam", "blue", ASSETS)
 
 

@@ -169,7 +169,7 @@ def test_the_message_names_the_field(tmp_path: Path) -> None:
     ):
         openvima.load_episode(path)
     path.write_text(text.replace("letter", "lettre", 1), encoding="utf-8")
-    with pytest.raises(openvima.errors.UnknownObjectError, match="Did you mean 'letter"):
+    with pytest.raises(openvima.errors.UnknownNameError, match="Did you mean 'letter"):
         openvima.load_episode(path)
 
 

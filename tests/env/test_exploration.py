@@ -8,7 +8,7 @@ import pytest
 
 import openvima
 from openvima.env import TabletopEnv
-from openvima.errors import OracleError, ReachError, SamplingError
+from openvima.errors import ActionError, OracleError, SamplingError
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from openvima.scene.action import COMMAND_HIGH, COMMAND_LOW, HIGHEST_TIP_Z_M
 from openvima.sim.tool_world import ToolWorld
@@ -102,7 +102,7 @@ def test_one_command_repeated_into_a_corner_stops_there(task: str) -> None:
 
 def test_errors_and_a_tool_that_has_left_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*args: object, **options: object) -> None:
-        raise ReachError("too far")
+        raise ActionError("too far")
 
     env = make("rotate")
     monkeypatch.setattr(
@@ -110,4 +110,4 @@ def test_errors_and_a_tool_that_has_left_are_found(monkeypatch: pytest.MonkeyPat
     )
     assert "the tool is at (0.9000" in explore(env, 0, steps=1)[-1]
     monkeypatch.setattr(ToolWorld, "command", fail)
-    assert "ReachError in fail: too far" in explore(env, 0, steps=1)[-1]
+    assert "ActionError in fail: too far" in explore(env, 0, steps=1)[-1]

@@ -14,7 +14,6 @@ from openvima.errors import (
     ActionError,
     ConfigError,
     EpisodeError,
-    LevelError,
     SamplingError,
     UnknownTaskError,
 )
@@ -103,7 +102,7 @@ def test_it_can_be_made_by_name_in_two_ways() -> None:
 def test_names_and_levels_are_checked_when_it_is_made() -> None:
     with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
         TabletopEnv("rotat")
-    with pytest.raises(LevelError, match="L9"):
+    with pytest.raises(ConfigError, match="L9"):
         TabletopEnv("rotate", level="L9")
     with pytest.raises(ConfigError, match="rgb_array"):
         TabletopEnv("rotate", render_mode="human")

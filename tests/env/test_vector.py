@@ -17,7 +17,6 @@ from openvima.errors import (
     ActionError,
     ConfigError,
     EpisodeError,
-    LevelError,
     OracleError,
     SamplingError,
     UnknownTaskError,
@@ -371,7 +370,7 @@ def test_what_cannot_be_built_is_refused_at_once(num_workers: int) -> None:
 
     with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
         build(["visual_manipulation", "rotat"])
-    with pytest.raises(LevelError, match="L9") as caught:
+    with pytest.raises(ConfigError, match="L9") as caught:
         build(["rotate", {"task": "rotate", "level": "L9"}], 2)
     assert caught.value.__notes__ == ["raised for sub-environment 1"]
     with pytest.raises(ActionError, match="action 1: "):

@@ -7,9 +7,8 @@ import pytest
 
 from openvima.env import EnvConfig
 from openvima.errors import (
-    CheckpointError,
     ConfigError,
-    LevelError,
+    InputFileError,
     UnknownPolicyError,
     UnknownTaskError,
 )
@@ -64,12 +63,12 @@ def test_a_named_task_is_left_out_only_at_levels_without_it():
 
 def test_a_named_task_that_no_level_holds_is_an_error():
     config = EvaluationConfig(("oracle",), ("rotate", "sweep_without_exceeding"), ("L3",))
-    with pytest.raises(LevelError, match="sweep_without_exceeding exists at train, L1, L2"):
+    with pytest.raises(ConfigError, match="sweep_without_exceeding exists at train, L1, L2"):
         cells(config)
 
 
 def test_an_unknown_level_is_refused_with_those_there_are():
-    with pytest.raises(LevelError, match="Allowed: train, L1"):
+    with pytest.raises(ConfigError, match="Allowed: train, L1"):
         cells(EvaluationConfig(("oracle",), levels=("l1",)))
 
 
@@ -174,7 +173,7 @@ def test_names_of_policies_are_checked_before_any_weights_are_read(monkeypatch, 
 
 
 def test_a_folder_without_weights_is_refused(tmp_path):
-    with pytest.raises(CheckpointError, match="holds no weights"):
+    with pytest.raises(InputFileError, match="holds no weights"):
         weights_hash(tmp_path)
 
 

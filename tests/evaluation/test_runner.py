@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from openvima.env import EnvConfig
-from openvima.errors import AssetError, CheckpointError, ConfigError, FolderLockedError
+from openvima.errors import AssetError, ConfigError, FolderLockedError, InputFileError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 from openvima.evaluation.config import plan
 from worker_jobs import holding
@@ -195,6 +195,6 @@ def test_a_damaged_checkpoint_is_named_before_episodes_of_other_policies(tmp_pat
     weights.write_bytes(weights.read_bytes()[:-4])
     monkeypatch.setattr(runner, "_play_all", lambda *arguments: pytest.fail("episodes were played"))
     policies = ("oracle", str(tmp_path / "mine"))
-    with pytest.raises(CheckpointError, match="is damaged"):
+    with pytest.raises(InputFileError, match="is damaged"):
         evaluate(replace(ORACLE, policies=policies, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from openvima.errors import CheckpointError, MissingExtraError, PolicyError, UnknownPolicyError
+from openvima.errors import InputFileError, MissingExtraError, PolicyError, UnknownPolicyError
 from openvima.policies import PRESETS, RandomPolicy, load_policy, preset
 from openvima.policies.build import (
     PARTS,
@@ -24,7 +24,7 @@ def test_an_unknown_name_gets_a_suggestion():
 
 
 def test_a_folder_without_checkpoint_is_refused(tmp_path):
-    with pytest.raises(CheckpointError, match="no checkpoint"):
+    with pytest.raises(InputFileError, match="no checkpoint"):
         load_policy(str(tmp_path))
 
 

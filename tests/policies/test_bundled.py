@@ -11,7 +11,7 @@ import torch
 from openvima.cli import quickstart
 from openvima.cli.main import main
 from openvima.env.config import DEFAULT_ENV_CONFIG
-from openvima.errors import CheckpointError, PolicyError, UnknownPolicyError
+from openvima.errors import InputFileError, PolicyError, UnknownPolicyError
 from openvima.evaluation import Results
 from openvima.evaluation.config import Batch
 from openvima.evaluation.rollout import play
@@ -90,7 +90,7 @@ def test_the_message_for_an_unknown_name_lists_the_bundled_checkpoint(bundled: P
     ):
         load_policy("openvima-smal")
     for find in (weights_hash, find_checkpoint):
-        with pytest.raises(CheckpointError, match="openvima-small"):
+        with pytest.raises(InputFileError, match="openvima-small"):
             find("something")
 
 
@@ -98,7 +98,7 @@ def test_the_message_for_an_unknown_name_lists_the_bundled_checkpoint(bundled: P
 def test_without_its_weights_the_message_says_where_they_belong(bundled: Path, capsys) -> None:
     (bundled / "model.safetensors").unlink()
     for work in (load_policy, weights_hash, find_checkpoint):
-        with pytest.raises(CheckpointError, match=f"lacks the weights of 'openvima-small'.*{bundled}"):
+        with pytest.raises(InputFileError, match=f"lacks the weights of 'openvima-small'.*{bundled}"):
             work(SMALL)
     assert main(["policies", "--json"]) == 0
     assert SMALL not in capsys.readouterr().out

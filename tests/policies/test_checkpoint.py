@@ -8,7 +8,7 @@ import yaml
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from openvima.errors import CheckpointError
+from openvima.errors import InputFileError
 from openvima.policies import checkpoint, preset, tensor_files
 from openvima.policies.build import (
     build_network,
@@ -133,7 +133,7 @@ def test_weights_beyond_the_range_of_float16_are_not_written(small_sizes, tmp_pa
     with torch.no_grad():
         model.observation_out.weight[0, 0] = -7e4
     with pytest.raises(
-        CheckpointError, match=r"beyond 6\.55e\+04, the most that float16 holds: observation_out"
+        InputFileError, match=r"beyond 6\.55e\+04, the most that float16 holds: observation_out"
     ):
         save_checkpoint(model, tmp_path / "checkpoint", dtype=torch.float16)
     assert not list(tmp_path.iterdir())
@@ -168,7 +168,7 @@ def test_a_checkpoint_whose_replacement_never_came_is_found(saved) -> None:
 
 def test_a_folder_with_other_files_is_not_replaced(saved, small_sizes) -> None:
     (saved / "optimizer.safetensors").touch()
-    with pytest.raises(CheckpointError, match=r"other files than a checkpoint \(optimizer\.safetensors\)"):
+    with pytest.raises(InputFileError, match=r"other files than a checkpoint \(optimizer\.safetensors\)"):
         save_checkpoint(build_network(small_sizes, seed=4), saved)
     load_checkpoint(saved)
 
@@ -180,7 +180,7 @@ def test_weights_of_another_size_are_named_as_such(saved, small_sizes) -> None:
     values["config"] = config_to_dict(larger)
     (saved / CONFIG_FILE).write_text(yaml.safe_dump(values))
     with pytest.raises(
-        CheckpointError, match=r"query is float32 \(64,\) instead of float32 \(128,\)"
+        InputFileError, match=r"query is float32 \(64,\) instead of float32 \(128,\)"
     ) as caught:
         load_checkpoint(saved)
     assert "missing: decoder.self_blocks.1" in str(caught.value)
@@ -190,7 +190,7 @@ def test_weights_of_another_architecture_are_refused(tmp_path) -> None:
     for name in ("vima", "gato"):
         save_checkpoint(build_network(preset(f"{name}-nano"), seed=0), tmp_path / name)
     (tmp_path / "gato" / CONFIG_FILE).replace(tmp_path / "vima" / CONFIG_FILE)
-    with pytest.raises(CheckpointError, match=r"missing: images.*unexpected: decoder\.cross_blocks"):
+    with pytest.raises(InputFileError, match=r"missing: images.*unexpected: decoder\.cross_blocks"):
         load_checkpoint(tmp_path / "vima")
 
 
@@ -209,7 +209,7 @@ def test_every_kind_of_problem_is_in_one_message_and_nothing_is_loaded(small_siz
     weights["surplus"] = torch.zeros(2)
     weights["end_effectors.weight"] = torch.zeros(3, 2)
     weights["observation_out.bias"] = weights["observation_out.bias"].int()
-    with pytest.raises(CheckpointError) as caught:
+    with pytest.raises(InputFileError) as caught:
         load_weights(model, weights, source="here")
     message = str(caught.value)
     for part in (
@@ -228,14 +228,14 @@ def test_every_kind_of_problem_is_in_one_message_and_nothing_is_loaded(small_siz
 def test_a_truncated_file_is_named_as_damaged(saved, kept: int) -> None:
     file = saved / WEIGHTS_FILE
     file.write_bytes(file.read_bytes()[:kept])
-    with pytest.raises(CheckpointError, match=r"model\.safetensors is damaged"):
+    with pytest.raises(InputFileError, match=r"model\.safetensors is damaged"):
         load_checkpoint(saved)
 
 
 @pytest.mark.parametrize("name", [WEIGHTS_FILE, CONFIG_FILE])
 def test_a_missing_file_is_named(saved, name: str) -> None:
     (saved / name).unlink()
-    with pytest.raises(CheckpointError, match=f"it holds no {name}"):
+    with pytest.raises(InputFileError, match=f"it holds no {name}"):
         load_policy(str(saved))
 
 
@@ -252,7 +252,7 @@ def test_a_missing_file_is_named(saved, name: str) -> None:
 )
 def test_a_config_that_makes_no_sense_is_a_checkpoint_error(saved, text: str, message: str) -> None:
     (saved / CONFIG_FILE).write_text(text)
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(InputFileError, match=message):
         load_checkpoint(saved)
 
 
@@ -274,7 +274,7 @@ def test_of_a_run_the_best_checkpoint_is_taken_else_the_last(tmp_path) -> None:
 
 def test_a_run_without_a_checkpoint_yet_is_refused(tmp_path) -> None:
     (tmp_path / CHECKPOINTS_FOLDER).mkdir()
-    with pytest.raises(CheckpointError, match="no checkpoint"):
+    with pytest.raises(InputFileError, match="no checkpoint"):
         load_policy(str(tmp_path))
 
 
@@ -282,7 +282,7 @@ def test_weights_that_were_changed_behind_the_config_are_refused(saved) -> None:
     weights = load_file(saved / WEIGHTS_FILE)
     weights["query"] = weights["query"] + 1
     save_file(weights, saved / WEIGHTS_FILE)
-    with pytest.raises(CheckpointError, match="its digest is not the one in"):
+    with pytest.raises(InputFileError, match="its digest is not the one in"):
         load_checkpoint(saved)
 
 

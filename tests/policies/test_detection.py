@@ -7,7 +7,7 @@ import pytest
 
 from openvima.detector.detection import DetectedObjects, Detections
 from openvima.env import TabletopEnv
-from openvima.errors import DetectionError, PolicyError, ShapeError
+from openvima.errors import PolicyError, ShapeError
 from openvima.perception.objects import (
     FRONT,
     GROUND_TRUTH,
@@ -308,15 +308,15 @@ def test_boxes_are_drawn_around_masks_and_specks_left_out() -> None:
         (lambda: Detections(np.zeros((2, 4))), ShapeError, "float64.*from_edges"),
         (lambda: Detections(np.zeros((2, 5), int)), ShapeError, r"\(2, 5\).*\(N, 4\)"),
         (lambda: Detections([[1, 2, 3, 4]]), ShapeError, "boxes are a list.*numpy array"),
-        (lambda: Detections(boxes((5, 5, 4, 9))), DetectionError, r"box 0 is \[5, 5, 4, 9\]"),
+        (lambda: Detections(boxes((5, 5, 4, 9))), ShapeError, r"box 0 is \[5, 5, 4, 9\]"),
         (lambda: Detections(boxes(), masks=np.zeros((1, 8, 8), bool)), ShapeError, r"bool \(0, H, W\)"),
         (lambda: Detections(boxes(), masks=np.zeros((0, 8, 8))), ShapeError, "masks are float64"),
         (lambda: Detections(boxes(), scores=np.zeros(3)), ShapeError, r"scores are float64 \(3,\)"),
-        (lambda: Detections(boxes((1, 1, 2, 2)), scores=np.array([np.nan])), DetectionError, "finite"),
+        (lambda: Detections(boxes((1, 1, 2, 2)), scores=np.array([np.nan])), ShapeError, "finite"),
         (lambda: Detections.from_edges(np.zeros(4)), ShapeError, "left, upper, right, lower"),
-        (lambda: Detections.from_edges(np.array([[256.0, 0, 300, 9]])), DetectionError, "outside"),
-        (lambda: Detections.from_edges(np.array([[np.nan, 0, 9, 9]])), DetectionError, "outside"),
-        (lambda: Detections.from_edges(np.array([[9.0, 9.0, 20.0, 5.0]])), DetectionError, "ends before"),
+        (lambda: Detections.from_edges(np.array([[256.0, 0, 300, 9]])), ShapeError, "outside"),
+        (lambda: Detections.from_edges(np.array([[np.nan, 0, 9, 9]])), ShapeError, "outside"),
+        (lambda: Detections.from_edges(np.array([[9.0, 9.0, 20.0, 5.0]])), ShapeError, "ends before"),
     ],
 )
 def test_impossible_detections_are_refused_at_once(make, error: type, message: str) -> None:
@@ -327,8 +327,8 @@ def test_impossible_detections_are_refused_at_once(make, error: type, message: s
 @pytest.mark.parametrize(
     ("found", "error", "message"),
     [
-        (plain((0, 0, 256, 9)), DetectionError, r"box 0 of view 'front'.*0 … 255.*0 … 127"),
-        (plain((0, 0, 9, 9), (0, -1, 9, 9)), DetectionError, "box 1 of view 'front'"),
+        (plain((0, 0, 256, 9)), ShapeError, r"box 0 of view 'front'.*0 … 255.*0 … 127"),
+        (plain((0, 0, 9, 9), (0, -1, 9, 9)), ShapeError, "box 1 of view 'front'"),
         (Detections(boxes((0, 0, 9, 9)), np.ones((1, 64, 64), bool)), ShapeError, r"not \(N, 128, 256\)"),
         (boxes((0, 0, 9, 9)), PolicyError, "returned a ndarray for view 'front'"),
     ],

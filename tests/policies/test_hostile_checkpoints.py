@@ -10,7 +10,7 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import ConfigError, InputFileError
 from openvima.policies.build import build_network, outline_network
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
 from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE
@@ -47,7 +47,7 @@ def repacked(file: Path, method: int = zipfile.ZIP_STORED, **replaced: bytes) ->
 def test_a_pipe_is_refused_and_not_waited_for(saved, name: str) -> None:
     (saved / name).unlink()
     os.mkfifo(saved / name)
-    with pytest.raises(CheckpointError, match=f"{name}.* no regular file"):
+    with pytest.raises(InputFileError, match=f"{name}.* no regular file"):
         load_checkpoint(saved)
 
 
@@ -55,7 +55,7 @@ def test_a_pipe_is_refused_and_not_waited_for(saved, name: str) -> None:
 def test_a_published_file_that_is_a_pipe_or_device_is_refused(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe.ckpt")
     for file in (tmp_path / "pipe.ckpt", Path("/dev/zero")):
-        with pytest.raises(CheckpointError, match="no regular file"):
+        with pytest.raises(InputFileError, match="no regular file"):
             load_published(file)
 
 
@@ -72,7 +72,7 @@ def test_a_published_file_that_is_a_pipe_or_device_is_refused(tmp_path) -> None:
 )
 def test_a_config_of_more_than_plain_values_is_refused(saved, text: str, message: str) -> None:
     (saved / CONFIG_FILE).write_bytes(text.encode("utf-8", "surrogateescape"))
-    with pytest.raises(CheckpointError, match=message) as caught:
+    with pytest.raises(InputFileError, match=message) as caught:
         load_checkpoint(saved)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 600
@@ -101,7 +101,7 @@ def test_sizes_beyond_all_reason_are_refused_before_anything_is_built(
         section = section[name]
     section[last] = value
     (saved / CONFIG_FILE).write_text(yaml.safe_dump(values))
-    with pytest.raises(CheckpointError, match=message) as caught:
+    with pytest.raises(InputFileError, match=message) as caught:
         load_checkpoint(saved)
     assert len(str(caught.value)) < 1000
 
@@ -111,25 +111,25 @@ def test_weights_that_are_not_finite_are_refused(saved, published, value: float)
     weights = load_file(saved / WEIGHTS_FILE)
     weights["query"][..., 0] = value
     save_file(weights, saved / WEIGHTS_FILE)
-    with pytest.raises(CheckpointError, match="not finite: query"):
+    with pytest.raises(InputFileError, match="not finite: query"):
         load_checkpoint(saved)
     contents = torch.load(published, weights_only=True)
     contents["state_dict"]["policy.end_effector_encoder.weight"][0, 0] = value
     torch.save(contents, published)
-    with pytest.raises(CheckpointError, match="not finite: "):
+    with pytest.raises(InputFileError, match="not finite: "):
         load_published(published)
 
 
 def test_a_compressed_archive_is_refused_before_it_is_unpacked(published) -> None:
     repacked(published, zipfile.ZIP_DEFLATED, **{"0": bytes(10_000_000)})
-    with pytest.raises(CheckpointError, match="is a compressed zip archive"):
+    with pytest.raises(InputFileError, match="is a compressed zip archive"):
         load_published(published)
 
 
 @pytest.mark.parametrize("name", ["builtins\nexec", "os\nmkdir", "torch\nload"])
 def test_pickles_that_name_more_than_tensors_are_refused(published, name: str) -> None:
     repacked(published, data=b"\x80\x02c" + name.encode() + b"\nX\x01\0\0\0x\x85R.")
-    with pytest.raises(CheckpointError, match="Nothing was executed"):
+    with pytest.raises(InputFileError, match="Nothing was executed"):
         load_published(published)
 
 
@@ -138,7 +138,7 @@ def test_a_setting_of_a_published_file_beyond_all_reason_is_refused(published) -
     for name, value in (("embed_dim", 2**40), ("xf_n_layers", 10**9), ("sattn_n_heads", 10**300)):
         hostile = {**contents, "cfg": {**contents["cfg"], name: value}}
         torch.save(hostile, published)
-        with pytest.raises(CheckpointError) as caught:
+        with pytest.raises(InputFileError) as caught:
             load_published(published)
         assert len(str(caught.value)) < 500
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from openvima.errors import CheckpointError
+from openvima.errors import InputFileError
 from openvima.policies import preset
 from openvima.policies.architectures import flamingo, gato, gpt, vima
 from openvima.policies.build import (
@@ -184,14 +184,12 @@ def test_weights_are_published_and_read_in_float32(network) -> None:
 
 
 def test_a_network_with_parts_of_its_own_has_no_published_names() -> None:
-    with pytest.raises(
-        CheckpointError, match=r"no published policy has: query, .*images\.appearance\.weight"
-    ):
+    with pytest.raises(InputFileError, match=r"no published policy has: query, .*images\.appearance\.weight"):
         to_published(outline_network(preset("nano-bins")))
 
 
 def test_weights_of_something_else_are_refused() -> None:
-    with pytest.raises(CheckpointError, match="no weights of VIMA, VIMA-Gato"):
+    with pytest.raises(InputFileError, match="no weights of VIMA, VIMA-Gato"):
         from_published({"layers.0.weight": torch.zeros(2)})
 
 
@@ -229,7 +227,7 @@ def test_heads_are_taken_from_cfg(vima_contents) -> None:
 def test_a_cfg_that_does_not_fit_is_refused(vima_contents, tmp_path, change, message) -> None:
     vima_contents["cfg"] |= change
     file = saved(vima_contents, tmp_path)
-    with pytest.raises(CheckpointError, match=message) as caught:
+    with pytest.raises(InputFileError, match=message) as caught:
         load_published(file)
     assert str(caught.value).startswith(str(file))
 
@@ -267,7 +265,7 @@ def test_missing_unexpected_and_misshapen_weights_are_listed_in_one_message(vima
     weights["policy.decoder.positions.weight"] = torch.zeros(512, 32)  # our name, not the published one
     weights["policy.obs_fusion_layer.bias"] = torch.zeros(3)
     weights["policy.obs_fusion_layer.weight"] = torch.zeros(32, 34, dtype=torch.int64)
-    with pytest.raises(CheckpointError) as caught:
+    with pytest.raises(InputFileError) as caught:
         load_published(saved(vima_contents, tmp_path))
     message = str(caught.value)
     for part in (
@@ -296,7 +294,7 @@ class Touch:
 def test_code_in_a_file_is_refused_and_not_executed(vima_contents, tmp_path, entry) -> None:
     trace = tmp_path / "executed"
     file = saved({**vima_contents, entry: Touch(trace)}, tmp_path)
-    with pytest.raises(CheckpointError, match="Nothing was executed"):
+    with pytest.raises(InputFileError, match="Nothing was executed"):
         load_published(file)
     assert not trace.exists()
     torch.load(file, weights_only=False)  # the file would have done it
@@ -306,7 +304,7 @@ def test_code_in_a_file_is_refused_and_not_executed(vima_contents, tmp_path, ent
 def test_a_bare_pickle_is_not_even_read(tmp_path) -> None:
     trace, file = tmp_path / "executed", tmp_path / "policy.ckpt"
     file.write_bytes(pickle.dumps(Touch(trace)))
-    with pytest.raises(CheckpointError, match="no torch zip archive"):
+    with pytest.raises(InputFileError, match="no torch zip archive"):
         load_published(file)
     assert not trace.exists()
 
@@ -316,7 +314,7 @@ def test_a_file_that_was_cut_is_refused(vima_contents, tmp_path, share) -> None:
     file = saved(vima_contents, tmp_path)
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(CheckpointError, match="ends too early"):
+    with pytest.raises(InputFileError, match="ends too early"):
         load_published(file)
 
 
@@ -327,5 +325,5 @@ def test_a_file_with_a_flipped_bit_is_refused(vima_contents, tmp_path, share) ->
     data = bytearray(file.read_bytes())
     data[int(share * len(data))] ^= 1
     file.write_bytes(data)
-    with pytest.raises(CheckpointError, match="is damaged"):
+    with pytest.raises(InputFileError, match="is damaged"):
         load_published(file)

@@ -12,7 +12,7 @@ import torch
 pytest.importorskip("transformers")
 
 from naive_inputs import NaiveProcessor
-from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError
+from openvima.errors import InputFileError, MissingExtraError, PolicyError, PromptError
 from openvima.hub import HubName
 from openvima.policies.build import build_network
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -147,13 +147,13 @@ def test_a_saved_tokenizer_is_read_again(tokenizer, tmp_path) -> None:
 
 
 def test_a_folder_without_tokenizer_is_refused(tmp_path) -> None:
-    with pytest.raises(CheckpointError, match=r"neither tokenizer\.json nor spiece\.model"):
+    with pytest.raises(InputFileError, match=r"neither tokenizer\.json nor spiece\.model"):
         T5Tokenizer(tmp_path)
 
 
 def test_a_damaged_tokenizer_is_refused(tmp_path) -> None:
     (tmp_path / "tokenizer.json").write_text('{"model":', encoding="utf-8")
-    with pytest.raises(CheckpointError, match="no tokenizer that can be read"):
+    with pytest.raises(InputFileError, match="no tokenizer that can be read"):
         T5Tokenizer(tmp_path)
 
 
@@ -163,7 +163,7 @@ def test_the_tokenizer_of_another_model_is_refused(tokenizer_folder, tmp_path) -
     values["model"]["vocab"] = [vocabulary[1], vocabulary[0], *vocabulary[2:]]  # end and padding swapped
     values["added_tokens"] = []
     (tmp_path / "tokenizer.json").write_text(json.dumps(values), encoding="utf-8")
-    with pytest.raises(CheckpointError, match=r"not that of T5.*\(1, 0, 2\)"):
+    with pytest.raises(InputFileError, match=r"not that of T5.*\(1, 0, 2\)"):
         T5Tokenizer(tmp_path)
 
 
@@ -289,7 +289,7 @@ def test_weights_of_other_sizes_are_refused_in_one_message_and_change_nothing(
     sizes = t5_sizes(small_sizes, vocabulary_size=130, text=replace(TEXT, num_layers=2))
     network = build_network(sizes, seed=0)
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-    with pytest.raises(CheckpointError) as caught:
+    with pytest.raises(InputFileError) as caught:
         load_t5(network, weights_folder)
     message = str(caught.value)
     assert "shared.weight is (128, 24) instead of (130, 24)" in message
@@ -304,7 +304,7 @@ def test_gated_encoders_of_later_versions_are_refused(reference, small_sizes, tm
         "encoder.block.1.layer.1.DenseReluDense.wi.weight"
     )
     torch.save(values, tmp_path / "pytorch_model.bin")
-    with pytest.raises(CheckpointError, match=r"lacks .*wi\.weight; it has .*wi_0\.weight.* T5 1\.0"):
+    with pytest.raises(InputFileError, match=r"lacks .*wi\.weight; it has .*wi_0\.weight.* T5 1\.0"):
         loaded(small_sizes, tmp_path)
 
 
@@ -320,7 +320,7 @@ class Malicious:
 
 def test_code_in_pickled_weights_is_not_executed(small_sizes, tmp_path) -> None:
     torch.save({"shared.weight": Malicious(tmp_path / "executed")}, tmp_path / "pytorch_model.bin")
-    with pytest.raises(CheckpointError):
+    with pytest.raises(InputFileError):
         loaded(small_sizes, tmp_path)
     assert not (tmp_path / "executed").exists()
 

@@ -7,7 +7,7 @@ import pytest
 
 from openvima.catalog import OBJECTS, TEXTURES, tasks_at
 from openvima.catalog.packs import load_assets
-from openvima.errors import CheckpointError, PromptError, UnknownWordWarning
+from openvima.errors import InputFileError, PromptError, UnknownWordWarning
 from openvima.policies.tokenizer import (
     END_ID,
     LARGEST_NUMBER,
@@ -258,7 +258,7 @@ def test_a_vocabulary_is_read_as_it_was_written(tmp_path) -> None:
 )
 def test_a_damaged_vocabulary_is_refused(content: str, reason: str, tmp_path) -> None:
     (tmp_path / VOCABULARY_FILE).write_text(content, encoding="utf-8")
-    with pytest.raises(CheckpointError, match=reason) as error:
+    with pytest.raises(InputFileError, match=reason) as error:
         Vocabulary.read(tmp_path)
     assert str(error.value).isprintable() and len(str(error.value)) < 600
 

@@ -12,7 +12,7 @@ from openvima.cli.main import main
 from openvima.data import Dataset
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
 from openvima.data.verification import VerifyConfig, verify
-from openvima.errors import DatasetError, HubError, ShardError
+from openvima.errors import DatasetError, ServerError
 from openvima.hub import HubName, dataset_name, hub_name
 from openvima.publishing import push_demonstrations
 from small_data_sets import edit_manifest
@@ -99,7 +99,7 @@ def test_what_was_fetched_is_read_without_a_connection(hub: LocalHub, demos: Pat
     Dataset("hf://owner/demos")
     monkeypatch.setattr(hub, "is_down", True)
     assert len(Dataset("hf://owner/demos")) == 2
-    with pytest.raises(HubError, match="the download of owner/others failed"):
+    with pytest.raises(ServerError, match="the download of owner/others failed"):
         Dataset("hf://owner/others")
 
 
@@ -108,7 +108,7 @@ def test_a_shard_that_changed_since_is_not_pushed(hub: LocalHub, demos: Path) ->
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
-    with pytest.raises(ShardError, match="checksum is not that of the manifest"):
+    with pytest.raises(DatasetError, match="checksum is not that of the manifest"):
         push_demonstrations(demos, "owner/demos")
     assert not hub.requests
 
@@ -153,20 +153,20 @@ def test_a_manifest_of_others_shows_nothing_but_lines(hub: LocalHub, demos: Path
 def test_what_the_hub_lacks_is_named_in_one_line(hub: LocalHub, name: str, message: str) -> None:
     hub.repository("owner/demos", "datasets").commit({"notes.txt": b""})
     hub.repository("owner/empty", "datasets").commit({"notes.txt": b""})
-    with pytest.raises((HubError, DatasetError), match=message) as caught:
+    with pytest.raises((ServerError, DatasetError), match=message) as caught:
         Dataset(name)
     assert "\n" not in str(caught.value)
 
 
 def test_without_a_token_that_may_write_nothing_is_pushed(hub: LocalHub, demos: Path, monkeypatch) -> None:
     monkeypatch.setenv("HF_TOKEN", "hf_of_somebody_else")
-    with pytest.raises(HubError, match=r"^the push to owner/demos failed: .*(401|[Ii]nvalid)"):
+    with pytest.raises(ServerError, match=r"^the push to owner/demos failed: .*(401|[Ii]nvalid)"):
         push_demonstrations(demos, "owner/demos")
     assert not hub.repositories
 
 
 @pytest.mark.parametrize("name", ["demos", "owner/demos/more", "owner/../demos"])
 def test_a_push_goes_to_a_repository_only(hub: LocalHub, demos: Path, name: str) -> None:
-    with pytest.raises(HubError, match="give OWNER/NAME"):
+    with pytest.raises(ServerError, match="give OWNER/NAME"):
         push_demonstrations(demos, name)
     assert not hub.requests

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from openvima.catalog import load_assets
-from openvima.errors import CameraError, ConfigError, ShapeError
+from openvima.errors import ConfigError, ShapeError
 from openvima.render import CAMERAS, FRONT, TOP, VIEWS, channels_first, channels_last, project, unproject
 from openvima.render.labels import cell_centres, label_raster
 from openvima.render.raycast import Hit, first_hit, object_below
@@ -50,7 +50,7 @@ def test_an_enlarged_image_leaves_out_the_same_triangles() -> None:
 
 
 def test_a_point_behind_the_camera_is_refused_by_name() -> None:
-    with pytest.raises(CameraError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
+    with pytest.raises(ShapeError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
         project(np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 1001.0]]), TOP)
 
 

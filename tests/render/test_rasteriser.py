@@ -6,7 +6,7 @@ import pytest
 from openvima.catalog import OBJECTS
 from openvima.catalog.bodies import block
 from openvima.catalog.procedural import ProceduralAssets
-from openvima.errors import ConfigError, ShapeError, UnknownObjectError
+from openvima.errors import ConfigError, ShapeError, UnknownNameError
 from openvima.render import CAMERAS, VIEWS, Drawable, Rasteriser, project
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
 from sim_cases import COLOURS, BoxAssets
@@ -176,7 +176,7 @@ def test_unfit_ids_textures_and_factors_are_refused(rasteriser) -> None:
 
 def test_an_unknown_object_is_reported_as_such() -> None:
     scene = Scene((Placement(5, "teapot", "red", BLOCK, Pose((0.5, 0.0, 0.0))),))
-    with pytest.raises(UnknownObjectError, match="teapot"):
+    with pytest.raises(UnknownNameError, match="teapot"):
         Rasteriser(ProceduralAssets()).scene(scene)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openvima.errors import ReachError, ShapeError
+from openvima.errors import ActionError, ShapeError
 from openvima.sim import ur5
 
 EXAMPLES = [
@@ -52,9 +52,9 @@ def test_forward_undoes_inverse_anywhere_low(x, y, z, yaw_rad) -> None:
 
 def test_a_point_beyond_reach_is_refused_and_the_limit_is_named() -> None:
     assert ur5.highest_tip_z(0.75, 0.5) == pytest.approx(0.0533, abs=1e-4)
-    with pytest.raises(ReachError, match=r"0\.8173 m.*highest_tip_z"):
+    with pytest.raises(ActionError, match=r"0\.8173 m.*highest_tip_z"):
         ur5.inverse(0.75, 0.5, 0.06, 0.0)
-    with pytest.raises(ReachError):
+    with pytest.raises(ActionError):
         ur5.inverse(0.05, 0.0, 0.1, 0.0)
     assert ur5.highest_tip_z(1.5, 0.0) == -math.inf
 
@@ -62,7 +62,7 @@ def test_a_point_beyond_reach_is_refused_and_the_limit_is_named() -> None:
 def test_the_farthest_distance_is_where_the_highest_point_is_asked_for() -> None:
     for z in (0.005, 0.1, 0.3):
         assert ur5.highest_tip_z(ur5.farthest_tip_distance(z), 0.0) == pytest.approx(z, abs=1e-9)
-    with pytest.raises(ReachError):
+    with pytest.raises(ActionError):
         ur5.farthest_tip_distance(1.0)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from openvima.catalog import Level, Pool, levels_of, pool
 from openvima.catalog.partitions import PUBLISHED_TASKS, tasks_at
-from openvima.errors import ConfigError, LevelError, UnknownTaskError
+from openvima.errors import ConfigError, UnknownTaskError
 from openvima.tasks import list_tasks, register_task, registry, sample_episode, task_spec
 from openvima.tasks.registry import MAX_EPISODE_STEPS
 from openvima.user_code import load_file
@@ -86,9 +86,9 @@ def test_a_mistyped_task_gets_a_suggestion() -> None:
 
 
 def test_a_level_without_the_task_is_refused() -> None:
-    with pytest.raises(LevelError, match="'rotate' is not defined at level L4; use train, L1, L2, L3, L5"):
+    with pytest.raises(ConfigError, match="'rotate' is not defined at level L4; use train, L1, L2, L3, L5"):
         task_spec("rotate").pool("L4")
-    with pytest.raises(LevelError, match="no level 'L9'"):
+    with pytest.raises(ConfigError, match="no level 'L9'"):
         task_spec("rotate").pool("L9")
 
 

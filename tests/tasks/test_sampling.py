@@ -12,7 +12,7 @@ from hypothesis import given, settings
 
 from openvima.catalog import Assets, object_spec, pool
 from openvima.catalog.partitions import PUBLISHED_TASKS
-from openvima.errors import ConfigError, LevelError, SamplingError, UnknownTaskError
+from openvima.errors import ConfigError, SamplingError, UnknownTaskError
 from openvima.render.labels import label_raster
 from openvima.scene import (
     FIRST_OBJECT_ID,
@@ -333,7 +333,7 @@ def test_errors_in_a_task_name_it(sample: Callable[[TableSampler], Problem], mes
 def test_wrong_arguments_are_refused_by_name() -> None:
     with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
         sample_episode("rotat", seed=0)
-    with pytest.raises(LevelError, match="not defined at level L3"):
+    with pytest.raises(ConfigError, match="not defined at level L3"):
         sample_episode("sweep_without_exceeding", level="L3", seed=0)
     with pytest.raises(ConfigError, match="Did you mean 'num_distractors'"):
         sample_episode("rotate", seed=0, num_distractor=2)

@@ -12,7 +12,7 @@ from openvima.data import (
     generate,
 )
 from openvima.env import EnvConfig, TabletopEnv
-from openvima.errors import CheckpointError, ConfigError, UnknownWordWarning
+from openvima.errors import ConfigError, InputFileError, UnknownWordWarning
 from openvima.evaluation import score
 from openvima.evaluation.sources import policy_sources
 from openvima.policies import load_policy, preset
@@ -77,7 +77,7 @@ def test_the_vocabulary_is_that_of_the_prompts_and_is_compared_when_a_run_resume
     assert vocabulary.digest() in (run / "config.yaml").read_text(encoding="utf-8")
 
     vocabulary.extended(["quokka"]).write(stored)
-    with pytest.raises(CheckpointError, match="another vocabulary, with"):
+    with pytest.raises(InputFileError, match="another vocabulary, with"):
         train(config)
 
 

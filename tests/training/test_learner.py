@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from openvima.cli.main import main
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import ConfigError, InputFileError
 from openvima.evaluation import Results
 from openvima.evaluation.recording import OnlineEval
 from openvima.training import TrainingConfig, train
@@ -111,10 +111,10 @@ def test_a_custom_learner_has_no_pretraining(example, settings) -> None:
 def test_weights_that_do_not_fit_are_refused(example, tmp_path) -> None:
     learner = make_learner(example)
     (tmp_path / "model.safetensors").write_bytes(b"half")
-    with pytest.raises(CheckpointError, match="is damaged"):
+    with pytest.raises(InputFileError, match="is damaged"):
         learner.read(tmp_path)
     Learner.write(learner, tmp_path, {"other": torch.zeros(1)})
-    with pytest.raises(CheckpointError, match=r"Missing key.*embed"):
+    with pytest.raises(InputFileError, match=r"Missing key.*embed"):
         learner.read(tmp_path)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from openvima.errors import AssetError, CheckpointError, ConfigError, DatasetError
+from openvima.errors import AssetError, ConfigError, DatasetError, InputFileError
 from openvima.policies import load_policy
 from openvima.training import TrainingConfig, train
 from openvima.training.config import ScheduleConfig
@@ -149,7 +149,7 @@ def test_a_damaged_checkpoint_is_named(settings):
     train_until(config, 3)
     (weights,) = config.out.rglob("model.safetensors")
     weights.write_bytes(weights.read_bytes()[:100])
-    with pytest.raises(CheckpointError, match="is damaged"):
+    with pytest.raises(InputFileError, match="is damaged"):
         train(config)
 
 
@@ -193,7 +193,7 @@ def test_the_progress_report_ends_at_the_total(settings):
 def test_an_empty_run_folder_has_no_checkpoint(tmp_path):
     folder = RunFolder(tmp_path / "run", {"a": 1})
     assert folder.latest() is None
-    with pytest.raises(CheckpointError, match="no checkpoint"):
+    with pytest.raises(InputFileError, match="no checkpoint"):
         folder.optimizer_state()
 
 

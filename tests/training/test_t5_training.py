@@ -9,7 +9,7 @@ import torch
 pytest.importorskip("transformers")
 
 from openvima.env import TabletopEnv
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import ConfigError, InputFileError
 from openvima.policies import load_policy, presets, sizes
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
@@ -110,9 +110,9 @@ def test_a_preset_with_words_takes_a_t5_of_the_size_that_is_named(
     observation, _ = env.reset(seed=0)
     policy.reset([env.prompt])
     assert policy.act([observation])[0] is not None
-    with pytest.raises(CheckpointError, match=r"needs a T5 1\.0: t5-small \(24 wide, 3 layers, 2 heads of 4"):
+    with pytest.raises(InputFileError, match=r"needs a T5 1\.0: t5-small \(24 wide, 3 layers, 2 heads of 4"):
         build_learner(TrainingConfig.of({**config, "t5": str(t5)}))
-    with pytest.raises(CheckpointError, match=r"t5 is t5-large, but the network has t5-small"):
+    with pytest.raises(InputFileError, match=r"t5 is t5-large, but the network has t5-small"):
         load_t5(policy.network, "t5-large")
     with pytest.raises(ConfigError, match=r"has its own vocabulary and no T5; .* model\.text_encoder"):
         train(TrainingConfig.of({**config, "model.text_encoder": None}))
@@ -155,7 +155,7 @@ def test_a_t5_of_another_size_leaves_no_run_folder(t5_settings, monkeypatch) -> 
     text = replace(sizes.prompt.text, hidden_width=24)
     wider = replace(sizes, prompt=replace(sizes.prompt, text=text))
     monkeypatch.setitem(presets.PRESETS, "tiny-t5", lambda: wider)
-    with pytest.raises(CheckpointError, match=r"wi\.weight is \(16, 32\) instead of \(24, 32\)"):
+    with pytest.raises(InputFileError, match=r"wi\.weight is \(16, 32\) instead of \(24, 32\)"):
         train(TrainingConfig.of(t5_settings))
     assert not t5_settings["out"].exists()
 

@@ -325,7 +325,7 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
         scale: Factor per axis on top of it.
 
     Raises:
-        UnknownObjectError: The catalogue has no such object.
+        UnknownNameError: The catalogue has no such object.
         AssetError: A size or factor that the object needs is not positive.
     """
     spec = object_spec(object_name)

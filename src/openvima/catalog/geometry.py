@@ -100,7 +100,7 @@ class Assets(Protocol):
             scale: Factor per axis on top of it.
 
         Raises:
-            UnknownObjectError: The catalogue has no such object.
+            UnknownNameError: The catalogue has no such object.
             AssetError: The pack lacks a file for it.
         """
         ...
@@ -109,7 +109,7 @@ class Assets(Protocol):
         """Return the texture's image, shape (H, W, 3), uint8, row 0 on top; plain colours are 1 × 1.
 
         Raises:
-            UnknownTextureError: The catalogue has no such texture.
+            UnknownNameError: The catalogue has no such texture.
             AssetError: The pack lacks a file for it.
         """
         ...

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from openvima.catalog.geometry import Vector3
-from openvima.errors import UnknownObjectError, unknown_name
+from openvima.errors import UnknownNameError, unknown_name
 
 ObjectKind = Literal["kit", "box", "compound", "mesh", "registered"]
 Profile = Literal["square", "circle"]
@@ -260,7 +260,7 @@ def object_spec(name: str) -> ObjectSpec:
         name: Display name, case-sensitive, such as "L-shaped block".
 
     Raises:
-        UnknownObjectError: There is no such object; the message suggests the nearest name.
+        UnknownNameError: There is no such object; the message suggests the nearest name.
 
     Example:
         >>> object_spec("block").size_max
@@ -274,4 +274,4 @@ def object_spec(name: str) -> ObjectSpec:
             "a file of OPENVIMA_TASK_FILES or for --assets."
         )
         known = (*OBJECTS, *REGISTERED_OBJECTS)
-        raise UnknownObjectError(unknown_name("object", name, known, hint)) from None
+        raise UnknownNameError(unknown_name("object", name, known, hint)) from None

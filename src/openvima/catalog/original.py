@@ -307,7 +307,7 @@ class OriginalAssets:
         """Return the shape of a catalogue object; see `Assets.geometry`.
 
         Raises:
-            UnknownObjectError: The catalogue has no such object.
+            UnknownNameError: The catalogue has no such object.
             AssetError: A mesh is missing or damaged.
         """
         if object_name in REGISTERED_OBJECTS:
@@ -318,7 +318,7 @@ class OriginalAssets:
         """Return the texture's image, shape (H, W, 3), uint8; see `Assets.texture`.
 
         Raises:
-            UnknownTextureError: The catalogue has no such texture.
+            UnknownNameError: The catalogue has no such texture.
             AssetError: The image is missing or damaged.
         """
         if texture_name in REGISTERED_TEXTURES:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from openvima.catalog.textures import TEXTURES
-from openvima.errors import LevelError, UnknownTaskError, unknown_name
+from openvima.errors import ConfigError, UnknownTaskError, unknown_name
 
 Level = Literal["train", "L1", "L2", "L3", "L4", "L5", "L6", "L7", "L8"]
 
@@ -215,7 +215,7 @@ def tasks_at(level: str) -> tuple[str, ...]:
     """Return the tasks of a level, in the benchmark's order.
 
     Raises:
-        LevelError: There is no such level.
+        ConfigError: There is no such level.
 
     Example:
         >>> len(tasks_at("L3"))
@@ -244,7 +244,7 @@ def pool(task: str, level: str) -> Pool:
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: There is no such level, or the task is not defined there.
+        ConfigError: There is no such level, or the task is not defined there.
 
     Example:
         >>> pool("rotate", "L3").dragged_objects
@@ -253,11 +253,11 @@ def pool(task: str, level: str) -> Pool:
     levels = levels_of(task)
     pools = _level_pools(level)
     if task not in pools:
-        raise LevelError(f"{task} is not defined at level {level}; it is defined at {', '.join(levels)}.")
+        raise ConfigError(f"{task} is not defined at level {level}; it is defined at {', '.join(levels)}.")
     return pools[task]
 
 
 def _level_pools(level: str) -> dict[str, Pool]:
     if level not in _POOLS:
-        raise LevelError(unknown_name("level", level, LEVELS))
+        raise ConfigError(unknown_name("level", level, LEVELS))
     return _POOLS[level]

@@ -18,7 +18,6 @@ from openvima.errors import (
     AssetError,
     ConfigError,
     InputFileError,
-    LevelError,
     ShapeError,
     echo,
     unknown_name,
@@ -93,7 +92,7 @@ def register_object(
         AssetError: A name is taken or no plain name, the mesh is unfit, or a number is out of bounds.
         ShapeError: Arrays have a wrong shape or dtype.
         ConfigError: A task is a published one.
-        LevelError: There is no such level.
+        ConfigError: There is no such level.
     """
     what = f"object {echo(repr(name))}"
     _check_name(name, what, "object")
@@ -244,7 +243,7 @@ def _check_pools(tasks: Sequence[str], levels: Sequence[Level], what: str) -> No
             "episode. Use it in a task of your own."
         )
     if unknown := [level for level in levels if level not in LEVELS]:
-        raise LevelError(f"{what}: {unknown_name('level', unknown[0], LEVELS)}")
+        raise ConfigError(f"{what}: {unknown_name('level', unknown[0], LEVELS)}")
 
 
 def _is_new(kind: str, name: str, entry: _Entry) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
 
-from openvima.errors import UnknownTextureError, unknown_name
+from openvima.errors import UnknownNameError, unknown_name
 
 TextureCategory = Literal[
     "plain", "special", "stripe", "polka_dot_2", "swirl", "paisley", "neutral", "registered"
@@ -150,7 +150,7 @@ def texture_spec(name: str) -> TextureSpec:
             images and no member of `TEXTURES`.
 
     Raises:
-        UnknownTextureError: There is no such texture; the message suggests the nearest name.
+        UnknownNameError: There is no such texture; the message suggests the nearest name.
 
     Example:
         >>> texture_spec("dark blue").texel
@@ -166,4 +166,4 @@ def texture_spec(name: str) -> TextureSpec:
             "a file of OPENVIMA_TASK_FILES or for --assets."
         )
         known = (*TEXTURES, *REGISTERED_TEXTURES)
-        raise UnknownTextureError(unknown_name("texture", name, known, hint)) from None
+        raise UnknownNameError(unknown_name("texture", name, known, hint)) from None

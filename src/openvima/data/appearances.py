@@ -72,7 +72,7 @@ def appearance_record(dataset: Dataset, report: Report | None = None) -> dict[st
         textures of the group but those listed as lacking.
 
     Raises:
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     names = dataset.shard_names()
     counts: dict[str, dict[str, Counter[Appearance]]] = defaultdict(lambda: defaultdict(Counter))
@@ -204,7 +204,7 @@ def training_appearances(task: str) -> dict[str, frozenset[Appearance]]:
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: It is none of the training tasks.
+        ConfigError: It is none of the training tasks.
     """
     names = pool(task, _LEVEL)
     shapes, bases = names.dragged_objects, names.base_objects

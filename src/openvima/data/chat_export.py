@@ -67,7 +67,7 @@ def export_chat(
     Raises:
         ConfigError: There cannot be so many questions.
         DatasetError: There are no such demonstrations, or the folder has content.
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     if questions < 0:
         raise ConfigError(f"questions is {questions}; it must be at least 0.")

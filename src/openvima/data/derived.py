@@ -21,7 +21,7 @@ from openvima.data.manifest import (
 )
 from openvima.data.reader import Dataset
 from openvima.data.shard import ShardWriter
-from openvima.errors import DatasetError, ShardError
+from openvima.errors import DatasetError
 from openvima.multiprocess import Report, imap_unordered
 
 _NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
@@ -128,7 +128,7 @@ def write_shards(shards: Sequence[ShardCopy], num_workers: int, report: Report |
         report: Called with episodes done, episodes in all, and a note.
 
     Raises:
-        ShardError: What is read is damaged.
+        DatasetError: What is read is damaged.
     """
     total = sum(len(shard.episodes) for shard in shards)
     count = None if report is None else (lambda done: report(done, total, ""))
@@ -144,7 +144,7 @@ def write_shard(shard: ShardCopy, count: Callable[[int], None]) -> None:
         count: Called with the number of episodes written so far.
 
     Raises:
-        ShardError: What is read is damaged.
+        DatasetError: What is read is damaged.
     """
     dataset = _open_unchanged(shard.source, shard.checksum)
     if not shard.original:
@@ -156,7 +156,7 @@ def write_shard(shard: ShardCopy, count: Callable[[int], None]) -> None:
     original = shard.source / shard.original
     shutil.copyfile(original, shard.path)
     if fingerprint(shard.path)["sha256"] != dataset.manifest["shards"][shard.original]["sha256"]:
-        raise ShardError(
+        raise DatasetError(
             f"{original} is damaged: its checksum is not that of the manifest. "
             f"`openvima data verify {shlex.quote(str(shard.source))}` says more."
         )

@@ -14,7 +14,7 @@ import pyarrow as pa
 from openvima.data.records import Demonstration, make_columns, planes
 from openvima.data.schema import ARRAYS, CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION, VIEWS
 from openvima.env.config import ENV_SETTINGS, EnvConfig, without_published
-from openvima.errors import ShardError, unknown_name
+from openvima.errors import DatasetError, unknown_name
 from openvima.scene import (
     ACTION_SHAPES,
     Action,
@@ -79,7 +79,7 @@ class ShardInfo:
         images: Whether images are stored; without, they are drawn anew on reading.
 
     Raises:
-        ShardError: There is no such codec.
+        DatasetError: There is no such codec.
     """
 
     task: str
@@ -99,7 +99,7 @@ class ShardInfo:
 
     def __post_init__(self) -> None:
         if self.compression not in CODECS:
-            raise ShardError(unknown_name("compression", self.compression, CODECS))
+            raise DatasetError(unknown_name("compression", self.compression, CODECS))
 
     @property
     def file_name(self) -> str:
@@ -134,27 +134,29 @@ class ShardInfo:
         """Read the entry of a file's schema.
 
         Raises:
-            ShardError: There is none, it is damaged, or of another version.
+            DatasetError: There is none, it is damaged, or of another version.
         """
         try:
             fields = json.loads((metadata or {}).get(_METADATA_KEY, b"{}"))
             written_as = fields.pop("schema", None)
             if written_as is None:
-                raise ShardError("it is an Arrow file, but holds no demonstrations of this package.")
+                raise DatasetError("it is an Arrow file, but holds no demonstrations of this package.")
             if written_as != SCHEMA_VERSION:
-                raise ShardError(f"it has schema version {written_as}; this package reads {SCHEMA_VERSION}.")
+                raise DatasetError(
+                    f"it has schema version {written_as}; this package reads {SCHEMA_VERSION}."
+                )
             if (difficulty := fields.pop("difficulty", "easy")) != "easy":
-                raise ShardError(f"its difficulty is {difficulty!r:.80}; generate it with --task-options.")
+                raise DatasetError(f"its difficulty is {difficulty!r:.80}; generate it with --task-options.")
             info = ShardInfo(**fields)
             for name, kind in ShardInfo.__annotations__.items():
                 if not isinstance(value := getattr(info, name), get_origin(kind) or kind):
                     raise TypeError(f"{name} is {value!r:.80}")
         except (UnicodeDecodeError, json.JSONDecodeError, AttributeError, TypeError) as error:
-            raise ShardError(f"what it says of itself is damaged ({error}).") from None
+            raise DatasetError(f"what it says of itself is damaged ({error}).") from None
         for name in ("task", "level", "domain", "assets"):  # of which names of files are made
             value = getattr(info, name)
             if not _WORD.fullmatch(value) and not (name == "assets" and _is_function(value)):
-                raise ShardError(f"its {name} is {getattr(info, name)!r:.80}, which is no plain name.")
+                raise DatasetError(f"its {name} is {getattr(info, name)!r:.80}, which is no plain name.")
         return info
 
 

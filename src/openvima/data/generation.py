@@ -29,7 +29,7 @@ from openvima.data.records import Demonstration, rollout_oracle
 from openvima.data.shard import Shard, ShardWriter, remedy
 from openvima.env import TabletopEnv
 from openvima.env.config import EnvConfig
-from openvima.errors import DatasetError, OracleError, SamplingError, ShardError
+from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.multiprocess import Report, imap_unordered
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
@@ -54,7 +54,7 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
 
     Raises:
         DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     _check_origin(config.out)
     wanted = {block.path.name: block for block in blocks}
@@ -113,7 +113,7 @@ def write_block(block: Block, count: Callable[[int], None]) -> None:
 
     Raises:
         OracleError: The oracle solved too few of the block's episodes.
-        ShardError: A record that is to be copied is damaged.
+        DatasetError: A record that is to be copied is damaged.
     """
     num_kept, skipped = 0, []
     with contextlib.ExitStack() as files:  # closed in reverse: where a shard is, its failed episodes are too
@@ -143,13 +143,13 @@ def _copy_records(path: Path, writer: ShardWriter) -> tuple[int, int]:
     """Copy the records that a shard has already; return their number, and the seed to go on with.
 
     Raises:
-        ShardError: One is damaged.
+        DatasetError: One is damaged.
     """
     shard, next_seed = Shard(path), 0
     for row in range(len(shard)):
         batch, demo = shard.batch(row), shard[row]
         if demo.content_hash() != batch.column("content_hash")[0].as_py():
-            raise ShardError(f"{path}: record {row} is damaged. {remedy(path.parent)}")
+            raise DatasetError(f"{path}: record {row} is damaged. {remedy(path.parent)}")
         writer.copy(batch)
         next_seed = demo.seed + 1
     return len(shard), next_seed
@@ -217,10 +217,10 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
         the settings and versions alone, not on who did the work, nor on interruptions.
 
     Raises:
-        UnknownTaskError, LevelError, ConfigError: The settings do not fit.
+        UnknownTaskError, ConfigError, ConfigError: The settings do not fit.
         MissingExtraError: Ray was asked for and is not installed.
         DatasetError: The folder holds a data set of other settings or versions, or a larger one.
-        ShardError: A shard in the folder is damaged.
+        DatasetError: A shard in the folder is damaged.
         StorageError: The disk is full, or the folder cannot be written to.
         OSError: `out` cannot be a folder, as where a file has that name.
         FolderLockedError: Another process writes to the folder, or to the same shards of it.
@@ -314,7 +314,7 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         blocks: Its division into shards.
 
     Raises:
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     versions, record = blocks[0].info.versions, config.record()
     failed = [block.failed_path for block in blocks if block.failed_path and block.failed_path.is_file()]

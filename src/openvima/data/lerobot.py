@@ -94,7 +94,7 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
 
     Raises:
         DatasetError: There are no such demonstrations, or the folder has content and `force` is not set.
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
         MissingExtraError: PyAV is not installed.
     """
     import_av()  # before the work begins

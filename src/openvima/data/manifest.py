@@ -87,7 +87,7 @@ def finish_folder(
         licence: Of the demonstrations.
 
     Raises:
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     summaries = [summarise_shard(path) for path in shards]
     origin = {"command": command, "config": dict(config), "versions": dict(versions), "licence": licence}
@@ -117,7 +117,7 @@ def summarise_shard(path: Path) -> ShardSummary:
     """Read what index and manifest hold of a shard.
 
     Raises:
-        ShardError: It is damaged.
+        DatasetError: It is damaged.
     """
     table = Shard(path).table(_COLUMNS)
     envelope, spans = measure(path)

@@ -25,7 +25,7 @@ from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empt
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
 from openvima.data.shard import DAMAGE_ERRORS, Envelope, Shard, list_spans, map_file
-from openvima.errors import DatasetError, ShardError, unknown_name
+from openvima.errors import DatasetError, unknown_name
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, imap_unordered
 from openvima.perception.objects import ObjectExtractor
@@ -122,7 +122,7 @@ class CacheFile:
         path: The file.
 
     Raises:
-        ShardError: It is missing, truncated, or no file of this version.
+        DatasetError: It is missing, truncated, or no file of this version.
     """
 
     def __init__(self, path: Path) -> None:
@@ -138,7 +138,7 @@ class CacheFile:
             self._scalars = {name: rows.column(name).to_pylist() for name in _SCALARS}
             self._checksums = rows.column(_CHECKSUM).to_pylist()
         except DAMAGE_ERRORS as error:
-            raise ShardError(
+            raise DatasetError(
                 _describe_damage(path, str(error).splitlines()[0] if str(error) else "empty")
             ) from None
         self.kind: InputKind = about["kind"]
@@ -155,7 +155,7 @@ class CacheFile:
                 arrays[name] = flat[start:end]
         scalars = tuple([column[row] for column in self._scalars.values()])
         if _checksum(scalars, arrays.values()) != self._checksums[row]:
-            raise ShardError(
+            raise DatasetError(
                 _describe_damage(self.path, f"the checksum of row {row} of {len(self)} is wrong")
             )
         task, seed, end_effector, text, descriptions = scalars
@@ -437,7 +437,7 @@ def open_object_cache(
     Raises:
         DatasetError: There is no such kind, it has no use for boxes, or the folder cannot be written to.
         FolderLockedError: Another process writes the cache.
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     if boxes is not None and kind == "frames":
         raise DatasetError(f"boxes are those of {boxes.name}, but whole frames have none; leave them out.")
@@ -508,7 +508,7 @@ def _open_files(
     for name, index in indices.items():
         try:
             file = CacheFile(folder / name)
-        except ShardError:
+        except DatasetError:
             files[name] = None
             continue
         asked = (joint_hash(index.column("content_hash").to_pylist()), kind, variant)

@@ -12,7 +12,7 @@ from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.data.summary import Summary
-from openvima.errors import AssetError, ConfigError, ShardError
+from openvima.errors import AssetError, ConfigError, DatasetError
 from openvima.html import render_page, require_extra
 from openvima.multiprocess import Report
 from openvima.render import channels_last
@@ -39,7 +39,7 @@ def write_page(summary: Summary, out: Path, *, num_samples: int = 3, report: Rep
 
     Raises:
         ConfigError: The number of samples is out of range.
-        ShardError: The data set is damaged.
+        DatasetError: The data set is damaged.
     """
     if not 0 <= num_samples <= MAX_SAMPLES:
         raise ConfigError(f"samples is {num_samples}; it must lie within 0 … {MAX_SAMPLES}.")
@@ -93,7 +93,7 @@ def _spread(numbers: np.ndarray, count: int) -> list[int]:
 def _make_card(dataset: Dataset, episode_index: int) -> dict[str, object] | str:
     try:
         return make_episode_card(dataset[episode_index])
-    except (AssetError, ShardError) as error:  # stored without images, which cannot be rerendered here
+    except (AssetError, DatasetError) as error:  # stored without images, which cannot be rerendered here
         if dataset.shard(dataset.locate(episode_index)[0]).info.images:
             raise
         return str(error)

@@ -18,7 +18,7 @@ from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
 from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
-from openvima.errors import ConfigError, LevelError, brief_repr, unknown_name
+from openvima.errors import ConfigError, brief_repr, unknown_name
 from openvima.input_files import settle
 from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
@@ -124,12 +124,12 @@ class GenerateConfig:
 
         Raises:
             UnknownTaskError: There is no such task.
-            LevelError: There is no such level, or a task is not defined at it.
+            ConfigError: There is no such level, or a task is not defined at it.
             ConfigError: A named task has no text form, which the prompts need; "all" leaves it out. Or a task
                 option does not fit.
         """
         if self.level not in LEVELS:
-            raise LevelError(unknown_name("level", self.level, LEVELS))
+            raise ConfigError(unknown_name("level", self.level, LEVELS))
         if self.tasks == ("all",):
             there = (task for task in list_tasks() if self.level in task_spec(task).levels)
             tasks = tuple(sorted(task for task in there if takes_prompts(task, self.env_config.prompts)))

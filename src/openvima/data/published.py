@@ -24,7 +24,7 @@ from openvima.data.published_episode import ASSETS, DOMAIN, LEVEL, package_versi
 from openvima.data.published_sources import EpisodeFolders, ZipArchive
 from openvima.data.records import Demonstration
 from openvima.data.shard import Shard, ShardWriter
-from openvima.errors import ConfigError, DatasetError, MemberError, unknown_name
+from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.input_files import as_path, names_of, settle
 from openvima.multiprocess import Report, check_workers, imap_unordered
 from openvima.tasks import list_tasks, task_spec
@@ -178,7 +178,7 @@ class PublishedData(Sequence[Demonstration]):
 
         Raises:
             DatasetError: There is no such episode.
-            MemberError: It is broken; the message names archive, file and reason.
+            DatasetError: It is broken; the message names archive, file and reason.
         """
         key = EpisodeKey(current_task(task) or task, episode_id)
         if key not in self._place_of:
@@ -212,7 +212,7 @@ class PublishedData(Sequence[Demonstration]):
     def _read(self, place: EpisodePlace) -> Demonstration:
         found = read_place(self._source, place)
         if isinstance(found, Broken):
-            raise MemberError(f"{self.path}: {found.member}: {found.reason}")
+            raise DatasetError(f"{self.path}: {found.member}: {found.reason}")
         return found
 
 
@@ -235,7 +235,7 @@ def read_place(source: Source, place: EpisodePlace) -> Demonstration | Broken:
     """Read one episode, or say what is wrong with it."""
     try:
         return read_demonstration(source.files(place.place), task=place.key.task, folder=place.folder)
-    except MemberError as error:
+    except DatasetError as error:
         return Broken(place.folder, str(error))
 
 

@@ -20,7 +20,7 @@ from openvima.catalog import OBJECTS
 from openvima.data.published_sources import FRAME_FOLDERS, PICKLES
 from openvima.data.records import Demonstration, versions_of
 from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
-from openvima.errors import MemberError, unknown_name
+from openvima.errors import DatasetError, unknown_name
 from openvima.render import channels_first
 from openvima.render.camera import TOP, project
 from openvima.scene import (
@@ -68,7 +68,7 @@ class _Dtype(Inert):
 
     def __init__(self, spec: object, *_: object) -> None:
         if not isinstance(spec, str) or not _DTYPE.fullmatch(spec):
-            raise MemberError(f"it has an array of type {_describe(spec)}; only numbers are read.")
+            raise DatasetError(f"it has an array of type {_describe(spec)}; only numbers are read.")
         self.dtype = np.dtype(spec)
 
     def __setstate__(self, state: Any) -> None:
@@ -115,15 +115,15 @@ def read_pickle(content: bytes) -> Any:
         content: The file.
 
     Raises:
-        MemberError: It is damaged, or more than data.
+        DatasetError: It is damaged, or more than data.
     """
     try:
         return _Unpickler(io.BytesIO(content)).load()
-    except MemberError:
+    except DatasetError:
         raise
     except _DAMAGE_ERRORS as error:
         reason = str(error)[:_MAX_TEXT] or type(error).__name__
-        raise MemberError(f"it is truncated or no pickle of data ({reason}).") from None
+        raise DatasetError(f"it is truncated or no pickle of data ({reason}).") from None
 
 
 class _Unpickler(pickle.Unpickler):
@@ -137,18 +137,18 @@ class _Unpickler(pickle.Unpickler):
             return decoder
         if _INERT.fullmatch(dotted):
             return Inert
-        raise MemberError(f"it names {dotted[:_MAX_TEXT]}, which no published file needs; nothing was run.")
+        raise DatasetError(f"it names {dotted[:_MAX_TEXT]}, which no published file needs; nothing was run.")
 
 
 def as_array(value: object) -> np.ndarray:
     """Return an array that `read_pickle` decoded, read-only.
 
     Raises:
-        MemberError: The value is none.
+        DatasetError: The value is none.
     """
     array = getattr(value, "array", value)
     if not isinstance(array, np.ndarray):
-        raise MemberError(f"it has {_describe(value)} where an array should be.")
+        raise DatasetError(f"it has {_describe(value)} where an array should be.")
     return array
 
 
@@ -209,7 +209,7 @@ def read_demonstration(files: Mapping[str, bytes], *, task: str, folder: str) ->
         from what the top view shows where the tool goes down.
 
     Raises:
-        MemberError: A file is missing, damaged or of another form; the message begins with its name.
+        DatasetError: A file is missing, damaged or of another form; the message begins with its name.
     """
     contents = []
     for name in PICKLES:
@@ -226,7 +226,7 @@ def read_demonstration(files: Mapping[str, bytes], *, task: str, folder: str) ->
         _check_summary(trajectory, len(steps))
         end_effector, objects = trajectory["end_effector_type"], trajectory["obj_id_to_info"]
         if shown.shape != (num_images,) or (shown != END_EFFECTORS.index(end_effector)).any():
-            raise MemberError(f"the tool is {end_effector!r}, but obs.pkl shows another.")
+            raise DatasetError(f"the tool is {end_effector!r}, but obs.pkl shows another.")
         objects = tuple(_object(object_id, entry, "texture_name") for object_id, entry in objects.items())
         prompt, seed = _prompt(trajectory), _whole_number(trajectory["seed"], MAX_SEED)
     return Demonstration(
@@ -262,16 +262,16 @@ def _naming(name: str) -> Iterator[None]:
     """Name the file in which something is damaged, or of another form."""
     try:
         yield
-    except MemberError as error:
-        raise MemberError(f"{name}: {error}") from None
+    except DatasetError as error:
+        raise DatasetError(f"{name}: {error}") from None
     except _DAMAGE_ERRORS as error:
         reason = f"{type(error).__name__}: {error}"
-        raise MemberError(f"{name} is missing or of another form ({reason[:_MAX_TEXT]}).") from None
+        raise DatasetError(f"{name} is missing or of another form ({reason[:_MAX_TEXT]}).") from None
 
 
 def _whole_number(value: object, largest: int) -> int:
     if type(value) is not int or not 0 <= value <= largest:
-        raise MemberError(f"a number is {_describe(value)}; a whole one within 0 … {largest:,} is needed.")
+        raise DatasetError(f"a number is {_describe(value)}; a whole one within 0 … {largest:,} is needed.")
     return value
 
 
@@ -279,7 +279,7 @@ def _images(value: object, *leading: int) -> np.ndarray:
     """A writable copy of one or more images."""
     array, shape = as_array(value), (*leading, *IMAGE_SHAPE)
     if array.shape != shape or array.dtype != np.uint8:
-        raise MemberError(f"it has images of shape {array.shape}, {array.dtype}; needed are {shape}, uint8.")
+        raise DatasetError(f"it has images of shape {array.shape}, {array.dtype}; needed are {shape}, uint8.")
     return array.copy()
 
 
@@ -292,7 +292,7 @@ def _actions(fields: Fields) -> tuple[Action, ...]:
         low, high = np.array(bounds, np.float32)
         inside = (rows >= low) & (rows <= high)  # what is no number is not
         if rows.shape[1:] != (length,) or not inside.all():
-            raise MemberError(
+            raise DatasetError(
                 f"{key} is {rows.tolist()!s:.80}; it must be of shape (T, {length}), within {bounds[0]} … "
                 f"{bounds[1]}."
             )
@@ -301,7 +301,7 @@ def _actions(fields: Fields) -> tuple[Action, ...]:
         Action(**dict(zip(columns, step, strict=True))) for step in zip(*columns.values(), strict=True)
     )
     if not steps:
-        raise MemberError("it holds no actions.")
+        raise DatasetError("it holds no actions.")
     return steps
 
 
@@ -310,7 +310,7 @@ def _object(object_id: object, entry: Fields, texture_key: str) -> ObjectRecord:
     name, texture = entry["obj_name"], entry[texture_key]
     _ = name.encode(), texture.encode()  # which fails for all but valid texts
     if name not in OBJECTS:
-        raise MemberError(unknown_name("object", name[:60], OBJECTS, "`openvima assets info` lists them."))
+        raise DatasetError(unknown_name("object", name[:60], OBJECTS, "`openvima assets info` lists them."))
     return ObjectRecord(_whole_number(object_id, 255), name, texture)
 
 
@@ -320,14 +320,14 @@ def _prompt(trajectory: Fields) -> RenderedPrompt:
     text.encode()
     names = list(dict.fromkeys(PLACEHOLDER.findall(text)))
     if set(names) != assets.keys():
-        raise MemberError(f"the prompt names images {', '.join(names)[:_MAX_TEXT]}; there are others.")
+        raise DatasetError(f"the prompt names images {', '.join(names)[:_MAX_TEXT]}; there are others.")
     return RenderedPrompt(text, {name: _prompt_image(name, assets[name]) for name in names})
 
 
 def _prompt_image(name: str, asset: Fields) -> PromptImage:
     kind = asset["placeholder_type"]
     if kind not in ("object", "scene"):
-        raise MemberError(f"{name} is an image of {_describe(kind)}, no object or scene.")
+        raise DatasetError(f"{name} is an image of {_describe(kind)}, no object or scene.")
     entries = asset["segm"]["obj_info"]
     return PromptImage(
         name=name,
@@ -346,7 +346,7 @@ def _check_summary(trajectory: Fields, num_steps: int) -> None:
     expected = {"steps": num_steps, "success": True, "difficulty": "easy"}
     for name, value in expected.items():
         if (found := trajectory.get(name, "easy")) != value:
-            raise MemberError(f"{name} is {_describe(found)}; {value!r} is needed.")
+            raise DatasetError(f"{name} is {_describe(found)}; {value!r} is needed.")
 
 
 def _frames(files: Mapping[str, bytes], folder: str, num_images: int) -> np.ndarray:
@@ -354,7 +354,9 @@ def _frames(files: Mapping[str, bytes], folder: str, num_images: int) -> np.ndar
     names = [f"{folder}/{number}.jpg" for number in range(num_images)]
     found = [name for name in files if name.startswith(f"{folder}/")]
     if set(found) != set(names):
-        raise MemberError(f"{folder} has {len(found)} images for {num_images - 1} actions, or misnames some.")
+        raise DatasetError(
+            f"{folder} has {len(found)} images for {num_images - 1} actions, or misnames some."
+        )
     return channels_first(np.stack([_decode(files[name], name) for name in names]))
 
 
@@ -364,9 +366,9 @@ def _decode(content: bytes, name: str) -> np.ndarray:
         with Image.open(io.BytesIO(content), formats=("JPEG",)) as image:
             # The size is known from the head, so nothing larger is ever decoded.
             if image.size != (width, height) or image.mode != "RGB":
-                raise MemberError(f"{name} is {image.size}, {image.mode}; not {width} × {height}, RGB.")
+                raise DatasetError(f"{name} is {image.size}, {image.mode}; not {width} × {height}, RGB.")
             return np.asarray(image)
-    except MemberError:
+    except DatasetError:
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        raise MemberError(f"{name} is no whole JPEG image.") from None
+        raise DatasetError(f"{name} is no whole JPEG image.") from None

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from openvima.errors import DatasetError, MemberError
+from openvima.errors import DatasetError
 
 PICKLES = ("obs.pkl", "action.pkl", "trajectory.pkl")
 FRAME_FOLDERS = ("rgb_front", "rgb_top")
@@ -83,7 +83,7 @@ class EpisodeFolders:
             Path within the episode's folder, such as "rgb_top/0.jpg", to content.
 
         Raises:
-            MemberError: A file cannot be read, or all are too large.
+            DatasetError: A file cannot be read, or all are too large.
         """
         contents, num_left = {}, MAX_EPISODE_BYTES
         for name in _files(Path(place)):
@@ -91,10 +91,10 @@ class EpisodeFolders:
                 with open(Path(place, name), "rb") as stream:
                     contents[name] = stream.read(num_left + 1)
             except OSError as error:
-                raise MemberError(f"{name} cannot be read: {error.strerror}.") from None
+                raise DatasetError(f"{name} cannot be read: {error.strerror}.") from None
             num_left -= len(contents[name])
             if num_left < 0:
-                raise MemberError(
+                raise DatasetError(
                     f"it has more than the {MAX_EPISODE_BYTES:,} bytes that episodes have at most."
                 )
         return contents
@@ -206,7 +206,7 @@ class ZipArchive:
             Path within the episode's folder, such as "rgb_top/0.jpg", to content.
 
         Raises:
-            MemberError: A member is damaged, too large or beyond the end.
+            DatasetError: A member is damaged, too large or beyond the end.
         """
         with open(self.path, "rb") as file:
             members = {}
@@ -216,10 +216,10 @@ class ZipArchive:
                 members |= {member.name: member for member in found if is_episode_file(member.name)}
             for member in members.values():
                 if member.offset + self._shift >= self._end:
-                    raise MemberError(f"{member.name} is not where the archive's directory says.")
+                    raise DatasetError(f"{member.name} is not where the archive's directory says.")
             total = sum(max(member.num_bytes, member.packed_bytes) for member in members.values())
             if total > MAX_EPISODE_BYTES:
-                raise MemberError(f"it claims {total:,} bytes; episodes have at most {MAX_EPISODE_BYTES:,}.")
+                raise DatasetError(f"it claims {total:,} bytes; episodes have at most {MAX_EPISODE_BYTES:,}.")
             return {name: self._content(file, member) for name, member in members.items()}
 
     def _runs(self) -> Iterator[tuple[bytes, int, int]]:
@@ -250,16 +250,16 @@ class ZipArchive:
     def _content(self, file: BinaryIO, member: _Member) -> bytes:
         if member.is_encrypted or member.method not in (_STORED, _DEFLATED):
             how = "encrypted" if member.is_encrypted else f"packed by method {member.method}"
-            raise MemberError(f"{member.name} is {how}; only stored and deflated members are read.")
+            raise DatasetError(f"{member.name} is {how}; only stored and deflated members are read.")
         file.seek(member.offset + self._shift)
         head = file.read(_HEAD.size)
         if len(head) < _HEAD.size or not head.startswith(b"PK\3\4"):
-            raise MemberError(f"{member.name} is not where the archive's directory says.")
+            raise DatasetError(f"{member.name} is not where the archive's directory says.")
         file.seek(sum(_HEAD.unpack(head)[-2:]), 1)  # name and extra fields again
         packed = file.read(member.packed_bytes)
         content = packed if member.method == _STORED else _inflate(packed, member)
         if len(content) != member.num_bytes or zlib.crc32(content) != member.checksum:
-            raise MemberError(f"{member.name} is damaged: its checksum differs.")
+            raise DatasetError(f"{member.name} is damaged: its checksum differs.")
         return content
 
 
@@ -268,7 +268,7 @@ def _inflate(packed: bytes, member: _Member) -> bytes:
     try:
         return zlib.decompressobj(-zlib.MAX_WBITS).decompress(packed, member.num_bytes + 1)
     except zlib.error:
-        raise MemberError(f"{member.name} is damaged: it cannot be unpacked.") from None
+        raise DatasetError(f"{member.name} is damaged: it cannot be unpacked.") from None
 
 
 def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
@@ -314,7 +314,7 @@ def _list_members(directory: bytes) -> Iterator[_Member]:
     position = 0
     while position < len(directory):
         if len(directory) < position + _ENTRY.size or not directory.startswith(b"PK\1\2", position):
-            raise MemberError("the archive's directory is damaged here.")
+            raise DatasetError("the archive's directory is damaged here.")
         fields = _ENTRY.unpack_from(directory, position)
         flags, method, (checksum, packed, unpacked) = fields[5], fields[6], fields[9:12]
         name_bytes, extra_bytes, comment_bytes, offset = *fields[12:15], fields[18]

@@ -40,8 +40,8 @@ class Dataset:
 
     Raises:
         DatasetError: The folder is no finished data set, a shard is missing, or it has no such task.
-        ShardError: A shard is damaged; raised when it is first read.
-        HubError: The Hub has no such data set, or cannot be reached.
+        DatasetError: A shard is damaged; raised when it is first read.
+        ServerError: The Hub has no such data set, or cannot be reached.
 
     Example:
         >>> dataset = Dataset("demos", tasks=["rotate"])
@@ -233,7 +233,7 @@ def data_folder(path: str | Path, *, shards: bool = True) -> Path:
         The folder. Of one on the Hub only the manifest was checked, as readers check shards.
 
     Raises:
-        HubError: There is no such repository, or it cannot be reached.
+        ServerError: There is no such repository, or it cannot be reached.
         DatasetError: It holds no data set, or its manifest is damaged.
         MissingExtraError: `huggingface_hub` is not installed.
     """
@@ -318,7 +318,7 @@ def find_demonstrations(dataset: Dataset, query: DemonstrationQuery) -> np.ndarr
 
     Raises:
         DatasetError: The data set has no such task.
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     index = dataset.index
     known = dataset.manifest["tasks"]

@@ -36,9 +36,7 @@ from openvima.errors import (
     AssetError,
     DatasetError,
     OpenVimaError,
-    ShardError,
-    UnknownObjectError,
-    UnknownTextureError,
+    UnknownNameError,
 )
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
@@ -72,15 +70,15 @@ def rerender(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonst
         The demonstration with the images that the environment showed when it was recorded.
 
     Raises:
-        ShardError: It is not the same any more: the packages that render are others than those that wrote.
+        DatasetError: It is not the same any more: the packages that render are others than those that wrote.
         AssetError: The asset pack is not there, or is a function that was not loaded before.
-        UnknownObjectError, UnknownTextureError: An object or texture of a user is not registered.
+        UnknownNameError, UnknownNameError: An object or texture of a user is not registered.
     """
     try:
         rasteriser = _rasteriser(info.assets)
         rgb, segm = render_observations(rasteriser, demo.scenes)
         prompt = rasteriser.prompt(sample_prompt(demo, info, rasteriser.assets))
-    except (AssetError, UnknownObjectError, UnknownTextureError):
+    except (AssetError, UnknownNameError):
         raise
     except OpenVimaError as error:  # the task samples no episode for this seed, or is gone
         raise _explain_change(demo, info, f" ({error})") from error
@@ -131,7 +129,7 @@ def _rasteriser(assets: str) -> Rasteriser:
     return Rasteriser(load_assets(recorded_assets(assets)))
 
 
-def _explain_change(demo: Demonstration, info: ShardInfo, details: str = "") -> ShardError:
+def _explain_change(demo: Demonstration, info: ShardInfo, details: str = "") -> DatasetError:
     installed = package_versions()
     others = [
         f"{name} {info.versions.get(name, 'none')} (installed: {installed.get(name, 'none')})"
@@ -143,7 +141,7 @@ def _explain_change(demo: Demonstration, info: ShardInfo, details: str = "") -> 
     )
     if others:
         versions = f"{', '.join(others)}; read it with those, or generate it again"
-    return ShardError(
+    return DatasetError(
         f"{demo.task} of seed {demo.seed} is stored without images and cannot be rerendered identically"
         f"{details}. It was written with {versions}."
     )

@@ -21,7 +21,7 @@ from openvima.atomic_io import NO_SPACE, atomic_write
 from openvima.data.encoding import ShardInfo, Skipped, decode, decode_actions, decode_columns, encode
 from openvima.data.records import Demonstration, Step, make_columns, planes
 from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION, VIEWS
-from openvima.errors import DatasetError, ShardError, unknown_name
+from openvima.errors import DatasetError, unknown_name
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS
 
 # What Arrow raises when it is given damaged bytes.
@@ -95,7 +95,7 @@ def measure(path: Path) -> tuple[Envelope, list[Span]]:
     """Find the parts of a whole shard and their checksums.
 
     Raises:
-        ShardError: It is no chain of records.
+        DatasetError: It is no chain of records.
     """
     content, ends = map_file(path), []
     try:
@@ -105,9 +105,9 @@ def measure(path: Path) -> tuple[Envelope, list[Span]]:
                 while pa.ipc.read_message(file):
                     ends.append(file.tell())
     except (pa.ArrowInvalid, OSError) as error:
-        raise ShardError(f"{path}: {str(error).splitlines()[0]}") from None
+        raise DatasetError(f"{path}: {str(error).splitlines()[0]}") from None
     if not ends:
-        raise ShardError(f"{path}: it ends before its schema")
+        raise DatasetError(f"{path}: it ends before its schema")
     spans = [
         Span(start, end - start, zlib.crc32(content[start:end])) for start, end in itertools.pairwise(ends)
     ]
@@ -136,7 +136,7 @@ class Shard:
         envelope: Checksum of all that surrounds the records, as the folder's manifest holds it.
 
     Raises:
-        ShardError: It is missing, truncated, damaged, or no shard of this package.
+        DatasetError: It is missing, truncated, damaged, or no shard of this package.
     """
 
     def __init__(self, path: Path, envelope: Envelope | None = None) -> None:
@@ -144,7 +144,7 @@ class Shard:
         try:
             self._content = map_file(path)
         except FileNotFoundError:
-            raise ShardError(f"there is no file {path}. {remedy(path.parent)}") from None
+            raise DatasetError(f"there is no file {path}. {remedy(path.parent)}") from None
         except DAMAGE_ERRORS as error:
             raise self._damage("it", error) from None
         if envelope is not None and (fault := envelope.fault_in(self._content)):
@@ -178,8 +178,8 @@ class Shard:
 
         try:
             return rerender(demo, self.info, batch.column("content_hash")[0].as_py())
-        except ShardError as error:
-            raise ShardError(f"{self.path}, record {row}: {error}") from None
+        except DatasetError as error:
+            raise DatasetError(f"{self.path}, record {row}: {error}") from None
 
     def read(self, row: int, columns: Sequence[str]) -> dict[str, Any]:
         """Read some columns of one row; nothing is decompressed for the others.
@@ -194,7 +194,7 @@ class Shard:
 
         Raises:
             DatasetError: There is no such column.
-            ShardError: The row is damaged.
+            DatasetError: The row is damaged.
         """
         batch = self._read_batch(row, (*columns, "steps") if "poses" in columns else columns)
         try:
@@ -218,7 +218,7 @@ class Shard:
         Raises:
             IndexError: The episode has fewer steps.
             DatasetError: There is no such view.
-            ShardError: The row is damaged.
+            DatasetError: The row is damaged.
         """
         for view in views:
             if view not in VIEWS:
@@ -242,7 +242,7 @@ class Shard:
 
         Raises:
             IndexError: There are fewer rows.
-            ShardError: It is damaged.
+            DatasetError: It is damaged.
         """
         return self._read_batch(row, COLUMNS.names)
 
@@ -254,7 +254,7 @@ class Shard:
             span: Where the index says that it lies.
 
         Raises:
-            ShardError: They are damaged.
+            DatasetError: They are damaged.
         """
         if fault := span.fault_in(self._content):
             raise self._row_damage(row, fault)
@@ -288,7 +288,7 @@ class Shard:
 
         Raises:
             DatasetError: There is no such column.
-            ShardError: The file is damaged, or has other columns.
+            DatasetError: The file is damaged, or has other columns.
         """
         key = tuple(dict.fromkeys(columns))
         if key not in self._readers:
@@ -304,23 +304,23 @@ class Shard:
                 raise self._damage("it", error) from None
             try:
                 self._info = self._info or ShardInfo.from_metadata(reader.schema.metadata)
-            except ShardError as error:
-                raise ShardError(f"{self.path}: {error}") from None
+            except DatasetError as error:
+                raise DatasetError(f"{self.path}: {error}") from None
             if not reader.schema.equals(pa.schema([COLUMNS.field(number) for number in numbers])):
-                raise ShardError(
+                raise DatasetError(
                     f"{self.path} has other columns than schema version {SCHEMA_VERSION} asks for."
                 )
             self._readers[key] = reader
         return self._readers[key]
 
-    def _row_damage(self, row: int, error: Exception | str) -> ShardError:
+    def _row_damage(self, row: int, error: Exception | str) -> DatasetError:
         if isinstance(error, OSError) and error.errno in NO_SPACE:
             raise error  # nothing is damaged: Numba keeps what it compiled on a full disk
         return self._damage(f"record {row} of {len(self)}", error)
 
-    def _damage(self, what: str, error: Exception | str) -> ShardError:
+    def _damage(self, what: str, error: Exception | str) -> DatasetError:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        return ShardError(
+        return DatasetError(
             f"{self.path}: {what} is truncated, damaged or no shard ({reason}). {remedy(self.path.parent)}"
         )
 

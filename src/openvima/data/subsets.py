@@ -145,7 +145,7 @@ def sample(
 
     Raises:
         DatasetError: The source is no finished data set, or the folder cannot be used.
-        ShardError: The source is damaged.
+        DatasetError: The source is damaged.
         ConfigError: Neither or both of fraction and number are given, or one is out of range.
     """
     if (fraction is None) == (episodes is None):
@@ -177,7 +177,7 @@ def split(config: SubsetConfig, splits: Splits, *, report: Report | None = None)
 
     Raises:
         DatasetError: The source is not finished, a split would be empty, or the folder cannot be used.
-        ShardError: The source is damaged.
+        DatasetError: The source is damaged.
     """
     check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
@@ -358,7 +358,7 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
     Raises:
         DatasetError: A source is no finished data set, an episode occurs more than once, or the folder cannot
             be used.
-        ShardError: A source is damaged.
+        DatasetError: A source is damaged.
     """
     if not config.sources:
         raise DatasetError("there is nothing to merge; name at least one data set.")

@@ -118,8 +118,8 @@ def summarise_folder(folder: str | Path, *, details: bool = False, report: Repor
 
     Raises:
         DatasetError: There is no data set, or it is damaged.
-        ShardError: A shard is damaged.
-        HubError: The Hub has no such data set, or cannot be reached.
+        DatasetError: A shard is damaged.
+        ServerError: The Hub has no such data set, or cannot be reached.
     """
     index_only = dataset_name(folder) is not None and not details
     folder = data_folder(folder, shards=not index_only)

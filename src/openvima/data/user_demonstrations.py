@@ -196,7 +196,7 @@ def _open_own_shards(folder: Path) -> list[Shard]:
 
     Raises:
         DatasetError: It holds other data than recorded demonstrations.
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     shards = [Shard(path) for path in sorted(folder.glob("*.arrow"))]
     made_by = read_manifest(folder)["command"] if (folder / MANIFEST_NAME).is_file() else COMMAND

@@ -29,7 +29,7 @@ from openvima.data.reader import explain_missing
 from openvima.data.records import package_versions
 from openvima.data.replay import ReplayTask, replay_shard
 from openvima.data.shard import Shard, remedy
-from openvima.errors import AssetError, ConfigError, DatasetError, OpenVimaError, ShardError, echo
+from openvima.errors import AssetError, ConfigError, DatasetError, OpenVimaError, echo
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, check_workers, imap_unordered
 from openvima.user_code import is_code
@@ -346,7 +346,7 @@ def check_shard(task: _ShardTask, count: Callable[[int], None]) -> _Checked:
     try:
         shard = Shard(task.path)
         hashes = shard.table(["content_hash"]).column(0).to_pylist()
-    except ShardError as error:
+    except DatasetError as error:
         return _Checked([_bare_cause(error, task.path)])
     faults = list(_find_record_faults(shard, hashes, count))
     causes = _by_cause(((row, cause) for row, cause, _ in faults), len(shard))
@@ -367,7 +367,7 @@ def _find_record_faults(
     for row, content_hash in enumerate(hashes):
         try:
             demo = shard[row]
-        except ShardError as error:
+        except DatasetError as error:
             yield row, _bare_cause(error, shard.path), shard.info.images
             continue
         except OpenVimaError as error:  # the asset pack that its images need is not there

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from openvima.detector.config import DETECTORS, BackboneConfig, DetectorConfig, detector_config
-from openvima.errors import CheckpointError
+from openvima.errors import InputFileError
 from openvima.input_files import as_path
 
 if TYPE_CHECKING:
@@ -23,12 +23,12 @@ def detector_folder(folder: str | Path | None = None) -> Path:
     """Return the folder of a trained detector; None is the bundled one.
 
     Raises:
-        CheckpointError: There is no such folder.
+        InputFileError: There is no such folder.
     """
     path = BUNDLED if folder is None else as_path(folder)
     if path.is_dir():
         return path
-    raise CheckpointError(
+    raise InputFileError(
         f"there is no folder {path}; `openvima detector train --data DIR --out RUN` makes one."
     )
 
@@ -42,7 +42,7 @@ def load_detector(folder: str | Path | None = None, **options: Any) -> "FrameDet
         **options: Of `FrameDetector`, such as `device`.
 
     Raises:
-        CheckpointError: There is no checkpoint, or it is damaged.
+        InputFileError: There is no checkpoint, or it is damaged.
         MissingExtraError: torch is not installed.
     """
     from openvima.policies.base import require_torch

@@ -22,7 +22,7 @@ from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
 from openvima.detector.config import DetectorConfig, resnet50
 from openvima.detector.layers import BOX_WEIGHTS, PROPOSAL_WEIGHTS
 from openvima.detector.network import MaskRCNN
-from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.errors import ConfigError, InputFileError
 from openvima.policies.config_fields import check_limits
 from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
 from openvima.policies.nn.layers import MetaInit
@@ -45,7 +45,7 @@ def save_network(network: MaskRCNN, folder: str | Path) -> None:
     """Write a checkpoint folder atomically; an existing checkpoint is replaced.
 
     Raises:
-        CheckpointError: The folder contains other files.
+        InputFileError: The folder contains other files.
     """
     folder = Path(folder)
     check_replaceable(folder, (WEIGHTS_FILE, CONFIG_FILE))
@@ -79,7 +79,7 @@ def load_network(path: str | Path) -> MaskRCNN:
         path: A checkpoint folder, or a run folder, whose best checkpoint is loaded.
 
     Raises:
-        CheckpointError: There is none, it is damaged, or weights and config do not match.
+        InputFileError: There is none, it is damaged, or weights and config do not match.
     """
     path = Path(path)
     restore_folder(path)
@@ -92,20 +92,20 @@ def read_config(folder: Path) -> DetectorConfig:
     """Read the config of a checkpoint.
 
     Raises:
-        CheckpointError: There is no config, or it is invalid.
+        InputFileError: There is no config, or it is invalid.
     """
     file, values = folder / CONFIG_FILE, read_description(folder, _KIND)
     try:
         return DetectorConfig.from_dict(values["config"])
     except ConfigError as error:
-        raise CheckpointError(f"{file}: {error}") from error
+        raise InputFileError(f"{file}: {error}") from error
 
 
 def load_weights(network: MaskRCNN, file: Path) -> None:
     """Load the weights of a file into a network.
 
     Raises:
-        CheckpointError: The file is missing or damaged, or names or shapes differ.
+        InputFileError: The file is missing or damaged, or names or shapes differ.
     """
     tensors = read_safetensors(file)
     _check(network, tensors, source=file)
@@ -116,7 +116,7 @@ def build_network(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *
     """Build a network of weights, in evaluation mode.
 
     Raises:
-        CheckpointError: Config and weights do not match, or describe no network.
+        InputFileError: Config and weights do not match, or describe no network.
     """
     try:
         with MetaInit():  # takes no memory, whatever the config says
@@ -124,7 +124,7 @@ def build_network(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *
     except MemoryError:
         raise
     except Exception as error:  # sizes within their limits can contradict each other in many ways
-        raise CheckpointError(f"the config of {source} describes no network: {error}") from error
+        raise InputFileError(f"the config of {source} describes no network: {error}") from error
     _check(outline, tensors, source=source)
     network = MaskRCNN(config)
     network.load_state_dict(tensors, strict=False)
@@ -136,7 +136,7 @@ def _check(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, source: Pa
     given = {name: tensor for name, tensor in tensors.items() if not name.endswith(_COUNTER)}
     problems = mismatches(given, expected, limit=_MAX_LISTED)
     if problems:
-        raise CheckpointError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
+        raise InputFileError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
 
 
 _CLASS_WEIGHTS = "roi_heads.box_predictor.cls_score.weight"
@@ -208,7 +208,7 @@ def load_detectron2(file: str | Path) -> MaskRCNN:
         The network in float32, in evaluation mode.
 
     Raises:
-        CheckpointError: The file is missing, damaged or no checkpoint, it contains code, or its weights or
+        InputFileError: The file is missing, damaged or no checkpoint, it contains code, or its weights or
             settings belong to another architecture.
     """
     file = Path(file)
@@ -218,7 +218,7 @@ def load_detectron2(file: str | Path) -> MaskRCNN:
         config = detectron2_config(weights, settings if isinstance(settings, Mapping) else None)
         check_limits(config, "detector")
     except (TypeError, ValueError, LookupError, RuntimeError) as error:  # settings may be anything
-        raise CheckpointError(f"{file} contains invalid settings: {error}") from error
+        raise InputFileError(f"{file} contains invalid settings: {error}") from error
     tensors = from_detectron2(weights)
     check_finite(tensors, file)
     return build_network(config, tensors, source=file)
@@ -235,10 +235,10 @@ def detectron2_config(
         settings: Detectron2's nested config; missing values have Detectron2's defaults.
 
     Raises:
-        CheckpointError: The weights are not a Mask R-CNN's, or a setting is not supported.
+        InputFileError: The weights are not a Mask R-CNN's, or a setting is not supported.
     """
     if _CLASS_WEIGHTS not in weights:
-        raise CheckpointError(f"there are no weights {_CLASS_WEIGHTS}; a Mask R-CNN of Detectron2 has them.")
+        raise InputFileError(f"there are no weights {_CLASS_WEIGHTS}; a Mask R-CNN of Detectron2 has them.")
     config = replace(
         resnet50(), num_classes=len(weights[_CLASS_WEIGHTS]) - 1, **_translate_settings(settings or {})
     )
@@ -264,7 +264,7 @@ def _translate_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     for path, expected in _FIXED.items():
         value = _setting(settings, path)
         if value is not None and _as_list(value) != _as_list(expected):
-            raise CheckpointError(f"{path} is {short(value)}; only {expected!r} is supported.")
+            raise InputFileError(f"{path} is {short(value)}; only {expected!r} is supported.")
     chosen = {
         own: value for path, own in _SETTINGS.items() if (value := _setting(settings, path)) is not None
     }
@@ -273,7 +273,7 @@ def _translate_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
             chosen[name] = tuple(float(number) for number in chosen[name])
     if "anchor_sizes" in chosen:
         if any(len(sizes) != 1 for sizes in chosen["anchor_sizes"]):
-            raise CheckpointError(
+            raise InputFileError(
                 f"anchors have sizes {short(chosen['anchor_sizes'])}; only one per level is supported."
             )
         chosen["anchor_sizes"] = tuple(float(sizes[0]) for sizes in chosen["anchor_sizes"])
@@ -318,27 +318,27 @@ def _class_of_settings(module: str) -> type:
 
 def _values_in(file: Path) -> Mapping[str, Any]:
     if not file.exists():
-        raise CheckpointError(f"there is no file {file}.")
+        raise InputFileError(f"there is no file {file}.")
     try:
         values = read_archive(file, classes=[*map(_class_of_settings, _CLASSES_OF_SETTINGS)])
     except InputFileError as error:
-        raise CheckpointError(
+        raise InputFileError(
             f"{error} Nothing in it was executed. Give a .pth file of torch; of a training checkpoint, save "
             'only the entry "model".'
         ) from error
     if not isinstance(values, Mapping):
-        raise CheckpointError(f"{file} contains a {type(values).__name__} instead of weights by name.")
+        raise InputFileError(f"{file} contains a {type(values).__name__} instead of weights by name.")
     return values
 
 
 def _weights_in(values: Mapping[str, Any], file: Path) -> dict[str, torch.Tensor]:
     values = values.get("model", {name: value for name, value in values.items() if name != "cfg"})
     if not isinstance(values, Mapping) or not values:
-        raise CheckpointError(f"{file} contains no weights by name.")
+        raise InputFileError(f"{file} contains no weights by name.")
     tensors = {
         str(name): torch.from_numpy(value) if isinstance(value, np.ndarray) else value
         for name, value in values.items()
     }
     if others := [name for name, value in tensors.items() if not isinstance(value, torch.Tensor)]:
-        raise CheckpointError(f"{file} contains more than weights: {', '.join(others[:5])}.")
+        raise InputFileError(f"{file} contains more than weights: {', '.join(others[:5])}.")
     return tensors

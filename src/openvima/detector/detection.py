@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from openvima.errors import DetectionError, PolicyError, ShapeError
+from openvima.errors import PolicyError, ShapeError
 from openvima.perception.objects import (
     FRONT,
     MIN_PIXELS,
@@ -48,7 +48,7 @@ class Detections:
 
     Raises:
         ShapeError: An array has another shape or dtype.
-        DetectionError: A box ends before it begins, or a score is not a finite number.
+        ShapeError: A box ends before it begins, or a score is not a finite number.
     """
 
     boxes: np.ndarray
@@ -71,10 +71,10 @@ class Detections:
         if scores is not None and (scores.dtype.kind not in "iuf" or scores.shape != (count,)):
             raise ShapeError(f"scores are {scores.dtype} {scores.shape}; they must be numbers ({count},).")
         if scores is not None and not np.isfinite(scores).all():
-            raise DetectionError(f"scores are {scores.tolist()}; they must be finite.")
+            raise ShapeError(f"scores are {scores.tolist()}; they must be finite.")
         wrong = np.flatnonzero((boxes[:, 2:] < boxes[:, :2]).any(axis=1))
         if len(wrong):
-            raise DetectionError(
+            raise ShapeError(
                 f"box {wrong[0]} is {boxes[wrong[0]].tolist()}; its last column and row must not come before "
                 "its first."
             )
@@ -109,7 +109,7 @@ class Detections:
 
         Raises:
             ShapeError: `edges` is not of shape (N, 4).
-            DetectionError: An edge is not a finite number, or a box lies outside the image or ends before
+            ShapeError: An edge is not a finite number, or a box lies outside the image or ends before
                 it begins.
         """
         edges = np.asarray(edges, np.float64)
@@ -120,7 +120,7 @@ class Detections:
         ordered = (edges[:, 2:] >= edges[:, :2]).all(axis=1)
         wrong = ~(inside & ordered & np.isfinite(edges).all(axis=1))
         if wrong.any():
-            raise DetectionError(
+            raise ShapeError(
                 f"box {edges[wrong][0].tolist()} lies outside the image of {width} × {height} pixels, or "
                 "ends before it begins."
             )
@@ -193,7 +193,7 @@ class DetectedObjects:
         Raises:
             PolicyError: A view is missing.
             ShapeError: An image or a detection has another shape or dtype.
-            DetectionError: A detection lies outside the image.
+            ShapeError: A detection lies outside the image.
         """
         return self._extract(_Pair.of_observation(observation))
 
@@ -206,7 +206,7 @@ class DetectedObjects:
         Raises:
             PolicyError: A view is missing.
             ShapeError: An image or a detection has another shape or dtype.
-            DetectionError: A detection lies outside the image.
+            ShapeError: A detection lies outside the image.
         """
         if self.prompt_extractor is not None:
             return self.prompt_extractor.in_prompt_image(image)
@@ -220,7 +220,7 @@ class DetectedObjects:
             images: What `in_prompt_image` will be asked for.
 
         Raises:
-            PolicyError, ShapeError, DetectionError: As those methods.
+            PolicyError, ShapeError, ShapeError: As those methods.
         """
         pairs = [_Pair.of_observation(each) for each in observations]
         if self.prompt_extractor is None:
@@ -393,7 +393,7 @@ def _check_within(found: Detections, shape: tuple[int, ...], view: View) -> None
     outside = (found.boxes < 0) | (found.boxes >= [width, height, width, height])
     if outside.any():
         number = int(np.flatnonzero(outside.any(axis=1))[0])
-        raise DetectionError(
+        raise ShapeError(
             f"box {number} of view {view!r} is {found.boxes[number].tolist()}; columns must lie in "
             f"0 … {width - 1} and rows in 0 … {height - 1}."
         )

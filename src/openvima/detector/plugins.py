@@ -49,7 +49,7 @@ def extractor_maker(source: str) -> Callable[[], object]:
 
     Raises:
         ConfigError: There is no such module, file or function.
-        CheckpointError: There is no trained detector.
+        InputFileError: There is no trained detector.
     """
     folder = _folder_of(source)
     if folder is not None:
@@ -65,7 +65,7 @@ def plugged_extractor(source: str) -> ObjectExtractor:
 
     Raises:
         ConfigError: There is no such function, or it returns something else.
-        CheckpointError: There is no trained detector, or it is damaged.
+        InputFileError: There is no trained detector, or it is damaged.
     """
     extractor = extractor_maker(source)()
     if not (hasattr(extractor, "in_observation") and hasattr(extractor, "in_prompt_image")):
@@ -94,7 +94,7 @@ def plugged_boxes(source: str, *, fraction: float = 1.0) -> Boxes:
 
     Raises:
         ConfigError: There is no such function.
-        CheckpointError: There is no trained detector, or it is damaged.
+        InputFileError: There is no trained detector, or it is damaged.
     """
     folder = _folder_of(source)
     if folder is not None:

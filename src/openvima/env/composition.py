@@ -281,7 +281,7 @@ class Composition:
         """Compose the episode.
 
         Raises:
-            SceneError, UnknownObjectError, UnknownTextureError: As for `compose`.
+            SceneError, UnknownNameError, UnknownNameError: As for `compose`.
         """
         composed = compose(
             list(self.objects),
@@ -319,7 +319,7 @@ class Composition:
 
         Raises:
             SceneError: The position is not free, or none is.
-            UnknownObjectError, UnknownTextureError: The catalogue has no such object or texture.
+            UnknownNameError, UnknownNameError: The catalogue has no such object or texture.
         """
         taken = {each.name for each in self.objects} | {*self.images}
         letters = "abcdefghijklmnopqrstuvwxyz"

@@ -31,7 +31,7 @@ def make(task: str, **options: object) -> "TabletopEnv":
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: The task is not defined at the level.
+        ConfigError: The task is not defined at the level.
         ConfigError: An option is unknown or its value invalid.
 
     Example:

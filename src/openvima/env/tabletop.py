@@ -136,7 +136,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: The task is not defined at the level.
+        ConfigError: The task is not defined at the level.
         ConfigError: The domain, the prompts, the render mode, a modality, the control or an option of the
             task is invalid, or the task has no text form.
     """

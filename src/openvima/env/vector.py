@@ -65,7 +65,7 @@ def make_vec(
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: A task is not defined at the level.
+        ConfigError: A task is not defined at the level.
         ConfigError: A number, a mode, an option or a seed is invalid, or sub-environments differ in their
             spaces.
         WorkerError: A worker ended while it started.

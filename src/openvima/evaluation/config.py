@@ -15,7 +15,7 @@ from typing import Literal
 from openvima.catalog.packs import ASSET_PACKS, load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.errors import ConfigError, LevelError, brief_repr, unknown_name
+from openvima.errors import ConfigError, brief_repr, unknown_name
 from openvima.evaluation.ablations import (
     ABLATIONS,
     DETECTED_BOXES,
@@ -332,13 +332,13 @@ def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: There is no such level, or none of the levels holds a task that was named.
+        ConfigError: There is no such level, or none of the levels holds a task that was named.
         ConfigError: No level holds any of the tasks, one that was named has no text form, which the
             prompts need, a task option does not fit, or the ablation applies to none of the tasks.
     """
     for level in config.levels:
         if level not in LEVELS:
-            raise LevelError(unknown_name("level", level, LEVELS))
+            raise ConfigError(unknown_name("level", level, LEVELS))
     if is_code(config.env_config.assets):
         load_assets(config.env_config.assets)  # registers objects of the tasks that are sampled below
     prompts = config.env_config.prompts
@@ -359,7 +359,7 @@ def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]
     stranded = [task for task in tasks if task not in {task for task, _ in pairs}]
     if stranded and "all" not in config.tasks:
         where = "; ".join(f"{task} exists at {', '.join(task_spec(task).levels)}" for task in stranded)
-        raise LevelError(f"nothing to play at {asked}: {where}. Change --levels or leave the task out.")
+        raise ConfigError(f"nothing to play at {asked}: {where}. Change --levels or leave the task out.")
     if not pairs:
         raise ConfigError(f"{asked} hold none of the tasks; `openvima tasks` shows the levels of each task.")
     check_task_options(tuple(dict.fromkeys(task for task, _ in pairs)), config.env_config.task_options)

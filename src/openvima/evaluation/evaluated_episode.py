@@ -54,7 +54,7 @@ class EvaluatedEpisode:
 
         Raises:
             PolicyError: Nobody knows where the policy is, or the detector is code, which is not trusted.
-            UnknownPolicyError, CheckpointError, ServerError: As for `load_rollout_policy`.
+            UnknownPolicyError, InputFileError, ServerError: As for `load_rollout_policy`.
         """
         if not self.batch.source:
             raise PolicyError(

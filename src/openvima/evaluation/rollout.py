@@ -7,7 +7,6 @@ from openvima.env.tabletop import TabletopEnv
 from openvima.errors import (
     ActionError,
     AnswerError,
-    DetectionError,
     OpenVimaError,
     OracleError,
     PolicyError,
@@ -27,7 +26,7 @@ NO_GOALS = "the step limit is reached; the episode has no goals"
 OUT_OF_STEPS = "not done within the step limit"
 NO_ORACLE_ACTION = "the oracle has no action"
 # What one prompt or observation may cause, unlike a lost server or a missing package.
-_OF_EPISODES = (PolicyError, PromptError, DetectionError, ShapeError, ActionError)
+_OF_EPISODES = (PolicyError, PromptError, ShapeError, ShapeError, ActionError)
 
 
 class EpisodeSlot:

@@ -259,7 +259,7 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = Fals
 
     Raises:
         UnknownPolicyError: There is no such policy or run folder.
-        CheckpointError: The checkpoint is damaged.
+        InputFileError: The checkpoint is damaged.
         ConfigError: There is no such detector.
         ServerError: No policy server answers at the address.
     """
@@ -318,7 +318,7 @@ def load_own_rollout_policy(
         seed: Of the sampling.
 
     Raises:
-        UnknownPolicyError, CheckpointError, ConfigError, ServerError: As for `load_rollout_policy`.
+        UnknownPolicyError, InputFileError, ConfigError, ServerError: As for `load_rollout_policy`.
     """
     PolicySource(source, source, trust_code).check()
     if source == ORACLE:

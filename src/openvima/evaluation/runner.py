@@ -439,7 +439,7 @@ def score(
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: There is no such level, or none of the levels holds a task that was named.
+        ConfigError: There is no such level, or none of the levels holds a task that was named.
         ConfigError: There is no episode, or the name of a policy, a task option or an ablation does not fit.
         PolicyError: A policy lacks a method, or never acts in its first batch: it raises, or gives something
             else than an action for each episode.

@@ -370,7 +370,7 @@ def play(
         Actions, outcome and final scene.
 
     Raises:
-        UnknownPolicyError, CheckpointError, ServerError: There is no such policy.
+        UnknownPolicyError, InputFileError, ServerError: There is no such policy.
         PolicyError: The policy has no `reset` and `act`, or gives no action.
         InputFileError, SceneError: The episode's file is not valid.
         OracleError: The oracle has no goals to pursue.

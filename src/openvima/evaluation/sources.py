@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
+from openvima.errors import ConfigError, InputFileError, UnknownPolicyError, echo
 from openvima.input_files import expand_home, open_regular
 from openvima.policies.base import Policy
 from openvima.policies.loading import (
@@ -119,7 +119,7 @@ class PolicySource:
         Raises:
             ConfigError: As for `check`, or a function raises.
             UnknownPolicyError: As for `check`.
-            CheckpointError: The run folder, or the package, holds no weights.
+            InputFileError: The run folder, or the package, holds no weights.
             PolicyError: A folder here is named like a bundled checkpoint and holds a checkpoint, too.
             ServerError: No policy server answers at the address.
         """
@@ -185,13 +185,13 @@ def weights_hash(source: str | Path) -> str:
     """SHA-256 over the weights that a folder, file, name or id on the Hub stands for, as hexadecimal text.
 
     Raises:
-        CheckpointError: There is no such folder or file, it holds no weights, or the Hub does not give it.
+        InputFileError: There is no such folder or file, it holds no weights, or the Hub does not give it.
     """
     found = find_checkpoint(source)
     files = [found] if found.is_file() else sorted(found.iterdir())
     files = [file for file in files if file.suffix in _WEIGHTS and file.stem != "optimizer"]
     if not files:
-        raise CheckpointError(f"{source} holds no weights; give the folder of a training run.")
+        raise InputFileError(f"{source} holds no weights; give the folder of a training run.")
     digest = hashlib.sha256()
     for file in files:
         with open_regular(file) as stream:

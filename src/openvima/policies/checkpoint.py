@@ -15,7 +15,7 @@ import yaml
 
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import ConfigError, InputFileError
 from openvima.input_files import as_path
 from openvima.policies.build import PolicyConfig, config_from_dict, config_to_dict, outline_network
 from openvima.policies.naming import CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE, find_checkpoint
@@ -79,7 +79,7 @@ def save_checkpoint(
             loaded as float32.
 
     Raises:
-        CheckpointError: The folder holds other files, the precision is not supported, or a weight overflows
+        InputFileError: The folder holds other files, the precision is not supported, or a weight overflows
             it.
     """
     folder = as_path(folder)
@@ -102,7 +102,7 @@ def write_checkpoint(
     """
     precision = described(dtype)
     if precision not in _PRECISIONS:
-        raise CheckpointError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
+        raise InputFileError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
     weights = network.state_dict() if weights is None else weights
     tensors = {name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in weights.items()}
     _check_range(tensors, weights)
@@ -133,7 +133,7 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
         The network in evaluation mode, in the precision of the stored weights, or in float32 for float16.
 
     Raises:
-        CheckpointError: A file is missing or unreadable, or weights and config do not match.
+        InputFileError: A file is missing or unreadable, or weights and config do not match.
     """
     folder = as_path(folder)
     restore_folder(folder)
@@ -142,7 +142,7 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     tensors = _read_weights(folder / WEIGHTS_FILE)
     _check(network, tensors, source=str(folder / WEIGHTS_FILE))
     if info.digest and info.digest != file_digest(folder / WEIGHTS_FILE):
-        raise CheckpointError(
+        raise InputFileError(
             f"{folder / WEIGHTS_FILE} is damaged: its digest is not the one in {CONFIG_FILE}. Take another "
             "checkpoint, or delete the line `digest` if you changed the weights on purpose."
         )
@@ -155,17 +155,17 @@ def read_info(folder: Path) -> CheckpointInfo:
     """Read the config of a checkpoint without its weights.
 
     Raises:
-        CheckpointError: The config is missing or invalid.
+        InputFileError: The config is missing or invalid.
     """
     file, values = folder / CONFIG_FILE, read_description(folder, _KIND)
     precision = values.get("precision", "float32")
     if not isinstance(precision, str) or precision not in _PRECISIONS:
-        raise CheckpointError(f"{file}: precision is {short(precision)}; allowed: {', '.join(_PRECISIONS)}.")
+        raise InputFileError(f"{file}: precision is {short(precision)}; allowed: {', '.join(_PRECISIONS)}.")
     try:
         config = config_from_dict(values["config"])
         return CheckpointInfo(config, _PRECISIONS[precision], str(values.get("digest", "")))
     except ConfigError as error:
-        raise CheckpointError(f"{file}: {error}") from error
+        raise InputFileError(f"{file}: {error}") from error
 
 
 def load_network(path_or_hub_id: str | Path) -> tuple[PolicyNetwork, Path | None]:
@@ -175,7 +175,7 @@ def load_network(path_or_hub_id: str | Path) -> tuple[PolicyNetwork, Path | None
         The network, and the folder of its stored tokenizer; None if it uses T5 and that is not stored.
 
     Raises:
-        CheckpointError: There is no such folder, or it holds no readable checkpoint.
+        InputFileError: There is no such folder, or it holds no readable checkpoint.
     """
     found = find_checkpoint(path_or_hub_id)
     if found.is_file():
@@ -189,7 +189,7 @@ def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, s
     """Copy weights into a network.
 
     Raises:
-        CheckpointError: Names, shapes or dtypes differ; one message lists all differences.
+        InputFileError: Names, shapes or dtypes differ; one message lists all differences.
     """
     _check(model, tensors, source=source)
     model.load_state_dict(tensors)
@@ -197,7 +197,7 @@ def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, s
 
 def _check(network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:
     if problems := mismatches(tensors, network.state_dict(), limit=_MAX_LISTED):
-        raise CheckpointError(
+        raise InputFileError(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
             "Use the config that was written with the weights."
         )
@@ -213,7 +213,7 @@ def _check_range(stored: Mapping[str, torch.Tensor], weights: Mapping[str, torch
     if overflown:
         dtype = stored[overflown[0]].dtype
         most = f"weights beyond {torch.finfo(dtype).max:.4g}, the most that {described(dtype)} holds"
-        raise CheckpointError(f"{listed(most, overflown, limit=_MAX_LISTED)[0]}. Store them in float32.")
+        raise InputFileError(f"{listed(most, overflown, limit=_MAX_LISTED)[0]}. Store them in float32.")
 
 
 def _outline(folder: Path, config: PolicyConfig) -> PolicyNetwork:
@@ -223,10 +223,10 @@ def _outline(folder: Path, config: PolicyConfig) -> PolicyNetwork:
     except MemoryError:
         raise
     except Exception as error:  # sizes within their limits can contradict each other in many ways
-        raise CheckpointError(f"{folder / CONFIG_FILE} describes no network: {error}") from error
+        raise InputFileError(f"{folder / CONFIG_FILE} describes no network: {error}") from error
 
 
 def _read_weights(file: Path) -> dict[str, torch.Tensor]:
     if not file.exists():
-        raise CheckpointError(f"{file.parent} is no checkpoint: it holds no {WEIGHTS_FILE}.")
+        raise InputFileError(f"{file.parent} is no checkpoint: it holds no {WEIGHTS_FILE}.")
     return read_safetensors(file)

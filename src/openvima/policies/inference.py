@@ -295,7 +295,7 @@ class NetworkPolicy(Policy):
             **options: Options of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
 
         Raises:
-            CheckpointError: There is no such folder, or it holds no readable checkpoint.
+            InputFileError: There is no such folder, or it holds no readable checkpoint.
             PolicyError: The policy needs the T5 tokenizer, which is neither stored nor given.
         """
         network, stored = load_network(path_or_hub_id)

@@ -109,7 +109,7 @@ def policy_of_run(folder: str | Path, code: LearnerCode, *, device: str = "cpu")
 
     Raises:
         ConfigError: There is no such function, it raises, or the learner has no policy.
-        CheckpointError: The weights are damaged or do not fit.
+        InputFileError: The weights are damaged or do not fit.
         PolicyError: `Learner.policy` returns something else than a policy.
     """
     require_torch(f"the policy in {folder}")
@@ -207,7 +207,7 @@ def load_policy(
     Raises:
         UnknownPolicyError: It is neither a known name, nor a path, nor a possible Hub id; or that of a
             preset, which has no weights.
-        CheckpointError: The folder or file holds no readable checkpoint, or the download failed.
+        InputFileError: The folder or file holds no readable checkpoint, or the download failed.
         ConfigError: There is no such function, or it raises; the run folder names code, which is not trusted;
             or an extractor is given to a policy of your own.
         PolicyError: A function returns something else than a policy; the policy needs the T5 tokenizer,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from openvima.atomic_io import restore_folder
-from openvima.errors import CheckpointError, PolicyError, unknown_name
+from openvima.errors import InputFileError, PolicyError, unknown_name
 from openvima.hub import HubName, fetch, hub_name
 from openvima.input_files import as_path, as_text, read_text
 from openvima.policies.presets import PRESETS, PUBLISHED, check_preset
@@ -82,7 +82,7 @@ def bundled_folder(name: str) -> Path:
 
     Raises:
         PolicyError: A local folder has that name and holds a checkpoint, too.
-        CheckpointError: This installation lacks its weights.
+        InputFileError: This installation lacks its weights.
     """
     # A folder without a checkpoint may have the name, as after
     # `evaluate --policy openvima-small --out openvima-small`.
@@ -93,7 +93,7 @@ def bundled_folder(name: str) -> Path:
         )
     policy = BUNDLED[name]
     if not policy.is_installed:
-        raise CheckpointError(
+        raise InputFileError(
             f"this installation lacks the weights of {name!r}, which belong into {policy.folder}; "
             "reinstall openvima, or give a run folder."
         )
@@ -225,9 +225,9 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
             "owner/policy@v1", which is downloaded.
 
     Raises:
-        CheckpointError: There is no such path, it is the name of a preset, or the installation lacks the
+        InputFileError: There is no such path, it is the name of a preset, or the installation lacks the
             weights.
-        HubError: The download failed.
+        ServerError: The download failed.
         PolicyError: A local folder has the name of a bundled checkpoint and holds a checkpoint, too.
         MissingExtraError: The Hub's client is needed and not installed.
     """
@@ -242,8 +242,8 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
     if repository := hub_name(name):
         return fetch(repository, _HUB_FILES)
     if name in PRESETS:
-        raise CheckpointError(_without_weights(name))
-    raise CheckpointError(
+        raise InputFileError(_without_weights(name))
+    raise InputFileError(
         f"there is no checkpoint at {name}; give a folder, a .ckpt file, owner/name[@revision] or "
         f"{', '.join(BUNDLED)}."
     )
@@ -253,7 +253,7 @@ def hub_commit(source: str) -> str | None:
     """Return the repository and commit of a policy on the Hub, as "owner/name@commit"; None for any other.
 
     Raises:
-        HubError: The download failed.
+        ServerError: The download failed.
     """
     name = None if source in BUNDLED else hub_name(source)
     return None if name is None else str(HubName(name.repo, find_checkpoint(source).name))

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.errors import ConfigError, InputFileError
 from openvima.policies.architectures import flamingo, gato, gpt, vima
 from openvima.policies.build import PolicyConfig, outline_network
 from openvima.policies.config_fields import MAX_WIDTH
@@ -270,7 +270,7 @@ def adapter_of(weights: Iterable[str]) -> PublishedAdapter:
     """Recognise the architecture of weights by their published names.
 
     Raises:
-        CheckpointError: It is none of the four.
+        InputFileError: It is none of the four.
     """
     names = {name.removeprefix(PREFIX) for name in weights}
     if any(name.startswith("obj_encoder.bbox_mlp.") for name in names):
@@ -279,7 +279,7 @@ def adapter_of(weights: Iterable[str]) -> PublishedAdapter:
         return FLAMINGO
     if any(name.startswith("transformer.lm.") for name in names):
         return GPT if "obj_encoder.cropped_img_encoder.vit.cls_token" in names else GATO
-    raise CheckpointError(
+    raise InputFileError(
         "these are no weights of VIMA, VIMA-Gato, VIMA-Flamingo or VIMA-GPT: no name begins with "
         f"obj_encoder.bbox_mlp, {PERCEIVER} or transformer.lm."
     )
@@ -295,7 +295,7 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
         Weights in float32, matrices as (out, in). Unused entries are dropped; unknown names are unchanged.
 
     Raises:
-        CheckpointError: The names are not those of VIMA or one of its baselines.
+        InputFileError: The names are not those of VIMA or one of its baselines.
     """
     adapter = adapter_of(weights)
     result = {}
@@ -319,7 +319,7 @@ def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
         Weights in float32, matrices as they are published. They may share memory with the network.
 
     Raises:
-        CheckpointError: The network has parts that no published policy has.
+        InputFileError: The network has parts that no published policy has.
     """
     adapter = ADAPTERS.get(network.config.architecture, VIMA)
     result, without_name = {}, []
@@ -331,7 +331,7 @@ def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
             name, transposed = renamed
             result[name] = _convert(tensor, transposed)
     if without_name:
-        raise CheckpointError(
+        raise InputFileError(
             f"this network has parts that no published policy has: {', '.join(without_name)}. "
             "Only presets of the form vima-…, gato-…, flamingo-… and gpt-… have published names."
         )
@@ -355,26 +355,23 @@ def load_published(file: str | Path) -> PolicyNetwork:
         The network, in float32 and in evaluation mode.
 
     Raises:
-        CheckpointError: The file is missing, damaged or of another format, it would execute code, or its
+        InputFileError: The file is missing, damaged or of another format, it would execute code, or its
             weights do not match its `cfg`. One message lists missing and unexpected names and wrong shapes,
             up to 20 of each.
     """
     file = Path(file)
     if not file.exists() or file.is_dir():
-        raise CheckpointError(f"{file} is no file. A published checkpoint is a single file such as 2M.ckpt.")
-    try:
-        weights, cfg = _contents(file, read_archive(file))
-    except InputFileError as error:
-        raise CheckpointError(str(error)) from error
+        raise InputFileError(f"{file} is no file. A published checkpoint is a single file such as 2M.ckpt.")
+    weights, cfg = _contents(file, read_archive(file))
     try:
         network = outline_network(config_from_published(weights, cfg))
         _check_fit(network, weights)
         network.load_state_dict(from_published(weights), assign=True)
-    except (CheckpointError, ConfigError) as error:
-        raise CheckpointError(f"{file}: {error}") from error
+    except (InputFileError, ConfigError) as error:
+        raise InputFileError(f"{file}: {error}") from error
     except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
         # Sizes within their limits can contradict each other in many ways.
-        raise CheckpointError(f"{file} describes no network: {error}") from error
+        raise InputFileError(f"{file} describes no network: {error}") from error
     check_finite(network.state_dict(), file)
     return network.eval()
 
@@ -386,7 +383,7 @@ def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapp
     ):
         keys = [short(key).strip("'") for key in values] if isinstance(values, Mapping) else []
         found = listed("the keys", keys, limit=_MAX_LISTED) or [f"a {type(values).__name__}"]
-        raise CheckpointError(
+        raise InputFileError(
             f"{file} holds {found[0]}; a published checkpoint holds the mappings state_dict and cfg. "
             "The number of heads cannot be inferred from weights alone."
         )
@@ -397,7 +394,7 @@ def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapp
         if not isinstance(value, torch.Tensor) or not isinstance(name, str)
     ]
     if others:
-        raise CheckpointError(
+        raise InputFileError(
             f"{file}: state_dict holds more than weights: {', '.join(others[:_MAX_LISTED])}."
         )
     return weights, values["cfg"]
@@ -409,7 +406,7 @@ def _check_fit(network: PolicyNetwork, weights: Mapping[str, torch.Tensor]) -> N
     given = {name: tensor for name, tensor in without_prefix(weights).items() if not is_unused(name)}
     problems = mismatches(given, expected, limit=_MAX_LISTED)
     if problems:
-        raise CheckpointError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
+        raise InputFileError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -441,7 +438,7 @@ def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str,
         The config; as in the paper, words are frozen and the last two layers of T5 are trained.
 
     Raises:
-        CheckpointError: The weights belong to none of the four policies, or `cfg` lacks an entry or
+        InputFileError: The weights belong to none of the four policies, or `cfg` lacks an entry or
             contradicts them.
     """
     adapter = adapter_of(weights)
@@ -463,7 +460,7 @@ def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str,
         )
         return replace(adapter.build(size), decoder=decoder)
     except ConfigError as error:
-        raise CheckpointError(f"the weights give no valid config: {error}") from error
+        raise InputFileError(f"the weights give no valid config: {error}") from error
 
 
 def _decoder(
@@ -482,12 +479,12 @@ def _decoder(
         if given[entry] != value
     ]
     if wrong:
-        raise CheckpointError(f"cfg says {'; '.join(wrong)}. They do not match.")
+        raise InputFileError(f"cfg says {'; '.join(wrong)}. They do not match.")
     try:
         kind = PrefixDecoderConfig if adapter.architecture in ("gato", "gpt") else DecoderConfig
         return kind(width, num_layers, *heads)
     except ConfigError as error:
-        raise CheckpointError(f"cfg is {given}: {error}") from error
+        raise InputFileError(f"cfg is {given}: {error}") from error
 
 
 def _read_cfg(cfg: Mapping[str, object], names: tuple[str, ...]) -> dict[str, int]:
@@ -495,7 +492,7 @@ def _read_cfg(cfg: Mapping[str, object], names: tuple[str, ...]) -> dict[str, in
     numbers = {name: value for name, value in given.items() if type(value) is int and 0 < value <= MAX_WIDTH}
     if numbers.keys() != given.keys():
         wrong = ", ".join(f"{name} {short(value)}" for name, value in given.items() if name not in numbers)
-        raise CheckpointError(
+        raise InputFileError(
             f"cfg has {wrong}; it must hold {', '.join(names)} as whole numbers from 1 to {MAX_WIDTH}."
         )
     return numbers

@@ -5,7 +5,7 @@ Nothing is downloaded unless an id is given.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from openvima.errors import (
-    CheckpointError,
     InputFileError,
     PolicyError,
     PromptError,
@@ -27,7 +26,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published import T5, T5_RULES, to_theirs
 from openvima.policies.sizes import T5_SIZES, t5_name
-from openvima.policies.tensor_files import check_finite, read_archive, read_safetensors
+from openvima.policies.tensor_files import check_finite, mismatches, read_archive, read_safetensors
 from openvima.policies.tokenizer import END_ID, PADDING_ID, UNKNOWN, Tokenizer, Vocabulary, WordTokenizer
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ class T5Tokenizer:
             packages sentencepiece and protobuf), or a name on the Hugging Face Hub such as "t5-base".
 
     Raises:
-        CheckpointError: There is no such tokenizer, or it is not a T5 tokenizer.
+        InputFileError: There is no such tokenizer, or it is not a T5 tokenizer.
         MissingExtraError: A required package is not installed.
     """
 
@@ -120,7 +119,7 @@ def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None)
     Raises:
         PolicyError: The T5 tokenizer is needed and no source is given, or the network has fewer word
             embeddings.
-        CheckpointError: The source has no such tokenizer.
+        InputFileError: The source has no such tokenizer.
         MissingExtraError: A required package is not installed.
     """
     if config.tokenizer == "words":
@@ -156,23 +155,21 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
             `weights_only`), or a name on the Hugging Face Hub such as "t5-base".
 
     Raises:
-        CheckpointError: There are no such weights, they are damaged, or their names or sizes differ.
+        InputFileError: There are no such weights, they are damaged, or their names or sizes differ.
         MissingExtraError: An id is given and huggingface_hub is not installed.
     """
     text = network.config.prompt.text
     named = str(path_or_hub_id).partition("@")[0].rpartition("/")[2]
     if named in T5_SIZES and T5_SIZES[named] != text and not as_path(path_or_hub_id).exists():
-        raise CheckpointError(
+        raise InputFileError(
             f"t5 is {path_or_hub_id}, but the network has {t5_name(text)}; give a T5 1.0 of that size."
         )
     file = _weights_file(path_or_hub_id)
     tensors = _read_encoder(file)
     expected = _expected(network)
-    problems = _differences(tensors, expected)
-    if problems:
-        more = f"; and {len(problems) - _MAX_LISTED} more" if len(problems) > _MAX_LISTED else ""
-        raise CheckpointError(
-            f"{file} does not fit the text encoder: {'; '.join(problems[:_MAX_LISTED])}{more}. "
+    if problems := mismatches(tensors, expected, limit=_MAX_LISTED):
+        raise InputFileError(
+            f"{file} does not fit the text encoder: {'; '.join(problems)}. "
             f"It needs a T5 1.0: {t5_name(text)}."
         )
     for name, tensor in expected.items():
@@ -183,7 +180,7 @@ def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
     folder = _folder(path_or_hub_id, _TOKENIZER_FILES)
     if not any((folder / name).is_file() for name in (_FAST_FILE, _SENTENCEPIECE_FILE)):
         # Without this check transformers would return a vocabulary of special tokens only.
-        raise CheckpointError(f"{path_or_hub_id} holds neither {_FAST_FILE} nor {_SENTENCEPIECE_FILE}.")
+        raise InputFileError(f"{path_or_hub_id} holds neither {_FAST_FILE} nor {_SENTENCEPIECE_FILE}.")
     if not (folder / _FAST_FILE).is_file():
         _require("sentencepiece", f"{folder / _SENTENCEPIECE_FILE}", "sentencepiece protobuf")
     for name in _TOKENIZER_FILES:
@@ -192,7 +189,7 @@ def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
     try:
         tokenizer = transformers.T5TokenizerFast.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # tokenizers raises no narrower one for a damaged file
-        raise CheckpointError(f"{path_or_hub_id} holds no tokenizer that can be read: {error}") from error
+        raise InputFileError(f"{path_or_hub_id} holds no tokenizer that can be read: {error}") from error
     _check_is_t5(tokenizer, str(path_or_hub_id))
     return tokenizer
 
@@ -201,20 +198,17 @@ def _check_size(file: Path) -> None:
     """Refuse what is no regular file, or much larger than the files of T5; it may be missing."""
     if not file.exists():
         return
-    try:
-        with open_regular(file) as stream:
-            num_bytes = stream.seek(0, 2)
-    except InputFileError as error:
-        raise CheckpointError(str(error)) from error
+    with open_regular(file) as stream:
+        num_bytes = stream.seek(0, 2)
     if num_bytes > _MAX_TOKENIZER_BYTES:
-        raise CheckpointError(f"{file} has {num_bytes} bytes; at most {_MAX_TOKENIZER_BYTES} are read.")
+        raise InputFileError(f"{file} has {num_bytes} bytes; at most {_MAX_TOKENIZER_BYTES} are read.")
 
 
 def _check_is_t5(tokenizer: "PreTrainedTokenizerFast", source: str) -> None:
     ids = (tokenizer.pad_token_id, tokenizer.eos_token_id, tokenizer.unk_token_id)
     pieces = tokenizer.backend_tokenizer.encode("Put", add_special_tokens=False).tokens
     if ids != (PADDING_ID, END_ID, _UNKNOWN_ID) or not pieces[0].startswith(_WORD_START):
-        raise CheckpointError(
+        raise InputFileError(
             f"the tokenizer of {source} is not that of T5: padding, end and unknown are {ids} instead of "
             f"{(PADDING_ID, END_ID, _UNKNOWN_ID)}, or words do not begin with {_WORD_START!r}."
         )
@@ -229,27 +223,14 @@ def _expected(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     return expected
 
 
-def _differences(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
-    missing = [f"it lacks {name}" for name in expected if name not in tensors]
-    unknown = [f"it has {name}, which the network lacks" for name in tensors if name not in expected]
-    differing = [
-        f"{name} is {tuple(tensors[name].shape)} instead of {tuple(wanted.shape)}"
-        for name, wanted in expected.items()
-        if name in tensors and tensors[name].shape != wanted.shape
-    ]
-    return differing + missing + unknown
-
-
 def _read_encoder(file: Path) -> dict[str, torch.Tensor]:
     """Load word embedding and encoder, without decoder and language model head."""
     try:
         weights = read_safetensors(file) if file.name == _SAFE_FILE else read_archive(file)
         tensors = {name: weights[name] for name in _of_encoder(weights)}
         check_finite(tensors, file)
-    except CheckpointError:
-        raise
-    except (InputFileError, OSError, TypeError, AttributeError) as error:  # a pickle may hold anything
-        raise CheckpointError(f"{file} holds no weights that can be read ({error}).") from error
+    except (OSError, TypeError, AttributeError) as error:  # a pickle may hold anything
+        raise InputFileError(f"{file} holds no weights that can be read ({error}).") from error
     copy = tensors.pop("encoder.embed_tokens.weight", None)  # the same table under its other name
     return tensors if copy is None else {"shared.weight": copy, **tensors}
 
@@ -263,7 +244,7 @@ def _weights_file(path_or_hub_id: str | Path) -> Path:
         file = _folder(path_or_hub_id, (name,)) / name
         if file.is_file():
             return file
-    raise CheckpointError(f"{path_or_hub_id} holds neither {_SAFE_FILE} nor {_PICKLE_FILE}.")
+    raise InputFileError(f"{path_or_hub_id} holds neither {_SAFE_FILE} nor {_PICKLE_FILE}.")
 
 
 def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
@@ -275,7 +256,7 @@ def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
     if repository is None and (ownerless := _OWNERLESS.fullmatch(name)):
         repository = HubName(*ownerless.groups())
     if folder.exists() or repository is None:
-        raise CheckpointError(f"{name} is no folder, and no name on the Hugging Face Hub such as 't5-base'.")
+        raise InputFileError(f"{name} is no folder, and no name on the Hugging Face Hub such as 't5-base'.")
     return fetch(repository, files)
 
 

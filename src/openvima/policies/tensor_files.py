@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from openvima.atomic_io import FREE_SPACE
-from openvima.errors import CheckpointError, InputFileError, StorageError, echo
+from openvima.errors import InputFileError, StorageError, echo
 from openvima.input_files import one_line, open_regular, read_yaml
 from openvima.policies.naming import CONFIG_FILE
 
@@ -27,13 +27,13 @@ def read_safetensors(file: Path) -> dict[str, torch.Tensor]:
     """Read a safetensors file; tensors are memory-mapped.
 
     Raises:
-        CheckpointError: It is missing, damaged, or holds weights that are not finite.
+        InputFileError: It is missing, damaged, or holds weights that are not finite.
     """
     try:
         open_regular(file).close()
         tensors = load_file(file)
     except (OSError, InputFileError, SafetensorError) as error:
-        raise CheckpointError(f"{file} is damaged ({one_line(error)}). Take another checkpoint.") from error
+        raise InputFileError(f"{file} is damaged ({one_line(error)}). Take another checkpoint.") from error
     check_finite(tensors, file)
     return tensors
 
@@ -102,7 +102,7 @@ def check_finite(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
     """Refuse weights that are NaN or infinite.
 
     Raises:
-        CheckpointError: Some are; the message names them.
+        InputFileError: Some are; the message names them.
     """
     found = [
         name
@@ -112,7 +112,7 @@ def check_finite(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
         and not all(bound.isfinite() for bound in torch.aminmax(_comparable(tensor)))
     ]
     if found:
-        raise CheckpointError(
+        raise InputFileError(
             f"{file}: {listed('weights that are not finite', found, limit=_MAX_LISTED)[0]}. The training "
             "diverged, or the file is damaged; take another checkpoint."
         )
@@ -147,12 +147,12 @@ def check_replaceable(folder: Path, names: Collection[str]) -> None:
     """Check that a folder, whose content a new checkpoint replaces, is a checkpoint and nothing else.
 
     Raises:
-        CheckpointError: It is a file, or holds others than these.
+        InputFileError: It is a file, or holds others than these.
     """
     if folder.is_file():
-        raise CheckpointError(f"{folder} is a file; give the name of a folder.")
+        raise InputFileError(f"{folder} is a file; give the name of a folder.")
     if folder.exists() and (others := sorted({path.name for path in folder.iterdir()} - {*names})):
-        raise CheckpointError(
+        raise InputFileError(
             f"{folder} holds other files than a checkpoint ({', '.join(others[:_MAX_LISTED])}), which would "
             "be lost; give another folder."
         )
@@ -166,17 +166,15 @@ def read_description(folder: Path, kind: str) -> dict[str, Any]:
         kind: Its kind, as the entry "policy" names it.
 
     Raises:
-        CheckpointError: There is none, it cannot be read, or is of another kind.
+        InputFileError: There is none, it cannot be read, or is of another kind.
     """
     file = folder / CONFIG_FILE
     try:
         values = read_yaml(file)
     except FileNotFoundError:
-        raise CheckpointError(f"{folder} is no checkpoint: it holds no {CONFIG_FILE}.") from None
-    except InputFileError as error:
-        raise CheckpointError(str(error)) from error
+        raise InputFileError(f"{folder} is no checkpoint: it holds no {CONFIG_FILE}.") from None
     if not isinstance(values, dict) or values.get("policy") != kind or "config" not in values:
-        raise CheckpointError(f"{file} does not describe a {kind!r} policy.")
+        raise InputFileError(f"{file} does not describe a {kind!r} policy.")
     return values
 
 

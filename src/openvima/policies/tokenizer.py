@@ -21,7 +21,7 @@ import numpy as np
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog import TEXTURES
-from openvima.errors import CheckpointError, InputFileError, PromptError, UnknownWordWarning, echo
+from openvima.errors import InputFileError, PromptError, UnknownWordWarning, echo
 from openvima.input_files import read_json
 
 PADDING_ID, END_ID = 0, 1
@@ -123,21 +123,19 @@ class Vocabulary:
         """Read the `vocabulary.json` of a folder.
 
         Raises:
-            CheckpointError: There is none, or it holds no vocabulary.
+            InputFileError: There is none, or it holds no vocabulary.
         """
         file = folder / VOCABULARY_FILE
         try:
             values = read_json(file, max_bytes=_MAX_FILE_BYTES)
         except FileNotFoundError:
-            raise CheckpointError(f"the checkpoint lacks its vocabulary, {file}.") from None
-        except InputFileError as error:
-            raise CheckpointError(str(error)) from error
+            raise InputFileError(f"the checkpoint lacks its vocabulary, {file}.") from None
         if not isinstance(values, dict) or values.keys() != {"words", "texture_words"}:
-            raise CheckpointError(f"{file} must be a mapping with the keys words and texture_words.")
+            raise InputFileError(f"{file} must be a mapping with the keys words and texture_words.")
         try:
             return Vocabulary(_texts(values["words"]), _texts(values["texture_words"]))
         except PromptError as error:
-            raise CheckpointError(f"{file}: {error}") from error
+            raise InputFileError(f"{file}: {error}") from error
 
     def _content(self) -> str:
         values = {"words": self.words, "texture_words": self.texture_words}

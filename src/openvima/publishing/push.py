@@ -14,12 +14,11 @@ from openvima import __version__
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, fingerprint
 from openvima.data.reader import Dataset
 from openvima.errors import (
-    CheckpointError,
     ConfigError,
-    HubError,
+    DatasetError,
     InputFileError,
     OpenVimaError,
-    ShardError,
+    ServerError,
     echo,
 )
 from openvima.evaluation.results import FILE_NAME, Results
@@ -80,10 +79,10 @@ def push_policy(
         The repository at the new commit, which `load_policy` takes as text.
 
     Raises:
-        CheckpointError: There is no such checkpoint, or it is no checkpoint folder.
+        InputFileError: There is no such checkpoint, or it is no checkpoint folder.
         ConfigError: The results are not of these weights, or the licence is no identifier.
         DatasetError: There are no results, or they are damaged.
-        HubError: The Hub refuses or cannot be reached.
+        ServerError: The Hub refuses or cannot be reached.
         MissingExtraError: torch or `huggingface_hub` is not installed.
     """
     target, files = repository(name), policy_files(source, name, results=results, licence=licence)
@@ -119,7 +118,7 @@ def policy_card(
         Markdown with the metadata of the Hub in front.
 
     Raises:
-        CheckpointError, ConfigError, DatasetError: As for `push_policy`.
+        InputFileError, ConfigError, DatasetError: As for `push_policy`.
     """
     require_torch("reading a checkpoint")
     folder, target = _checkpoint(source), repository(name)
@@ -149,7 +148,7 @@ def policy_card(
 def _checkpoint(source: str | Path) -> Path:
     folder = find_checkpoint(source)
     if not folder.is_dir():
-        raise CheckpointError(
+        raise InputFileError(
             f"{source} is a file; convert it to a checkpoint folder first: `openvima policies convert`."
         )
     return folder
@@ -299,8 +298,8 @@ def push_demonstrations(
 
     Raises:
         DatasetError: The folder is no finished data set.
-        ShardError: A shard is not the one that the manifest describes.
-        HubError: The Hub refuses or cannot be reached.
+        DatasetError: A shard is not the one that the manifest describes.
+        ServerError: The Hub refuses or cannot be reached.
         MissingExtraError: `huggingface_hub` is not installed.
     """
     target, files = repository(name), demonstrations_files(folder, name)
@@ -313,7 +312,7 @@ def demonstrations_files(folder: str | Path, name: str) -> dict[str, Path | byte
     dataset = Dataset(folder)
     for shard, entry in dataset.manifest["shards"].items():
         if fingerprint(dataset.path / shard)["sha256"] != entry["sha256"]:
-            raise ShardError(
+            raise DatasetError(
                 f"{dataset.path / shard} is damaged: its checksum is not that of the manifest. "
                 f"`openvima data verify {shlex.quote(str(dataset.path))}` says more."
             )
@@ -388,11 +387,11 @@ def repository(text: str) -> HubName:
     """Read the name of the repository to push to.
 
     Raises:
-        HubError: It is none.
+        ServerError: It is none.
     """
     name = hub_name(text if text.startswith("hf:") else f"hf://{text}")
     if name is None:
-        raise HubError(f"{text!r} names no repository on the Hub; give OWNER/NAME or OWNER/NAME@BRANCH.")
+        raise ServerError(f"{text!r} names no repository on the Hub; give OWNER/NAME or OWNER/NAME@BRANCH.")
     return name
 
 

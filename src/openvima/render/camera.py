@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from openvima.errors import CameraError, ConfigError, ShapeError
+from openvima.errors import ConfigError, ShapeError
 
 View = Literal["front", "top"]
 VIEWS: tuple[View, View] = ("front", "top")
@@ -116,7 +116,7 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
     Raises:
         ShapeError: The last axis of `points` does not have length 3.
-        CameraError: A point is in or behind the camera plane.
+        ShapeError: A point is in or behind the camera plane.
 
     Example:
         >>> project(np.array([0.5, 0.0, 0.0]), TOP)
@@ -131,7 +131,7 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     behind = away <= 0
     if behind.any():
         first = tuple(float(v) for v in points[behind].reshape(-1, 3)[0])
-        raise CameraError(f"point {first} is behind the {camera.view} camera; give points near the table.")
+        raise ShapeError(f"point {first} is behind the {camera.view} camera; give points near the table.")
     columns = camera.width / 2 + camera.focal_px * right / away
     heights = camera.height / 2 + camera.focal_px * up / away
     return np.stack([columns, camera.height - 1 - heights], axis=-1)

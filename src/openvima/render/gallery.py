@@ -63,7 +63,7 @@ def draw_thumbnail(
         Red, green, blue and opacity, shape (240 · detail, 320 · detail, 4), uint8, row 0 on top.
 
     Raises:
-        UnknownObjectError, UnknownTextureError, AssetError: The pack has no such shape or texture.
+        UnknownNameError, UnknownNameError, AssetError: The pack has no such shape or texture.
     """
     mesh = rasteriser.assets.geometry(object_name, object_spec(object_name).size_max).visual
     texture = rasteriser.assets.texture(texture_name)

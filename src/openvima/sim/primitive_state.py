@@ -80,7 +80,7 @@ def reachable_joints(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray
     Far from the base the arm does not reach its hover height with the tool vertical.
 
     Raises:
-        ReachError: The arm does not reach (x, y) at any height.
+        ActionError: The arm does not reach (x, y) at any height.
     """
     return inverse(x, y, min(z, highest_tip_z(x, y) - REACH_RESERVE_M), yaw_rad)
 

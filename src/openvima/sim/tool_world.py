@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.errors import ReachError
+from openvima.errors import ActionError
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Pose, Scene
 from openvima.scene.action import CONTROL_HZ, HIGHEST_TIP_Z_M, ToolCommand, ToolPose
 from openvima.sim import ur5
@@ -244,7 +244,7 @@ class ToolWorld:
     def _can_reach(self, pose: ToolPose) -> bool:
         try:
             joints = self._joints_at(pose)
-        except ReachError:
+        except ActionError:
             return False
         too_fast = np.abs(joints - self._joints) > MAX_JOINT_SPEED * _PART_S
         return not (too_fast | (np.abs(joints) > ur5.JOINT_LIMITS)).any()

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from openvima.catalog.geometry import Vector3
-from openvima.errors import ReachError, ShapeError
+from openvima.errors import ActionError, ShapeError
 from openvima.scene.scene import Pose, Quaternion, multiply, yaw_quaternion
 
 HOME = np.array([-1.0, -0.5, 0.5, -0.5, -0.5, 0.0]) * math.pi
@@ -101,7 +101,7 @@ def inverse(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
         Shape (6,), float64, radians; joint 1 in [−3π/2, π/2), joint 6 in [−π, π).
 
     Raises:
-        ReachError: The point is too near, too far or too high; the message names the reach.
+        ActionError: The point is too near, too far or too high; the message names the reach.
 
     Example:
         >>> inverse(0.5, 0.0, 0.32, 0.0).round(5)[:3]
@@ -115,7 +115,7 @@ def inverse(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
     reach, height = _plane_point(distance, z)
     length = math.hypot(reach, height)
     if not SHORTEST_REACH_M <= length <= LONGEST_REACH_M or reach <= 0:
-        raise ReachError(
+        raise ActionError(
             f"tip ({x:.4f}, {y:.4f}, {z:.4f}) m needs an arm of {length:.4f} m; it must be "
             f"{SHORTEST_REACH_M:.4f} … {LONGEST_REACH_M:.4f} m with the tool vertical. Lower it or move it "
             f"nearer (`highest_tip_z` gives the limit of the height)."
@@ -148,11 +148,11 @@ def farthest_tip_distance(z: float) -> float:
     """Greatest distance from the base axis at which the vertical tool reaches height `z`; both in metres.
 
     Raises:
-        ReachError: The height is beyond the arm altogether.
+        ActionError: The height is beyond the arm altogether.
     """
     height = z + _HEIGHT_OFFSET_M
     if abs(height) > LONGEST_REACH_M:
-        raise ReachError(f"height {z:.4f} m is out of reach; the arm is {LONGEST_REACH_M:.4f} m long.")
+        raise ActionError(f"height {z:.4f} m is out of reach; the arm is {LONGEST_REACH_M:.4f} m long.")
     return math.hypot(math.sqrt(LONGEST_REACH_M**2 - height**2) + WRIST_M, SIDE_OFFSET_M)
 
 

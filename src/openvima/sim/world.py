@@ -305,7 +305,7 @@ class World:
         compat: Move the spatula straight in joint space, as VIMA-Bench's arm does, and stop it 3 mm earlier.
 
     Raises:
-        UnknownObjectError: An object is not in the catalogue.
+        UnknownNameError: An object is not in the catalogue.
         AssetError: The asset pack lacks a file.
 
     Example:

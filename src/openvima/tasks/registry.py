@@ -21,7 +21,6 @@ from openvima.catalog.partitions import PACKAGE_TASKS, PUBLISHED_LEVELS
 from openvima.catalog.registration import with_registered
 from openvima.errors import (
     ConfigError,
-    LevelError,
     UnknownTaskError,
     brief_repr,
     echo,
@@ -88,20 +87,22 @@ class TaskSpec:
         """Return the level, or the first one of the task for None.
 
         Raises:
-            LevelError: There is no such level, or the task is not defined there.
+            ConfigError: There is no such level, or the task is not defined there.
         """
         for known in self.levels:
             if level is None or level == known:
                 return known
         if level not in LEVELS:
-            raise LevelError(unknown_name("level", str(level), LEVELS))
-        raise LevelError(f"task {self.name!r} is not defined at level {level}; use {', '.join(self.levels)}.")
+            raise ConfigError(unknown_name("level", str(level), LEVELS))
+        raise ConfigError(
+            f"task {self.name!r} is not defined at level {level}; use {', '.join(self.levels)}."
+        )
 
     def pool(self, level: str | None = None) -> Pool:
         """Return the objects and textures at a level, by default the first, registered ones included.
 
         Raises:
-            LevelError: There is no such level, or the task is not defined there.
+            ConfigError: There is no such level, or the task is not defined there.
         """
         level = self.checked_level(level)
         return with_registered(self.pools[level], self.name, level)
@@ -243,10 +244,10 @@ def tasks_of(level: str | None) -> tuple[str, ...]:
     """Names of the tasks that are defined at a level, in alphabetical order; of all for None.
 
     Raises:
-        LevelError: There is no such level.
+        ConfigError: There is no such level.
     """
     if level is not None and level not in LEVELS:
-        raise LevelError(unknown_name("level", level, LEVELS))
+        raise ConfigError(unknown_name("level", level, LEVELS))
     return tuple(task for task in list_tasks() if level is None or level in task_spec(task).levels)
 
 

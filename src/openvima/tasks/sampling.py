@@ -233,7 +233,7 @@ def sample_episode(
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: There is no such level, or the task is not defined there.
+        ConfigError: There is no such level, or the task is not defined there.
         ConfigError: The seed, the domain, the form of prompts or an option is not allowed, the task has no
             text form, its code raises, or the episode would have more than 20 steps.
         SamplingError: No draw in a hundred could place all objects.

@@ -176,7 +176,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
             `init_from`.
 
     Raises:
-        CheckpointError: T5 or the initial weights are not where the settings say.
+        InputFileError: T5 or the initial weights are not where the settings say.
         ConfigError: The initial weights are those of a network of other sizes, or lack a tokenizer.
         PromptError: The texts have too many different words.
         MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
@@ -272,7 +272,7 @@ def training_texts(
         with_captions: Also yield the words of captions of attributes.
 
     Raises:
-        ShardError: A shard is damaged.
+        DatasetError: A shard is damaged.
     """
     prompts: set[str] = set()
     for table in _tables(dataset, "prompt"):  # 0.1 ms per demonstration

@@ -10,7 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.data.preprocessed import number_images
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import ConfigError, InputFileError
 from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import Policy
 from openvima.policies.batch import Batch
@@ -83,13 +83,13 @@ class Learner(nn.Module):
         """Load the weights of a checkpoint.
 
         Raises:
-            CheckpointError: It is damaged or does not fit.
+            InputFileError: It is damaged or does not fit.
         """
         file = folder / WEIGHTS_FILE
         try:
             self.load_state_dict(read_safetensors(file))
         except RuntimeError as error:
-            raise CheckpointError(f"{file} does not fit: {error}") from None
+            raise InputFileError(f"{file} does not fit: {error}") from None
 
     def description(self) -> dict[str, Any]:
         """Return the sizes of the network, for the run's `config.yaml`."""
@@ -155,7 +155,7 @@ class PolicyLearner(Learner):
         if isinstance(tokenizer, WordTokenizer):
             stored = Vocabulary.read(folder / TOKENIZER_FOLDER)
             if stored != tokenizer.vocabulary:
-                raise CheckpointError(
+                raise InputFileError(
                     f"{folder} has another vocabulary, with {len(stored.words)} words instead of "
                     f"{len(tokenizer.vocabulary.words)}; train into another --out."
                 )

@@ -190,7 +190,7 @@ class Trainer:
         going_on: As in `RunFolder`.
 
     Raises:
-        CheckpointError: The last checkpoint is damaged.
+        InputFileError: The last checkpoint is damaged.
         ConfigError: The folder holds a run with other settings.
     """
 

@@ -79,7 +79,7 @@ def train(
             there is no such detector or excluded task, or the loss diverged.
         DatasetError: There are no demonstrations, some are held out for evaluation, or one is too long for
             the network.
-        CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
+        InputFileError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
             or of other sizes.
         PromptError: A prompt has a word that T5 lacks, or the prompts have too many different words.
         FolderLockedError: Another run writes to the folder.

@@ -39,7 +39,7 @@ from openvima.atomic_io import (
 )
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset
-from openvima.errors import CheckpointError, ConfigError, InputFileError, differences
+from openvima.errors import ConfigError, InputFileError, differences
 from openvima.input_files import read_json, read_yaml
 from openvima.policies.naming import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_order
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
@@ -186,7 +186,7 @@ class RunFolder:
             Progress of the run.
 
         Raises:
-            CheckpointError: The checkpoint is damaged or does not fit.
+            InputFileError: The checkpoint is damaged or does not fit.
         """
         checkpoint = self.latest()
         progress = _read_progress(checkpoint) if checkpoint else Progress()
@@ -198,11 +198,11 @@ class RunFolder:
         """Read the optimizer state of the last checkpoint, by name of the parameter.
 
         Raises:
-            CheckpointError: There is none, or it is damaged.
+            InputFileError: There is none, or it is damaged.
         """
         checkpoint = self.latest()
         if checkpoint is None:
-            raise CheckpointError(f"{self.checkpoints} holds no checkpoint to resume from.")
+            raise InputFileError(f"{self.checkpoints} holds no checkpoint to resume from.")
         state: dict[str, dict[str, torch.Tensor]] = {}
         for key, tensor in read_safetensors(checkpoint / OPTIMIZER_FILE).items():
             parameter, _, name = key.partition("|")
@@ -289,7 +289,7 @@ def _read_progress(checkpoint: Path) -> Progress:
     try:
         return Progress(**read_json(file))
     except (OSError, ValueError, TypeError) as error:
-        raise CheckpointError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
+        raise InputFileError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
 
 
 def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:

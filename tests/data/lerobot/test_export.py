@@ -17,7 +17,7 @@ from openvima.data import Demonstration
 from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv
-from openvima.errors import ConfigError, DatasetError, ShardError
+from openvima.errors import ConfigError, DatasetError
 
 VIDEO_KEYS = [
     f"observation.images.{name}"
@@ -325,7 +325,7 @@ def test_a_damaged_shard_leaves_no_export(tmp_path: Path, export: Path) -> None:
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 255
     shard.write_bytes(content)
-    with pytest.raises(ShardError, match=shard.name):
+    with pytest.raises(DatasetError, match=shard.name):
         export_lerobot(LerobotConfig(tmp_path / "demos", tmp_path / "broken"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demos", "out"]
 

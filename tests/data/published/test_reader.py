@@ -15,7 +15,7 @@ from openvima.data.published_episode import infer_picks
 from openvima.data.records import rollout_oracle
 from openvima.data.schema import UNKNOWN_ID
 from openvima.env import EnvConfig
-from openvima.errors import ConfigError, DatasetError, MemberError, UnknownTaskError
+from openvima.errors import ConfigError, DatasetError, UnknownTaskError
 from openvima.scene import ObjectRecord
 from published_data import PUBLISHED, TODAY, Generation, MadeEpisode, jpeg, pickled, write_folder, write_zip
 
@@ -291,7 +291,7 @@ def test_a_broken_episode_is_named_and_skipped(
     data, broken = broken_source
     number, reason = list(FAULTS).index(fault), FAULTS[fault][1]
     assert broken[number].member == f"rotate/{number:06d}"
-    with pytest.raises(MemberError, match=r"vima\.zip: rotate/\d+: .*" + reason):
+    with pytest.raises(DatasetError, match=r"vima\.zip: rotate/\d+: .*" + reason):
         data.read("rotate", f"{number:06d}")
 
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import published_data
 from openvima.data.published_episode import Inert, as_array, read_pickle
-from openvima.errors import MemberError
+from openvima.errors import DatasetError
 
 PROTO = b"\x80\x04"
 SCALARS = st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats(allow_nan=False) | st.text()
@@ -91,13 +91,13 @@ def test_arrays_of_protocol_5_fit_their_bytes(args: tuple, is_sound: bool) -> No
     if is_sound:
         assert as_array(read_pickle(pickled)).tolist() == [*b"abc"]
         return
-    with pytest.raises(MemberError, match="no pickle of data"):
+    with pytest.raises(DatasetError, match="no pickle of data"):
         read_pickle(pickled)
 
 
 @pytest.mark.parametrize("opcode", [b"\x97", b"\x98"])
 def test_buffers_outside_of_the_pickle_are_refused(opcode: bytes) -> None:
-    with pytest.raises(MemberError, match="no pickle of data"):
+    with pytest.raises(DatasetError, match="no pickle of data"):
         read_pickle(b"\x80\x05N" + opcode + b".")
 
 
@@ -105,9 +105,9 @@ def test_bytes_that_can_be_written_are_data_and_no_tool() -> None:
     content = b"\x96" + struct.pack("<Q", 3) + b"abc"
     assert read_pickle(b"\x80\x05" + content + b".") == bytearray(b"abc")
     for use in (b")R", b"}Nsb", b")\x81"):
-        with pytest.raises(MemberError, match="no pickle of data"):
+        with pytest.raises(DatasetError, match="no pickle of data"):
             read_pickle(b"\x80\x05" + content + use + b".")
-    with pytest.raises(MemberError, match="truncated"):
+    with pytest.raises(DatasetError, match="truncated"):
         read_pickle(b"\x80\x05\x96" + b"\xff" * 8 + b"abc.")
 
 
@@ -186,7 +186,7 @@ def test_hostile_pickles_are_refused_and_nothing_runs(kind: str, tmp_path: Path)
     marker = tmp_path / "marker"
     content = attack(f"touch {marker}")[kind]
     with pytest.raises(
-        MemberError, match=r"nothing was run|no pickle of data|only numbers are read"
+        DatasetError, match=r"nothing was run|no pickle of data|only numbers are read"
     ) as error:
         read_pickle(content)
     assert not marker.exists()
@@ -202,7 +202,7 @@ def test_functions_that_other_code_has_registered_are_refused(tmp_path: Path) ->
     content = PROTO + b"\x82\x07" + text(f"touch {marker}") + b"\x85R."
     copyreg.add_extension("os", "system", 7)
     try:
-        with pytest.raises(MemberError, match=r"names os\.system"):
+        with pytest.raises(DatasetError, match=r"names os\.system"):
             read_pickle(content)
         assert not marker.exists()
         pickle.loads(content)
@@ -232,7 +232,7 @@ SIZE_RANGE = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRan
     ],
 )
 def test_what_no_published_file_does_is_refused(content: bytes, fault: str) -> None:
-    with pytest.raises(MemberError, match=fault):
+    with pytest.raises(DatasetError, match=fault):
         read_pickle(PROTO + content + b".")
 
 
@@ -278,20 +278,20 @@ def array_pickle(shape: object, dtype: str, content: object) -> bytes:
 def test_arrays_are_never_larger_than_their_bytes(
     shape: object, dtype: str, content: object, fault: str
 ) -> None:
-    with pytest.raises(MemberError, match=fault):
+    with pytest.raises(DatasetError, match=fault):
         read_pickle(array_pickle(shape, dtype, content))
 
 
 def test_other_things_are_no_arrays() -> None:
     for value in (None, [], "x", {}, Inert()):
-        with pytest.raises(MemberError, match="where an array should be"):
+        with pytest.raises(DatasetError, match="where an array should be"):
             as_array(value)
 
 
 def test_no_beginning_of_a_pickle_reads_as_whole() -> None:
     content = published_data.pickled(published_data.MadeEpisode().actions(3))
     for length in range(len(content)):
-        with pytest.raises(MemberError):
+        with pytest.raises(DatasetError):
             read_pickle(content[:length])
 
 
@@ -304,7 +304,7 @@ def test_damage_gives_a_value_or_an_error_that_says_so(data: st.DataObject) -> N
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     try:
         read_pickle(bytes(content))
-    except MemberError as error:
+    except DatasetError as error:
         assert len(str(error)) < 400
 
 
@@ -312,18 +312,18 @@ def test_damage_gives_a_value_or_an_error_that_says_so(data: st.DataObject) -> N
 def test_any_bytes_give_a_value_or_an_error_that_says_so(content: bytes) -> None:
     try:
         read_pickle(content)
-    except MemberError as error:
+    except DatasetError as error:
         assert len(str(error)) < 400
 
 
 def test_classes_themselves_stay_as_they_are() -> None:
     for state in (b"}" + text("name") + b"Nsb", b"N}" + text("__new__") + b"Ns\x86b"):
-        with pytest.raises(MemberError, match="missing 1 required positional argument"):
+        with pytest.raises(DatasetError, match="missing 1 required positional argument"):
             read_pickle(PROTO + SIZE_RANGE + state + b".")
 
 
 def test_an_endless_value_is_named_by_its_kind() -> None:
     endless = read_pickle(PROTO + b"]q\x00h\x00a.")
-    with pytest.raises(MemberError, match="it has a list where"):
+    with pytest.raises(DatasetError, match="it has a list where"):
         as_array(endless)
     assert math.isclose(len(endless), 1)

@@ -136,7 +136,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
         ConfigError: The folder holds a run with other settings, the loss diverged, or there are several
             processes.
         DatasetError: There are not enough demonstrations, or some are held out for evaluation.
-        CheckpointError: The last checkpoint, or the initial one, is damaged.
+        InputFileError: The last checkpoint, or the initial one, is damaged.
         FolderLockedError: Another run writes to the folder.
     """
     dataset, loader = open_demonstrations(config.data, allow_heldout=config.allow_heldout), config.loader
