@@ -12,7 +12,6 @@ import yaml
 
 from openvima.atomic_io import atomic_write_file
 from openvima.data import Dataset
-from openvima.data.appearances import appearance_record, appearance_text
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import load_network, read_info, write_checkpoint
@@ -27,6 +26,7 @@ from openvima.training.run_folder import (
     whole_lines,
 )
 from openvima.training.validation import flatten
+from training_data import appearance_record, appearance_text
 
 RECORD = "training"  # folder beside the weights
 DATA = "training_data.json"

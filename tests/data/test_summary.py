@@ -1,10 +1,8 @@
-"""What `openvima data info` says of a folder, in the terminal, for machines and as a page."""
+"""What `openvima data info` says of a folder, in the terminal and for machines."""
 
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -13,11 +11,8 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter, generate
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
-from openvima.data.page import make_episode_card, write_page
 from openvima.data.summary import Histogram, Summary, summarise_folder
-from openvima.errors import ConfigError, DatasetError
-from openvima.html import render_page
-from openvima.scene import Action
+from openvima.errors import DatasetError
 
 MadeUp = Callable[..., Demonstration]
 
@@ -37,32 +32,6 @@ def finished(folder: Path, *, details: bool = False) -> Summary:
     summary = summarise_folder(folder, details=details)
     assert isinstance(summary, Summary)
     return summary
-
-
-class Page(HTMLParser):
-    """Collects ids and sources, and notices elements that are not closed."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.ids: list[str] = []
-        self.links: list[str] = []
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = {name: value or "" for name, value in attrs}
-        self.ids += [values["id"]] if "id" in values else []
-        self.links += [values[name] for name in ("src", "href") if name in values]
-        if tag not in ("meta", "link", "img", "wbr"):
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_starttag(tag, attrs)
-        self.handle_endtag(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag not in ("wbr",):
-            assert self.open.pop() == tag
 
 
 def test_counts_are_those_of_the_episodes(demos: Path) -> None:
@@ -142,79 +111,7 @@ def test_machines_read_the_manifest_and_the_overview(demos: Path, capsys: pytest
     assert record["summary"]["tasks"]["rotate"]["episodes"] == 3
 
 
-def test_the_page_needs_nothing_else_and_names_nothing_twice(demos: Path, tmp_path: Path) -> None:
-    text = write_page(finished(demos, details=True), tmp_path / "a.html", num_samples=2).read_text("utf-8")
-    page = Page(text)
-    assert page.open == []
-    assert len(set(page.ids)) == len(page.ids)
-    assert all(link.startswith(("data:", "#")) for link in page.links)
-    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
-    assert "<script" not in text
-    assert "http" not in text
-    assert text.count("<article") == 6
-    dataset = Dataset(demos)
-    assert all(dataset[place].content_hash() in text for place in (0, 1, 3, 4, 6, 7))
-
-
-def test_equal_data_give_equal_pages(demos: Path, tmp_path: Path) -> None:
-    summary = finished(demos)
-    pages = [write_page(summary, tmp_path / name, num_samples=1).read_bytes() for name in ("a", "b")]
-    assert pages[0] == pages[1]
-    assert str(demos).encode() not in pages[0]
-
-
-def drawn_episode(demo: Demonstration) -> str:
-    return render_page("episode", card=make_episode_card(demo))
-
-
-def drawn_chart(histogram: Histogram) -> str:
-    return render_page("histogram", chart=histogram)
-
-
-def test_names_from_files_cannot_change_the_page(made_up: MadeUp) -> None:
-    demo = made_up(num_images=0)
-    evil = replace(demo.prompt, text="<script>alert(1)</script>")
-    card = drawn_episode(replace(demo, prompt=evil, level='"><b>', domain="<i>"))
-    assert "<script" not in card
-    assert "<b>" not in card
-    assert "<i>" not in card
-    assert "<b>" not in drawn_chart(Histogram("a", {"<b>": 1}))
-
-
-def test_captions_say_what_was_done(made_up: MadeUp) -> None:
-    demo = replace(made_up(num_steps=1, num_images=0), end_effector="suction")
-    there = Action.planar((0.3, 0.1), (0.6, -0.2))
-    turned = Action.planar((0.3, 0.1), (0.3, 0.1), -0.5236)
-    assert "1: move red swirl flower<" in drawn_episode(replace(demo, actions=(there,)))
-    placed = drawn_episode(replace(demo, actions=(there,), place_ids=(6,)))
-    assert "1: move red swirl flower to red swirl flower<" in placed
-    in_place = drawn_episode(replace(demo, actions=(turned,), place_ids=(5,)))
-    assert "1: turn red swirl flower 30° to the right<" in in_place
-    assert "<path" not in in_place
-    swept = drawn_episode(replace(demo, actions=(there,), end_effector="spatula"))
-    assert "1: sweep red swirl flower<" in swept
-    unknown = drawn_episode(replace(demo, actions=(there,), pick_ids=(-2,), place_ids=(-2,)))
-    assert "1: move an object<" in unknown
-
-
-def test_arrows_begin_and_end_where_the_action_does(made_up: MadeUp) -> None:
-    demo = made_up(num_steps=1, num_images=0)
-    card = drawn_episode(replace(demo, actions=(Action.planar((0.5, 0.0), (0.5, 0.25)),)))
-    # The top camera looks at (0.5, 0) with column 128 and row 63, 256 columns a metre; its image lies below.
-    assert '<circle cx="128.5" cy="193.5"' in card
-    assert 'd="M133.0 193.5L191.2 193.5' in card
-
-
 def test_long_histograms_show_both_ends() -> None:
-    chart = drawn_chart(Histogram("values", {str(n): 100 - n for n in range(50)}))
-    assert "… 35 more …" in chart
-    assert chart.count("<div") == 15
-
-
-def test_pages_and_samples_that_make_no_sense_are_refused(
-    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["data", "info", str(demos), "--html", str(tmp_path)]) == 2
-    assert "name of an HTML file" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match="samples is -1"):
-        write_page(finished(demos), tmp_path / "a.html", num_samples=-1)
+    rows = Histogram("values", {str(n): 100 - n for n in range(50)}).rows()
+    assert len(rows) == 16
+    assert rows[10][0] == "… 35 more …"

@@ -9,11 +9,11 @@ import pytest
 
 import openvima
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
-from openvima.data.appearances import appearances_of, find_leaks
 from openvima.scene import ObjectImage, Placement, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.sampling import make_rng
 from small_data_sets import seeds_of
+from training_data import appearances_of, find_leaks
 
 FOLDER = Path(openvima.__file__).parent / "policies" / "trained" / "openvima-small"
 RECORD = json.loads((FOLDER / "training_data.json").read_text(encoding="utf-8"))

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,78 +17,39 @@ if TYPE_CHECKING:
     from openvima.data.summary import Histogram, Summary
 
 _BAR_WIDTH = 40
-_NUM_AT_END = 5
 
 
 def info(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     *,
     details: bool = False,
-    html: Path | None = None,
-    samples: int = 3,
-    appearance: Path | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Print counts, sizes, histograms and provenance of a folder of demonstrations.
 
-    Example: openvima data info demos --html demos.html
+    Example: openvima data info demos --details
 
     Args:
         folder: Folder of a data set, or hf://OWNER/NAME[@REVISION] on the Hugging Face Hub,
             of which without details only the index is fetched.
         details: Count objects, textures and prompt images too; reads every file.
-        html: Write a self-contained page with all of this and sample episodes.
-        samples: Sample episodes of each task on that page.
-        appearance: Write the combinations of object and texture, by task and role, to this JSON file, and
-            report those outside the training partition; reads every file.
         as_json: Print everything as JSON.
 
     Returns:
         Exit status.
     """
     from openvima.data.summary import summarise_folder
-    from openvima.errors import ConfigError
 
-    if html is not None and html.suffix.lower() not in (".html", ".htm"):
-        raise ConfigError(f"--html is {str(html)!r}; give the name of an HTML file, such as demos.html.")
-    with progress_bar("files") if details or html else contextlib.nullcontext() as report:
-        summary = summarise_folder(folder, details=details or html is not None, report=report)
-    if html is not None:
-        from openvima.data.page import write_page
-
-        with progress_bar("episodes") as report:
-            write_page(summary, html, num_samples=samples, report=report)
-    if appearance is not None:
-        _write_appearance(folder, appearance)
+    with progress_bar("files") if details else contextlib.nullcontext() as report:
+        summary = summarise_folder(folder, details=details, report=report)
     if as_json:
         print(json.dumps(summary.to_record(), indent=2, ensure_ascii=False))
     else:
-        for line in [
-            *_summary(summary, _shown_name(folder, summary)),
-            *_hints(details or html is not None, html),
-        ]:
-            print(*map(_printable, line.split("\n")), sep="\n") if isinstance(line, str) else print_table(
-                line
-            )
+        for line in _summary(summary, _shown_name(folder, summary)):
+            print(_printable(line)) if isinstance(line, str) else print_table(line)
+        if not details:
+            print("\n--details counts objects, textures and prompt images too.")
     return 0
-
-
-def _write_appearance(folder: Path, file: Path) -> None:
-    """Write the appearance statistics; report on standard error what is outside the training partition."""
-    from openvima.atomic_io import atomic_write_file
-    from openvima.data.appearances import appearance_record, appearance_text, find_leaks
-    from openvima.data.reader import Dataset
-
-    with progress_bar("files") as report:
-        record = appearance_record(Dataset(folder), report)
-    atomic_write_file(file, appearance_text(record))
-    problems = find_leaks(record)
-    for problem in problems[:_NUM_AT_END]:
-        print(f"outside the training partition: {problem}", file=sys.stderr)
-    if len(problems) > _NUM_AT_END:
-        print(f"… and {len(problems) - _NUM_AT_END:,} more", file=sys.stderr)
-    if not problems:
-        print(f"{file}: everything is inside the training partition", file=sys.stderr)
 
 
 def _shown_name(folder: Path, summary: "Summary") -> str:
@@ -166,13 +126,6 @@ def _bars(histogram: "Histogram") -> Iterator[str]:
     for label, count, share, length in histogram.rows():
         bar = f"{'█' * max(1, round(_BAR_WIDTH * length))} {count:,} ({share:.1%})" if count else ""
         yield f"  {label:>{width}}  {bar}".rstrip()
-
-
-def _hints(has_details: bool, html: Path | None) -> Iterator[str]:
-    if html is not None:
-        yield f"\nPage: {html}"
-    elif not has_details:
-        yield "\n--details counts objects, textures and prompt images too; --html FILE shows episodes."
 
 
 if TYPE_CHECKING:

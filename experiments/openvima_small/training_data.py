@@ -1,5 +1,7 @@
 """Appearance statistics: combinations of object and texture in demonstrations, by task and role.
 
+    python experiments/openvima_small/training_data.py DEMONSTRATIONS FILE.json
+
 They document the training data of a policy: `training_data.json` beside its weights identifies the data set
 by content and lists every combination in it. `find_leaks` compares it with the training partition, so that
 L2, L3 and L4 stay unseen. The benchmark itself makes three exceptions at every level:
@@ -26,9 +28,11 @@ other_fixed    fixed, and the reference of no placement
 import hashlib
 import json
 import re
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +40,6 @@ import numpy as np
 from openvima.catalog import NEUTRAL_TEXTURE, OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
 from openvima.data.manifest import MANIFEST_NAME
 from openvima.data.reader import Dataset
-from openvima.multiprocess import Report
 
 Appearance = tuple[str, str]  # names of object and texture
 Row = Mapping[str, Any]
@@ -58,12 +61,11 @@ _FROM_MANIFEST = (
 )
 
 
-def appearance_record(dataset: Dataset, report: Report | None = None) -> dict[str, Any]:
+def appearance_record(dataset: Dataset) -> dict[str, Any]:
     """Collect the appearance statistics of a data set; reads every shard, without images.
 
     Args:
         dataset: The data set.
-        report: Called with shards read, shards in all, and a note.
 
     Returns:
         `manifest`: entries of the manifest, and `sha256` of its file, which identifies the data of a run.
@@ -74,15 +76,12 @@ def appearance_record(dataset: Dataset, report: Report | None = None) -> dict[st
     Raises:
         DatasetError: A shard is damaged.
     """
-    names = dataset.shard_names()
     counts: dict[str, dict[str, Counter[Appearance]]] = defaultdict(lambda: defaultdict(Counter))
-    for done, name in enumerate(names, start=1):
+    for name in dataset.shard_names():
         for row in dataset.shard(name).table(_COLUMNS).to_pylist():
             roles = counts[row["task"]]
             for role, appearance in _list_roles(row):
                 roles[role][appearance] += 1
-        if report is not None:
-            report(done, len(names), "")
     manifest = {name: dataset.manifest[name] for name in _FROM_MANIFEST}
     tasks = {
         task: {**_summarise_episodes(dataset, task), "roles": _make_tables(counts[task])}
@@ -239,3 +238,14 @@ def _find_problems(task: str, entry: Mapping[str, Any]) -> list[str]:
 
 def _appearances(objects: Iterable[str], textures: Iterable[str]) -> frozenset[Appearance]:
     return frozenset(product(objects, textures))
+
+
+def main(folder: str, file: str) -> None:
+    """Write the record of a data set, and print what is outside the training partition."""
+    record = appearance_record(Dataset(folder))
+    Path(file).write_text(appearance_text(record), encoding="utf-8")
+    print(*find_leaks(record) or ["everything is inside the training partition"], sep="\n")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

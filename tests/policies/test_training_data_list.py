@@ -8,19 +8,19 @@ from typing import Any
 import pytest
 
 from openvima.catalog import TEXTURE_SETS
-from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.appearances import (
+from openvima.data.manifest import MANIFEST_NAME
+from openvima.errors import ConfigError
+from small_data_sets import seeds_of
+from training_data import (
     ROLES,
     appearance_record,
     appearance_text,
     appearances_of,
     find_leaks,
+    main,
     training_appearances,
 )
-from openvima.data.manifest import MANIFEST_NAME
-from openvima.errors import ConfigError
-from small_data_sets import seeds_of
 
 TASKS = ("rearrange", "visual_manipulation", "novel_noun", "sweep_without_exceeding")
 
@@ -122,20 +122,13 @@ def test_only_distractors_of_rearrangements_have_all_textures() -> None:
             assert has_all == (task == "rearrange" and role == "distractor")
 
 
-def test_the_command_writes_the_statistics_and_names_leaks(
+def test_the_script_writes_the_statistics_and_names_leaks(
     demos: Path, record: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "training_data.json"
-    assert main(["data", "info", str(demos), "--appearance", str(file)]) == 0
+    main(str(demos), str(file))
     assert json.loads(file.read_text()) == record
-    assert "everything is inside the training partition" in capsys.readouterr().err
+    assert "everything is inside the training partition" in capsys.readouterr().out
     novel = generate(GenerateConfig(out=tmp_path / "novel", tasks=("rotate",), level="L3", episodes=2))
-    assert main(["data", "info", str(novel), "--appearance", str(file)]) == 0
-    assert "rotate shows 'letter R'" in capsys.readouterr().err
-
-
-def test_a_folder_that_is_not_finished_has_no_table(demos: Path, tmp_path: Path) -> None:
-    for shard in demos.glob("*.arrow"):
-        (tmp_path / shard.name).write_bytes(shard.read_bytes())
-    assert main(["data", "info", str(tmp_path), "--appearance", str(tmp_path / "appearance.json")]) == 2
-    assert not (tmp_path / "appearance.json").exists()
+    main(str(novel), str(file))
+    assert "rotate shows 'letter R'" in capsys.readouterr().out
