@@ -170,5 +170,3 @@ def test_the_parts_of_a_batch_contain_all_of_it(source) -> None:
     BatchMaker(source, collate, seed=3, largest=2)(np.arange(10, 24), 7)
     assert all(whole[row] == value for row, value in drawn.items())  # whoever shares the batch
     assert len(set(whole.values())) == 24
-    counted = BatchMaker(source, collate, seed=3, largest=5, count=4)(np.arange(24), 7)
-    assert [len(rows) for rows, _ in counted] == [6] * 4

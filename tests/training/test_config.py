@@ -105,10 +105,9 @@ def test_settings_cannot_be_changed_afterwards() -> None:
         config.schedule.steps = 3  # type: ignore[misc]
 
 
-@pytest.mark.parametrize(("name", "value"), [("runtime.precision", "float16"), ("runtime.sharding", "fdsp")])
-def test_an_invalid_choice_is_named(name: str, value: str) -> None:
-    with pytest.raises(ConfigError, match=rf"there is no {name} '{value}'"):
-        TrainingConfig.of({**FOLDERS, name: value})
+def test_an_invalid_choice_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"there is no runtime.precision 'float16'"):
+        TrainingConfig.of({**FOLDERS, "runtime.precision": "float16"})
 
 
 def test_an_unknown_setting_is_named_with_the_nearest_one() -> None:

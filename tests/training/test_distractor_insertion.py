@@ -100,11 +100,11 @@ def test_distractors_are_inserted_in_training_only_with_their_probability(episod
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
 
     def counts(share: float) -> torch.Tensor:
-        make = BatchMaker(source_of_episodes(episodes), collate, 0, 99, count=1, distractor_prob=share)
-        ((batch, _),) = make(np.arange(len(episodes)), 4)
-        return (batch.history.num_slots_BT * batch.history.steps_BT).sum(dim=1)
+        make = BatchMaker(source_of_episodes(episodes), collate, 0, 99, distractor_prob=share)
+        histories = [batch.history for batch, _ in make(np.arange(len(episodes)), 4)]
+        return torch.cat([(each.num_slots_BT * each.steps_BT).sum(dim=1) for each in histories])
 
-    order = np.argsort([episode.num_steps for episode in episodes], kind="stable")
+    order = np.concatenate(source_of_episodes(episodes).by_length(np.arange(len(episodes))))
     plain = torch.tensor(
         [episodes[row].objects_per_step.sum() + 2 * episodes[row].num_steps for row in order]
     )

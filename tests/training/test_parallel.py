@@ -116,20 +116,18 @@ def assert_alike(ours: Path, theirs: Path) -> None:
         assert a.get("gradient_norm", 0) == pytest.approx(b.get("gradient_norm", 0), rel=1e-3)
 
 
-@pytest.mark.parametrize("sharding", ["ddp"])  # fsdp: the next test compares its steps, too
-def test_two_processes_train_as_one(bins, tmp_path, sharding) -> None:
+def test_two_processes_train_as_one(bins, tmp_path) -> None:
     bins |= {"loader.boxes": HOOK}
     one = train(TrainingConfig.of({**bins, "out": tmp_path / "one"}))
     parts = {"optimizer.grad_accum_steps": 8}  # more than demonstrations of a process
-    two = run_in_processes(2, {**bins, **parts, "out": tmp_path / "two", "runtime.sharding": sharding})
+    two = run_in_processes(2, {**bins, **parts, "out": tmp_path / "two"})
     assert_alike(one, two)
     load_policy(str(two))
 
 
-@pytest.mark.parametrize("sharding", ["fsdp"])  # whose state has to be gathered
-def test_a_run_of_two_processes_resumes_with_one(bins, tmp_path, sharding) -> None:
+def test_a_run_of_two_processes_resumes_with_one(bins, tmp_path) -> None:
     whole = train(TrainingConfig.of({**bins, "out": tmp_path / "whole"}))
-    torn = {**bins, "out": tmp_path / "torn", "runtime.sharding": sharding}
+    torn = {**bins, "out": tmp_path / "torn"}
     run_in_processes(2, {**torn, "kill_at": 4})
     assert sorted(path.name for path in (tmp_path / "torn/checkpoints").glob("2-*"))[-1].endswith("000003")
     assert_alike(whole, train(TrainingConfig.of(torn)))

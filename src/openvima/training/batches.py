@@ -88,7 +88,6 @@ class BatchMaker:
         collate: Makes a batch of each part.
         seed: Of the run; every example of every batch has its own generator.
         largest: Maximum size of a part.
-        count: Number of parts, whatever the lengths; None is as many as needed.
         alternatives: Other caches of the same demonstrations, each with the probability of using it instead
             where it has the demonstration; see `alternative_source`.
         distractor_prob: Probability of inserting distractors from another demonstration, for those that allow
@@ -99,7 +98,6 @@ class BatchMaker:
     collate: Collate
     seed: int
     largest: int
-    count: int | None = None
     alternatives: tuple[tuple[ExampleSource, float], ...] = ()
     distractor_prob: float = 0.0
 
@@ -127,10 +125,6 @@ class BatchMaker:
         return replace(example, other=self.source[int(rng.integers(len(self.source)))])
 
     def _divide(self, indices: np.ndarray) -> list[np.ndarray]:
-        if self.count is not None:
-            ordered = indices[np.argsort(self.source.lengths[indices, 0], kind="stable")]
-            ends = [len(ordered) * part // self.count for part in range(1, self.count)]
-            return np.split(ordered, ends)
         return [
             group[start : start + self.largest]
             for group in self.source.by_length(indices)

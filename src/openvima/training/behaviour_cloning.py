@@ -53,7 +53,6 @@ class BehaviourCloning:
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
         self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
         self._training, self._validation, self._alternatives = training, validation, alternatives
-        self._validated = module if parallel.is_sharded else learner
         self._order = make_order(
             training,
             batch_size=config.loader.batch_size,
@@ -95,14 +94,13 @@ class BehaviourCloning:
         # Sorted by length, to reduce padding; processes take parts in turn.
         rows = np.lexsort(source.lengths.T[::-1])
         for number, start in enumerate(range(0, len(rows), size)):
-            mine = number % ranks == self._parallel.rank
-            if not (mine or self._parallel.is_sharded):  # a sharded network needs all processes
+            if number % ranks != self._parallel.rank:
                 continue
             for group in source.by_length(rows[start : start + size]):
                 batch = collate([source[index] for index in group.tolist()], None)
-                loss, metrics = self._call(batch, self._validated)
+                loss, metrics = self._call(batch, self._learner)
                 weight = source.num_steps(group) / total
-                _add(sums, {"loss": loss, **metrics}, weight * mine * ranks)
+                _add(sums, {"loss": loss, **metrics}, weight * ranks)
         sums = self._parallel.mean(sums)
         score = sums[self._learner.score]
         return {**sums, "score": score, "score_error": math.sqrt(max(0.0, score * (1 - score)) / total)}
@@ -115,8 +113,6 @@ class BehaviourCloning:
             self._learner.collator(),
             config.seed,
             largest=-(-ours // parts),
-            # Sharded weights are gathered at every pass, so all processes make equally many passes.
-            count=min(parts, ours) if self._parallel.is_sharded else None,
             alternatives=self._alternatives,
             distractor_prob=config.augmentation.distractor_prob,
         )

@@ -25,7 +25,7 @@ _NOT_IDENTITY = {
     "": ("data", "out", "force", "object_cache", "t5", "rollout"),
     "loader": ("num_workers",),
     "schedule": ("checkpoint_every", "keep_every"),
-    "runtime": ("device", "compile", "sharding", "threads", "workers", "tensorboard", "wandb"),
+    "runtime": ("device", "compile", "threads", "workers", "tensorboard", "wandb"),
 }
 
 
@@ -283,7 +283,6 @@ class RuntimeConfig:
         compile: Compile the layers of the network with torch.compile.
         processes: Processes that share each batch, on this machine; for several, see `torchrun`. On GPUs at
             most one on each.
-        sharding: Several processes replicate the network ("ddp") or shard it ("fsdp").
         threads: CPU threads; equal numbers give equal weights.
         workers: Processes that render the scenes of pretraining and write object caches, before the steps;
             fewer where there is little to do. `openvima train` takes all CPUs.
@@ -295,7 +294,6 @@ class RuntimeConfig:
     precision: Literal["float32", "bfloat16"] = "float32"
     compile: bool = False
     processes: Annotated[int, Range(1, 64)] = 1
-    sharding: Literal["ddp", "fsdp"] = "ddp"
     threads: Annotated[int, Range(1, 1024)] = 1
     workers: Annotated[int, Range(1, 1024)] = 1
     tensorboard: bool = True

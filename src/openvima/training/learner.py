@@ -73,7 +73,7 @@ class Learner(nn.Module):
 
         Args:
             folder: The folder.
-            weights: State dict of the learner, gathered if sharded.
+            weights: State dict of the learner.
         """
         # Copies, since a file holds no tensors that share memory, as tied weights do.
         tensors = {name: t.detach().to("cpu", copy=True).contiguous() for name, t in weights.items()}

@@ -24,7 +24,7 @@ from openvima.errors import ConfigError, Terminated
 from openvima.multiprocess import Report
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
-from openvima.training.parallel import Parallel, load_named_state, named_state, set_whole_state, whole_state
+from openvima.training.parallel import Parallel, load_named_state, named_state
 from openvima.training.run_folder import (
     METRICS_FILE,
     SESSIONS_FILE,
@@ -399,13 +399,10 @@ class Trainer:
                 tracker.add(stage.name, numbers, self._done())
 
     def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
-        if self.parallel.is_sharded:
-            return TrainedState(*whole_state(self.learner, optimizer))
         return TrainedState(self.learner.state_dict(), named_state(self.learner, optimizer))
 
     def _load_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
-        load = set_whole_state if self.parallel.is_sharded else load_named_state
-        load(self.learner, optimizer, self.run.optimizer_state())
+        load_named_state(self.learner, optimizer, self.run.optimizer_state())
 
     def _here(self) -> dict[str, int]:
         return {"stage": self.progress.stage, "step": self.progress.step}

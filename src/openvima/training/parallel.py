@@ -1,6 +1,5 @@
-"""Distributed training: data parallel (DDP) or sharded (FSDP2), over the processes of `torchrun`.
+"""Data-parallel training (DDP) over the processes of `torchrun`, each with the whole network.
 
-DDP replicates the network in every process. FSDP2 shards weights, gradients and optimizer state.
 `start_peers` starts the processes of one machine, with the environment in which `torchrun` starts them.
 """
 
@@ -15,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -80,8 +79,6 @@ def start_peers(others: int, arguments: Sequence[str]) -> Iterator[None]:
                 process.wait()
 
 
-Sharding = Literal["ddp", "fsdp"]
-FORWARD_METHODS = ("keys_values",)  # methods of layers that are called besides `forward`
 # Processes wait for the first one, which builds the object cache and runs rollouts.
 TIMEOUT = datetime.timedelta(days=1)
 
@@ -94,30 +91,21 @@ class Parallel:
         rank: Rank of this process.
         num_ranks: World size.
         device: Device of this process.
-        sharding: "ddp" or "fsdp".
     """
 
     rank: int
     num_ranks: int
     device: torch.device
-    sharding: Sharding = "ddp"
 
     @property
     def is_first(self) -> bool:
         """Whether this process writes files and reports."""
         return self.rank == 0
 
-    @property
-    def is_sharded(self) -> bool:
-        """Whether each process holds a shard of the weights."""
-        return self.sharding == "fsdp" and self.num_ranks > 1
-
     def wrap(self, module: nn.Module) -> nn.Module:
         """Wrap a module for training, so that gradients are synchronized between processes."""
         if self.num_ranks == 1:
             return module
-        if self.is_sharded:
-            return _shard(module, self.device)
         ids = [self.device.index] if self.device.type == "cuda" else None
         # Processes may call it different numbers of times; no buffer changes in training.
         with warnings.catch_warnings():
@@ -133,12 +121,7 @@ class Parallel:
             module: The wrapped module.
             last: Whether the block is the last pass of the step.
         """
-        if self.num_ranks == 1:
-            yield
-        elif self.is_sharded:
-            module.set_requires_gradient_sync(last)  # type: ignore[operator]
-            yield
-        elif last:
+        if self.num_ranks == 1 or last:
             yield
         else:
             with module.no_sync():  # type: ignore[operator]
@@ -149,7 +132,7 @@ class Parallel:
 
         Prompts without images, as text prompts are, leave some out.
         """
-        if self.num_ranks == 1 or self.is_sharded:
+        if self.num_ranks == 1:
             return loss
         return loss + 0.0 * torch.stack([parameter.sum() for parameter in parameters]).sum()
 
@@ -230,12 +213,11 @@ ONE_PROCESS = Parallel(0, 1, torch.device("cpu"))
 
 
 @contextlib.contextmanager
-def join_processes(device: str, sharding: Sharding) -> Iterator[Parallel]:
+def join_processes(device: str) -> Iterator[Parallel]:
     """Join the process group of `torchrun`, if there is one.
 
     Args:
         device: "auto" takes a GPU where there is one; or "cpu", "cuda", "cuda:1".
-        sharding: "ddp" or "fsdp".
 
     Raises:
         ConfigError: There is no such device.
@@ -255,11 +237,11 @@ def join_processes(device: str, sharding: Sharding) -> Iterator[Parallel]:
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
     if num_ranks == 1:
-        yield Parallel(0, 1, chosen, sharding)
+        yield Parallel(0, 1, chosen)
         return
     dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo", timeout=TIMEOUT)
     try:
-        yield Parallel(rank, num_ranks, chosen, sharding)
+        yield Parallel(rank, num_ranks, chosen)
         dist.barrier()  # gloo aborts if one process ends earlier
     finally:
         dist.destroy_process_group()
@@ -272,53 +254,6 @@ def compile_layers(module: nn.Module) -> None:
     """
     for layer in _layers(module):
         layer.compile(dynamic=True)
-
-
-def whole_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Gather weights and optimizer state of a sharded module; every process must call it.
-
-    Returns:
-        Tensors and optimizer state by name of the parameter, on the first process; elsewhere empty.
-    """
-    from torch.distributed.checkpoint.state_dict import (
-        StateDictOptions,
-        get_model_state_dict,
-        get_optimizer_state_dict,
-    )
-
-    options = StateDictOptions(full_state_dict=True, cpu_offload=True)
-    weights = get_model_state_dict(module, options=options)
-    state: dict[str, Any] = get_optimizer_state_dict(module, optimizer, options=options)
-    return weights, state.get("state", {})
-
-
-def set_whole_state(
-    module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Mapping[str, torch.Tensor]]
-) -> None:
-    """Load the full optimizer state of a sharded module; every process must call it."""
-    from torch.distributed.checkpoint.state_dict import (
-        StateDictOptions,
-        get_optimizer_state_dict,
-        set_optimizer_state_dict,
-    )
-
-    groups = get_optimizer_state_dict(module, optimizer, options=StateDictOptions(full_state_dict=True))
-    whole = {"state": dict(state), "param_groups": groups["param_groups"]}
-    set_optimizer_state_dict(module, optimizer, whole, options=StateDictOptions(full_state_dict=True))
-
-
-def _shard(module: nn.Module, device: torch.device) -> Any:
-    """Shard the layers of stacks one by one, and the rest together."""
-    from torch.distributed.device_mesh import init_device_mesh
-    from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
-
-    mesh = init_device_mesh(device.type, (dist.get_world_size(),))
-    for layer in _layers(module):
-        fully_shard(layer, mesh=mesh)
-        for method in FORWARD_METHODS:
-            if hasattr(layer, method):
-                register_fsdp_forward_method(layer, method)
-    return fully_shard(module, mesh=mesh)
 
 
 def _layers(module: nn.Module) -> list[nn.Module]:

@@ -152,7 +152,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
     runtime = config.runtime
     with (
         torch_threads(runtime.threads),
-        join_processes(runtime.device, runtime.sharding) as parallel,
+        join_processes(runtime.device) as parallel,
         end_on_sigterm(),  # not while processes join, a wait that no handler interrupts
         run_lock(config.out, is_first=parallel.is_first),
     ):
