@@ -27,7 +27,7 @@ from openvima.policies.nn.heads import (
 )
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
-from openvima.policies.variants import with_head, with_visual_residual
+from openvima.policies.variants import with_head, with_variant, with_visual_residual
 from small_networks import collate_examples, examples_of
 
 # One decoder; and cross-attention, with the last slot or with a query token as the action query.
@@ -157,6 +157,27 @@ def test_the_loss_is_that_of_the_published_head_on_these_logits(network, demonst
     torch.testing.assert_close(loss, parts)
     assert isinstance(network.head, AutoregressiveHead)
     assert metrics.keys() >= {"accuracy", "pick_accuracy", "query_spread"}
+
+
+@torch.no_grad()
+def test_positions_from_objects_are_read_before_the_next_component_is_decoded(demonstrations) -> None:
+    network = network_of(with_variant(preset("midas-nano"), {"points": True}))
+    batch, features = read(network, demonstrations)
+    prompt, steps = network.encode_prompt(batch.prompts, features), batch.targets.steps_BT[:, :1]
+    none = torch.zeros_like(batch.targets.actions_BTC[:, :1])
+    history = step_of(batch.history, 0)
+    actions, _ = network.decode_step(
+        prompt, network.init_cache(prompt), history, features, none, torch.zeros_like(steps)
+    )
+    points = network.observe(history, features).points_BTQ2
+    pick, place = (actions[:, :, None, part] - points for part in (slice(0, 2), slice(6, 8)))
+    assert (pick.norm(dim=-1).amin(-1) < 1e-6).all()
+    assert not (place.norm(dim=-1).amin(-1) < 1e-6).all()  # some places are near no object
+    targets = replace(batch.targets, actions_BTC=actions, steps_BT=steps)
+    loss_of = network.head.loss(
+        network.decoder, network.init_cache(prompt), network.observe(history, features), targets
+    )
+    torch.testing.assert_close(loss_of[2], actions)
 
 
 def uncached(policy: NetworkPolicy, prompts: Sequence, seen: Sequence[Sequence[dict]]) -> list[np.ndarray]:

@@ -29,6 +29,7 @@ from openvima.training.augmentation.prompts import (
     rename_objects,
     shuffle_prompt_objects,
     shuffle_sentences,
+    turn_comparisons,
     with_motion_prompt,
 )
 from openvima.training.batches import Example
@@ -170,6 +171,25 @@ def test_shuffled_sentences_keep_images_and_placeholders(task, episodes):
         examples.add(sum(" than " in sentence for sentence in found))
     assert {0, 1, 2} <= seen
     assert examples == ({1, 2, 3} if task == "novel_adj" else {0})
+
+
+def test_turned_comparisons_ask_for_the_same_without_less():
+    turned = plain = 0
+    env = TabletopEnv("novel_adj", level="train", domain="user")
+    for seed in range(6):
+        episode = preprocess(rollout_oracle(env, seed), "objects")
+        after = turn_comparisons(episode, np.random.default_rng(0))
+        if "the less " not in episode.prompt.text:
+            assert after is episode
+            plain += 1
+            continue
+        assert " less " not in after.prompt.text
+        for n in (1, 2, 3):
+            more, less = f"{{demo_blicker_obj_{n}}}", f"{{demo_less_blicker_obj_{n}}}"
+            assert after.prompt.text.index(less) < after.prompt.text.index(more)
+        assert _images(after) == _images(episode)
+        turned += 1
+    assert turned and plain
 
 
 @pytest.mark.parametrize("task", ["twist", "rearrange", "same_shape"])

@@ -68,7 +68,7 @@ def test_every_preset_has_a_recipe_that_trains_it() -> None:
         ([], True, 1.0, 1600),
         (["--model.image-tokens", "object-perceiver", "--model.conditioning", "prefix"], None, 0.0, 1600),
         (["--model.image-tokens=patches"], None, 0.0, 0),
-        (["--model.head", "autoregressive"], None, 1.0, 1600),
+        (["--model.head", "autoregressive"], True, 1.0, 1600),
         (["--init-from", "openvima-vima"], True, 1.0, 0),
     ],
 )

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from openvima.errors import ConfigError
 from openvima.perception.objects import TOP
 from openvima.policies.batch import HistoryBatch, InputLayout, PromptBatch
-from openvima.policies.nn.action_head import ActionHead, BinsConfig, BinsHead, ObservationTokens
+from openvima.policies.nn.action_head import BinsConfig, BinsHead, ObservationTokens
 from openvima.policies.nn.decoder import AnyDecoderConfig, Decoder, DecoderConfig, build_decoder
 from openvima.policies.nn.heads import (
     AutoregressiveConfig,
@@ -74,11 +74,8 @@ class TokenPolicyConfig:
 
     def __post_init__(self) -> None:
         images, width = self.images, self.decoder.width
-        if self.points and not (self.has_object_tokens and not isinstance(self.head, AutoregressiveConfig)):
-            raise ConfigError(
-                "policy: points needs a token for each object, and a head that is not autoregressive; set it "
-                "to False."
-            )
+        if self.points and not self.has_object_tokens:
+            raise ConfigError("policy: points needs a token for each object; set it to False.")
         check_widths(images.output_width if isinstance(images, VitConfig) else images.width, width)
         if self.resampler is None:
             return
@@ -259,12 +256,13 @@ class TokenPolicy(PolicyNetwork):
         self.decoder = build_decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head = build_head(config.head, width, actions)
-        if isinstance(self.head, ActionHead):
-            self.head.points = config.points
+        self.head.points = config.points
         if token_width == width:
             self._align_attention()
-        # Other heads have no bins, and the other decoder no attention to the prompt alone.
-        has_bins = isinstance(self.head, BinsHead | AutoregressiveHead)
+        # Other heads have no bins, or decode positions twice; the other decoder does not attend to the prompt
+        # alone.
+        is_autoregressive = isinstance(self.head, AutoregressiveHead)
+        has_bins = isinstance(self.head, BinsHead) or (is_autoregressive and not config.points)
         self.explains = has_bins and isinstance(self.decoder, Decoder)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:

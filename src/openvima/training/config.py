@@ -236,6 +236,7 @@ class AugmentationConfig:
             boxes.
         rename_objects_prob: Probability of naming prompt objects by novel nouns: "This is a wug {image}."
             Prompts with novel words of their own stay as they are.
+        turn_comparisons_prob: Probability of asking without "less", with all comparisons turned round.
         shuffle_sentences_prob: Probability of shuffling the sentences that define novel words, and of keeping
             only some of several comparisons.
         distractor_prob: Probability of inserting up to three distractors from another demonstration, in tasks
@@ -258,6 +259,7 @@ class AugmentationConfig:
     inverse_dynamics_prob: Probability = 0.0
     drop_unused_objects_prob: Probability = 0.0
     rename_objects_prob: Probability = 0.0
+    turn_comparisons_prob: Probability = 0.0
     shuffle_sentences_prob: Probability = 0.0
     distractor_prob: Probability = 0.0
     text_description_prob: Probability = 0.0

@@ -96,13 +96,13 @@ _PAPERS: Mapping[str, Any] = {
     "augmentation.centre_picks": True,
     "augmentation.leftmost_first": True,
     "augmentation.rename_objects_prob": 0.3,
+    "augmentation.turn_comparisons_prob": 0.7,
     "augmentation.shuffle_sentences_prob": 0.3,
     "augmentation.distractor_prob": 0.3,
 }
 _PAPERS_MIDAS: Mapping[str, Any] = {
     **_PAPERS,
     "preset": "midas-nano",
-    "model.points": None,  # its head is autoregressive
     "augmentation.leftmost_first": False,
     "augmentation.inverse_dynamics_prob": 0.33,
 }
@@ -240,7 +240,7 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     pretraining = {"pretraining.steps": None} if others.get("init_from") else {}
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
-    if tokens != "objects" or others.get("model.head") == "autoregressive":
+    if tokens != "objects":
         unfit = {"model.points"}
     if others.get("model.head") == "autoregressive":
         unfit |= {"augmentation.leftmost_first"}

@@ -91,7 +91,7 @@ def decode_observations(
 
 
 _POSITIONS = (ACTION_PARTS["pose0_position"], ACTION_PARTS["pose1_position"])
-_AT_OBJECT_M = 0.06  # a decoded place within this distance of an object is meant to be at one
+_NEAR_M = (math.inf, 0.06)  # a decoded place within this distance of an object is meant to be at one
 # The loss, a mean over all steps; its parts as `loss/<name>`; and the decoded actions, (B, T, C).
 ActionLoss = tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]
 
@@ -138,7 +138,7 @@ class ActionHead(nn.Module):
         query_BTD = observations.query(outputs_BTQD)
         loss, metrics, actions_BTC = self.action_loss(query_BTD, targets)
         if self.points:
-            actions_BTC = point_at_objects(actions_BTC, query_BTD, observations, greedy)
+            actions_BTC = point_at_objects(actions_BTC, query_BTD, query_BTD, observations, greedy)
         found = loss, metrics, actions_BTC
         return add_pointing(found, self.pointing_weight, query_BTD, query_BTD, observations, targets)
 
@@ -157,7 +157,7 @@ class ActionHead(nn.Module):
         query_BTD = observations.query(outputs_BTQD)
         actions_BTC = self.action(query_BTD, strategy)
         if self.points:
-            actions_BTC = point_at_objects(actions_BTC, query_BTD, observations, strategy)
+            actions_BTC = point_at_objects(actions_BTC, query_BTD, query_BTD, observations, strategy)
         return actions_BTC, cache
 
     def _segment(
@@ -214,27 +214,37 @@ def pointing_loss(
 
 def point_at_objects(
     actions_BTC: torch.Tensor,
-    query_BTD: torch.Tensor,
+    pick_BTD: torch.Tensor,
+    place_BTD: torch.Tensor,
     observations: ObservationTokens,
     strategy: DecodingStrategy,
 ) -> torch.Tensor:
-    """Move each pick to the centre of the object that the output points at, and places at objects likewise.
+    """Move each pick to the centre of the object that its output points at, and places at objects likewise.
 
     Independent bins of two equally good picks may give the column of one and the row of the other; see
     results/2026-11-28_vima_pointing.md. A place that is near no object stays.
     """
-    points_BTQ2 = observations.points_BTQ2
-    assert points_BTQ2 is not None
     actions_BTC = actions_BTC.clone()
-    for half, limit_m in ((0, math.inf), (1, _AT_OBJECT_M)):
-        slot_BT = strategy(_score_objects(half, query_BTD, observations))
-        point_BT2 = at(points_BTQ2, slot_BT)
-        decoded_BT12 = actions_BTC[..., None, _POSITIONS[half]].to(points_BTQ2)
-        is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < limit_m)[..., None]
-        actions_BTC[..., _POSITIONS[half]] = torch.where(is_near_BT1, point_BT2, decoded_BT12.squeeze(2)).to(
-            actions_BTC.dtype
-        )
+    for half, query_BTD in enumerate((pick_BTD, place_BTD)):
+        point_at_object(half, actions_BTC, query_BTD, observations, strategy)
     return actions_BTC
+
+
+def point_at_object(
+    half: int,
+    actions_BTC: torch.Tensor,
+    query_BTD: torch.Tensor,
+    observations: ObservationTokens,
+    strategy: DecodingStrategy,
+) -> None:
+    """Do so in place with the pick, half 0, or the place, half 1; see `point_at_objects`."""
+    points_BTQ2, part = observations.points_BTQ2, _POSITIONS[half]
+    assert points_BTQ2 is not None
+    slot_BT = strategy(_score_objects(half, query_BTD, observations))
+    decoded_BT12 = actions_BTC[..., None, part].to(points_BTQ2)
+    is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < _NEAR_M[half])[..., None]
+    position_BT2 = torch.where(is_near_BT1, at(points_BTQ2, slot_BT), decoded_BT12.squeeze(2))
+    actions_BTC[..., part] = position_BT2.to(actions_BTC.dtype)
 
 
 def _score_objects(half: int, query_BTD: torch.Tensor, observations: ObservationTokens) -> torch.Tensor:

@@ -34,6 +34,8 @@ from openvima.policies.nn.action_head import (
     decode_observations,
     encode_bins,
     fit_bins,
+    point_at_object,
+    point_at_objects,
 )
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
@@ -80,6 +82,7 @@ class AutoregressiveHead(nn.Module):
     """
 
     pointing_weight = 0.0  # see `ActionHead`
+    points = False
 
     def __init__(self, hidden_width: int, width: int, actions: "ComponentTokens") -> None:
         super().__init__()
@@ -104,8 +107,11 @@ class AutoregressiveHead(nn.Module):
         pairs = zip(self.classifiers, outputs_BTCD.unbind(2), strict=True)
         logits = [classifier(output) for classifier, output in pairs]
         loss, metrics, bins_BTC = bins_loss(logits, targets)
-        found = loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
         pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
+        if self.points:
+            actions_BTC = point_at_objects(actions_BTC, pick_BTD, place_BTD, observations, greedy)
+        found = loss, metrics, actions_BTC
         return add_pointing(found, self.pointing_weight, pick_BTD, place_BTD, observations, targets)
 
     def decode_step(
@@ -119,17 +125,38 @@ class AutoregressiveHead(nn.Module):
     ) -> tuple[torch.Tensor, KVCache]:
         """Decode the next action autoregressively.
 
+        A position that is read from an object replaces the decoded one before the next component is decoded.
         The returned cache ends with the observation: the action joins it with the next one, as it was sent.
         """
         previous = self._segment(previous_BTC, has_previous_BT)
         outputs_BTQD, cache = decode_observations(decoder, cache, observations, previous)
-        output_BTD, ahead, bins = observations.query(outputs_BTQD), cache, []
-        for component, classifier in enumerate(self.classifiers):
-            bins.append(strategy(classifier(output_BTD)))
-            if component + 1 < ACTION_WIDTH:
-                token_BTD = self.actions.embed(component, bins[-1])
-                output_BTD, ahead = decoder(ahead, token_BTD, torch.ones_like(bins[-1], dtype=torch.bool))
-        return actions_from_bins(torch.stack(bins, dim=-1), outputs_BTQD.dtype), cache
+        output_BTD, ahead = observations.query(outputs_BTQD), cache
+        bins_BTC = encode_bins(torch.zeros(*output_BTD.shape[:2], ACTION_WIDTH, device=output_BTD.device))
+        actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+
+        def read(component: int) -> None:
+            nonlocal output_BTD, ahead
+            token_BTD = self.actions.embed(component, bins_BTC[..., component])
+            exists_BT = torch.ones_like(bins_BTC[..., component], dtype=torch.bool)
+            output_BTD, ahead = decoder(ahead, token_BTD, exists_BT)
+
+        half_width = ACTION_WIDTH // 2
+        for half in (0, 1):
+            before, first = (output_BTD, ahead), half * half_width
+            for component in range(first, first + half_width):
+                bins_BTC[..., component] = strategy(self.classifiers[component](output_BTD))
+                if component + 1 < ACTION_WIDTH:
+                    read(component)
+                actions_BTC[..., component] = actions_from_bins(bins_BTC, outputs_BTQD.dtype)[..., component]
+                if self.points and component == first + 1:
+                    point_at_object(half, actions_BTC, before[0], observations, strategy)
+                    moved = slice(first, component + 1)
+                    unit_BTC = to_unit_range(actions_BTC.to(torch.float64))
+                    bins_BTC[..., moved] = encode_bins(unit_BTC)[..., moved]
+                    output_BTD, ahead = before
+                    read(first)
+                    read(first + 1)
+        return actions_BTC, cache
 
     def _segment(self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor) -> TokenSegment:
         # Bins need all digits, whatever the network computes in.

@@ -27,6 +27,7 @@ from openvima.training.augmentation.prompts import (
     rename_objects,
     shuffle_prompt_objects,
     shuffle_sentences,
+    turn_comparisons,
     with_motion_prompt,
 )
 from openvima.training.config import AugmentationConfig
@@ -256,6 +257,7 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
         of_tasks=(
             Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
             Randomly(config.rename_objects_prob, rename_objects),
+            Randomly(config.turn_comparisons_prob, turn_comparisons),
             Randomly(config.shuffle_sentences_prob, shuffle_sentences),
             # after those that look for images
             partial(

@@ -135,6 +135,23 @@ def shuffle_sentences(episode: PreprocessedEpisode, rng: np.random.Generator) ->
     return with_prompt(episode, text, images_by_name(episode.prompt))
 
 
+_COMPARISON = re.compile(r"(\{\w+\}) is (\w+) than (\{\w+\})")
+_LESS = re.compile(r"\bless (?=\w+ \{)")
+
+
+def turn_comparisons(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
+    """Ask without "less", and turn all comparisons round, which means the same.
+
+    "{a} is kobar than {b}. Put the less kobar {c} …"    "{b} is kobar than {a}. Put the kobar {c} …"
+
+    Where half of the prompts say "less", neither the comparisons nor the objects tell anything by themselves
+    of the one to pick, and a network hardly begins to learn what they tell together.
+    """
+    text, count = _LESS.subn("", episode.prompt.text)
+    text = _COMPARISON.sub(r"\3 is \2 than \1", text)
+    return with_prompt(episode, text, images_by_name(episode.prompt)) if count else episode
+
+
 def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Put a paraphrase in place of a prompt; tasks without any, and prompts of other forms, are unchanged.
 
