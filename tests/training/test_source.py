@@ -1,5 +1,6 @@
 """Demonstrations before a training: opened, checked and split; and false positives in their batches."""
 
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 
@@ -35,6 +36,7 @@ from openvima.training.source import (
     check_words,
     make_order,
     open_demonstrations,
+    repeat_tasks,
     split_examples,
 )
 from small_networks import collate_examples, examples_of, rngs_of
@@ -132,6 +134,21 @@ def test_the_split_follows_from_the_episode_and_keeps_everything(data):
     assert names_of(least) <= names_of(kept)
     with pytest.raises(DatasetError, match="no demonstration to train on"):
         split_examples(cache, validation_fraction=1.0, validation_episodes=1)
+
+
+def test_demonstrations_of_repeated_tasks_are_shown_as_often_as_asked_in_an_epoch(data, settings):
+    cache = open_object_cache(Dataset(data))
+    training, _ = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
+    repeats = TrainingConfig.of({**settings, "loader.repeat_tasks": "rotate=3, "}).loader.repeats
+    order = make_order(repeat_tasks(training, repeats), batch_size=1, seed=0, bucket=0, rank=0, num_ranks=1)
+    source = repeat_tasks(training, repeats)
+    shown = Counter(source[int(order.rows(n)[0])].row for n in range(order.batches_per_epoch))
+    assert shown == {e.row: 3 if e.episode.task == "rotate" else 1 for e in training}
+    assert 3 in shown.values() and 1 in shown.values()
+    with pytest.raises(ConfigError, match="no task 'rotat'"):
+        repeat_tasks(training, {"rotat": 2})
+    with pytest.raises(ConfigError, match="repeat_tasks has 'rotate=0'"):
+        resolve(TrainingConfig.of({**settings, "loader.repeat_tasks": "rotate=0"}))
 
 
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):

@@ -53,7 +53,9 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
     """
     if config.preset not in PRESETS:
         config = replace(config, preset=own_policies().get(config.preset, config.preset))
-    loader = replace(config.loader, exclude_tasks=",".join(config.loader.excluded_tasks))
+    repeats = ",".join(f"{name}={count}" for name, count in sorted(config.loader.repeats.items()))
+    excluded = ",".join(config.loader.excluded_tasks)
+    loader = replace(config.loader, exclude_tasks=excluded, repeat_tasks=repeats)
     config, augmentation = replace(config, loader=loader), config.augmentation
     if loader.detected_prob and loader.boxes is None:
         raise ConfigError(

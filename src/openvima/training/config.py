@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from openvima.errors import ConfigError, unknown_name
+from openvima.errors import ConfigError, echo, unknown_name
 from openvima.input_files import settle
 from openvima.policies.presets import PRESETS, own_policies
 from openvima.training.validation import (
@@ -51,6 +51,8 @@ class LoaderConfig:
             drawn per demonstration and batch; together with `detected_prob` at most 1.
         exclude_tasks: Tasks that the run must not see, comma-separated: in no stage, vocabulary or
             validation.
+        repeat_tasks: Tasks whose demonstrations an epoch shows several times, such as
+            "novel_adj=2,twist=3"; each of the others is shown once.
     """
 
     batch_size: Count = 64
@@ -63,11 +65,30 @@ class LoaderConfig:
     detected_fraction: Probability = 1.0
     rerendered_prob: Probability = 0.0
     exclude_tasks: str = ""
+    repeat_tasks: str = ""
 
     @property
     def excluded_tasks(self) -> tuple[str, ...]:
         """The excluded tasks, sorted."""
         return tuple(sorted({name.strip() for name in self.exclude_tasks.split(",")} - {""}))
+
+    @property
+    def repeats(self) -> dict[str, int]:
+        """How often an epoch shows the demonstrations of tasks, by name.
+
+        Raises:
+            ConfigError: `repeat_tasks` has another form.
+        """
+        found = {}
+        for part in filter(None, self.repeat_tasks.replace(" ", "").split(",")):
+            name, _, count = part.partition("=")
+            if not (count.isdecimal() and 1 <= int(count) <= 100):
+                raise ConfigError(
+                    f"loader.repeat_tasks has {echo(repr(part))}; give TASK=COUNT, counts from 1 to 100, "
+                    "with commas between them."
+                )
+            found[name] = int(count)
+        return found
 
 
 @dataclass(frozen=True, slots=True)

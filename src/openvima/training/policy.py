@@ -47,6 +47,7 @@ from openvima.training.source import (
     check_words,
     open_demonstrations,
     read_actions,
+    repeat_tasks,
     split_examples,
 )
 
@@ -233,11 +234,12 @@ class _Stages:
     def _examples(self) -> tuple[ExampleSource, ExampleSource]:
         """Demonstrations to train on, and held-out ones."""
         loader = self.config.loader
-        return split_examples(
+        training, validation = split_examples(
             self._caches[0][0],
             validation_fraction=loader.validation_fraction,
             validation_episodes=loader.validation_episodes,
         )
+        return repeat_tasks(training, loader.repeats), validation
 
     @cached_property
     def _caches(self) -> list[tuple[ObjectCache, float]]:

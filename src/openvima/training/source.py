@@ -1,6 +1,7 @@
 """The demonstrations of a run before its first step: opened, checked, and split for validation."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,21 @@ def split_examples(
     kept = np.sort(kept[np.argsort(hashes[kept], kind="stable")[:validation_episodes]])
     first, second = (ExampleSource(cache, rows, bases, lengths[rows]) for rows in (training, kept))
     return first, second
+
+
+def repeat_tasks(source: ExampleSource, repeats: Mapping[str, int]) -> ExampleSource:
+    """Let an epoch show the demonstrations of some tasks several times.
+
+    Raises:
+        ConfigError: There is no such task.
+    """
+    tasks = source.cache.dataset.index.column("task").to_numpy(zero_copy_only=False)[source.rows]
+    known = {*tasks, *list_tasks()}
+    for name in repeats.keys() - known:
+        raise ConfigError(f"loader.repeat_tasks: {unknown_name('task', name, known)}")
+    counts = [repeats.get(task, 1) for task in tasks]
+    rows, lengths = np.repeat(source.rows, counts), np.repeat(source.lengths, counts, axis=0)
+    return replace(source, rows=rows, lengths=lengths)
 
 
 def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: int) -> ExampleSource:
