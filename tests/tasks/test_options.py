@@ -1,5 +1,7 @@
 """Task options as text, and distractors in every task that has some."""
 
+import math
+
 import pytest
 
 from openvima.catalog.partitions import PUBLISHED_LEVELS, PUBLISHED_TASKS
@@ -119,13 +121,34 @@ def test_every_task_takes_up_to_six_distractors(task: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "option", "value", "message"),
+    ("task", "options", "message"),
     [
-        ("rearrange", "distractor_textures", ["x"], "no choice of distractor_textures"),
-        ("novel_adj", "meanings", 5, "meanings is 5; give some of shorter, taller"),
-        ("novel_adj", "adjectives", 5, "adjectives is 5; give a word or a list of words"),
+        *((task, {"difficulty": "hart"}, "no difficulty 'hart'.*'hard'") for task in PUBLISHED_TASKS),
+        *(
+            (task, {"num_distractors": 7}, "num_distractors is 7; give an integer from 0 to 6")
+            for task in WITH_DISTRACTORS
+            if task != "manipulate_old_neighbor"  # whose grid has room for 8
+        ),
+        ("rotate", {"num_distractors": 1.0}, "num_distractors is 1.0"),
+        ("rotate", {"angles_deg": (30, 0)}, "must be larger than 15 degrees"),
+        ("rotate", {"angles_deg": (math.nan,)}, "angles_deg"),
+        ("twist", {"angles_deg": "30"}, "give a list of degrees"),
+        ("twist", {"num_examples": 0}, "num_examples is 0; give an integer from 1 to 6"),
+        ("follow_motion", {"num_frames": True}, "num_frames is True; give an integer from 2 to 10"),
+        ("follow_order", {"num_blocks": 5}, "num_blocks is 5; give an integer from 2 to 4"),
+        ("rearrange", {"num_objects": 4}, "num_objects is 4; give an integer from 1 to 3"),
+        ("rearrange", {"conflict_rate": math.nan}, "conflict_rate is nan; give a number from 0 to 1"),
+        ("rearrange", {"distractor_textures": "pol"}, "'pol'. Did you mean 'pool'"),
+        ("rearrange", {"distractor_textures": ["x"]}, "no choice of distractor_textures"),
+        ("novel_noun", {"nouns": "dax"}, "nouns holds 'dax'; give at least 2 different words"),
+        ("novel_noun", {"nouns": ["dax", "two words", "{x}", 3]}, r"holds 'two words', '\{x\}', 3; give"),
+        ("novel_adj", {"adjectives": []}, "adjectives holds nothing; give at least 1"),
+        ("novel_adj", {"adjectives": 5}, "adjectives is 5; give a word or a list of words"),
+        ("novel_adj", {"meanings": ["darkr"]}, "no meaning 'darkr'. Did you mean 'darker'"),
+        ("novel_adj", {"meanings": 5}, "meanings is 5; give some of shorter, taller"),
+        ("refer_by_number", {"template": 99}, "template is 99; give an integer from 0 to 13"),
     ],
-)
-def test_an_option_of_another_type_is_named(task: str, option: str, value: object, message: str) -> None:
+)  # fmt: skip
+def test_an_option_out_of_range_is_refused(task: str, options: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        sample_episode(task, seed=0, **{option: value})
+        sample_episode(task, level=task_spec(task).levels[0], seed=0, **options)

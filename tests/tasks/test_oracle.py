@@ -9,7 +9,7 @@ from openvima.catalog import Assets
 from openvima.errors import OracleError
 from openvima.render.labels import label_raster
 from openvima.scene import Action, AtPose, Placement, Pose, Problem, Scene, angle_difference
-from openvima.tasks import Progress, begin, list_tasks, make_rng, oracle_action, sample_episode, task_spec
+from openvima.tasks import Progress, begin, make_rng, oracle_action, sample_episode
 from openvima.tasks.oracle import visible_point
 from task_cases import REPRESENTATIVE_TASKS
 
@@ -123,7 +123,3 @@ def test_a_finished_episode_leaves_the_oracle_without_an_action(assets: Assets) 
     problem = sample_episode("rotate", seed=0).problem
     with pytest.raises(OracleError, match="nothing left to do"):
         oracle_action(problem, Progress(()), problem.scene, assets=assets, rng=RNG)
-
-
-def test_all_three_tasks_of_the_first_release_are_covered_here() -> None:
-    assert {task_spec(task).end_effector for task in list_tasks()} == {"suction", "spatula"}

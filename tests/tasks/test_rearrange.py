@@ -3,9 +3,8 @@
 import pytest
 
 from openvima.catalog import TEXTURE_SETS, Assets, pool
-from openvima.errors import ConfigError, OracleError
 from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem
-from openvima.tasks import advance, begin, make_rng, oracle_action, sample_episode
+from openvima.tasks import sample_episode
 from openvima.tasks.table import is_in_the_way
 from task_cases import assert_frequencies, assert_uniform, judged, pictured
 
@@ -61,14 +60,6 @@ def test_only_a_single_object_has_a_distractor_and_half_of_these_are_in_its_way(
     single = (bool(p.prerequisites) for p in problems if len(p.goals) == 1)
     assert_frequencies(single, {True: 0.5, False: 0.5})
     assert not any(p.prerequisites for p in problems if len(p.goals) > 1)
-
-
-@pytest.mark.slow
-def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
-    drawn_from = pool(TASK, "train")
-    movables = [placement for problem in problems for placement, _ in moves(problem)]
-    assert_uniform((placement.object for placement in movables), drawn_from.dragged_objects)
-    assert_uniform((placement.texture for placement in movables), drawn_from.dragged_textures)
 
 
 @pytest.mark.parametrize("level", ["train", "L2", "L3"])
@@ -169,12 +160,6 @@ def test_a_parked_distractor_leaves_the_target_to_the_object(conflict: Problem) 
         assert judged(conflict, {distractor: parked}, {own.id: target})[1].success
 
 
-def test_an_object_on_top_of_the_distractor_is_a_failure(conflict: Problem) -> None:
-    ((own, target),) = moves(conflict)
-    outcome = judged(conflict, {own.id: target})[1]
-    assert outcome.failure and "is within 0.1 m of the target of" in outcome.reason
-
-
 @pytest.mark.parametrize(("distance", "success"), [(0.099, False), (0.101, True)])
 def test_at_the_end_the_distractor_must_be_away_from_target_and_object(
     conflict: Problem, distance: float, success: bool
@@ -195,68 +180,3 @@ def test_a_distractor_may_be_anywhere_until_the_object_is_there(clean: Problem) 
     assert judged(clean, on_target)[1] == Outcome()
     assert judged(clean, on_target, {distractor: FAR_AWAY}, {own.id: target})[1].success
     assert judged(clean, on_target, {own.id: target})[1].failure
-
-
-def test_a_lost_object_is_a_failure(conflict: Problem) -> None:
-    own, _ = ids(conflict)
-    outcome = judged(conflict, {own: FAR_AWAY})[1]
-    assert outcome.failure and "left the workspace" in outcome.reason
-
-
-@pytest.mark.parametrize(
-    ("options", "num_steps"),
-    [
-        ({"num_objects": 1, "conflict_rate": 0}, 1),
-        ({"num_objects": 1, "conflict_rate": 1}, 2),
-        ({"num_objects": 2}, 2),
-        ({"num_objects": 3}, 3),
-    ],
-)
-def test_the_oracle_needs_a_step_an_object_and_one_to_clear_the_target(
-    options: dict[str, object], num_steps: int, assets: Assets
-) -> None:
-    problem = sample_episode(TASK, seed=5, **options).problem
-    rng, scene, progress, outcome = (
-        make_rng("user", TASK, "train", 5, "oracle"),
-        problem.scene,
-        begin(problem),
-        0,
-    )
-    picked = []
-    for _ in range(num_steps):
-        picked.append(oracle_action(problem, progress, scene, assets=assets, rng=rng).pick_id)
-        wanted = [g for g in (*problem.prerequisites, *problem.goals) if isinstance(g, AtPose)]
-        scene = scene.with_poses({g.object_id: g.target for g in wanted if g.object_id == picked[-1]})
-        progress, outcome = advance(problem, progress, scene)
-    assert outcome.success
-    assert picked == [g.object_id for g in (*problem.prerequisites, *problem.goals)]
-    with pytest.raises(OracleError, match="nothing left to do"):
-        oracle_action(problem, progress, scene, assets=assets, rng=rng)
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "message"),
-    [
-        ("num_objects", 4, "num_objects is 4; give an integer from 1 to 3"),
-        ("num_objects", 0, "num_objects is 0"),
-        ("conflict_rate", 1.5, "conflict_rate is 1.5; give a number from 0 to 1"),
-        ("conflict_rate", float("nan"), "conflict_rate is nan"),
-        ("distractor_textures", "pol", "no choice of distractor_textures 'pol'. Did you mean 'pool'"),
-        ("difficulty", "extreme", "no difficulty 'extreme'"),
-    ],
-)
-def test_bad_options_are_refused(option: str, value: object, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        sample_episode(TASK, seed=0, **{option: value})
-
-
-def test_with_compat_a_distractor_in_the_way_starts_at_the_height_of_the_object() -> None:
-    sunk = 0
-    for seed in range(150):
-        options = {"num_objects": 1, "conflict_rate": 1, "compat": True}
-        problem = sample_episode(TASK, seed=seed, **options).problem
-        ((own, target),), distractor = moves(problem), distractor_of(problem)
-        assert distractor is not None and (own.id, distractor.id) == (5, 6)
-        assert distractor.pose == target and target.z == pytest.approx(own.size[2] / 2)
-        sunk += distractor.object == "block" and own.object != "block"
-    assert sunk > 0

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from openvima.catalog import TEXTURE_SETS
-from openvima.errors import ConfigError
 from openvima.scene import InZone, NeverTouches, ObjectImage, Placement, Problem, ZoneKeptClear, block_points
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.pushes import Rectangle
@@ -68,12 +67,6 @@ def test_difficulty_brings_more_blocks(task: str, difficulty: str, most: int) ->
     ]
     nums_swept = [len(blocks(episode.problem)[0]) for episode in sampled]
     assert_frequencies(nums_swept, {num: 0.5 if num == most else 0.25 for num in (1, 2, 3)})
-
-
-@TASKS
-def test_an_unknown_difficulty_is_told_what_there_is(task: str) -> None:
-    with pytest.raises(ConfigError, match=r"'hart'.*'hard'"):
-        sample_episode(task, level=level_of(task), seed=0, difficulty="hart")
 
 
 @TASKS

@@ -117,22 +117,6 @@ def test_distractors_may_touch_the_line_but_not_reach_into_the_area() -> None:
     assert outcome.failure and outcome.reason.endswith("is in the goal zone")
 
 
-@pytest.mark.parametrize("num_required", [1, 2, 3])
-def test_exactly_the_asked_number_counts(num_required: int) -> None:
-    problem = problem_with(num_required)
-    for num_swept, swept in enumerate([(), *(groups(problem)[0][:n] for n in (1, 2, 3))]):
-        places = {object_id: (0.39, 0.05 * (i - 1)) for i, object_id in enumerate(swept)}
-        outcome = judged(problem, places)
-        assert outcome.success is (num_swept == num_required)
-        assert outcome.failure is (num_swept > num_required)
-
-
-def test_an_open_block_must_stay_in_the_workspace() -> None:
-    problem = problem_with(1)
-    assert judged(problem, {groups(problem)[0][0]: (0.751, 0.0)}).failure
-    assert not judged(problem, {groups(problem)[1][0]: (0.751, 0.0)}).is_over
-
-
 @pytest.mark.parametrize("difficulty", LENGTHS)
 @pytest.mark.slow
 def test_the_oracle_never_touches_the_line(difficulty: str) -> None:
