@@ -58,12 +58,6 @@ def test_a_folder_is_replaced_as_a_whole(tmp_path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
-def test_an_empty_folder_may_be_there(tmp_path) -> None:
-    (tmp_path / "folder").mkdir()
-    write(tmp_path / "folder", "new")
-    assert content(tmp_path / "folder") == {"new"}
-
-
 def test_a_failure_leaves_the_old_folder_and_nothing_of_the_new_one(tmp_path) -> None:
     write(tmp_path / "folder", "old")
     with pytest.raises(OSError, match="disk is full"), atomic_folder(tmp_path / "folder") as folder:
@@ -71,14 +65,6 @@ def test_a_failure_leaves_the_old_folder_and_nothing_of_the_new_one(tmp_path) ->
         raise OSError("disk is full")
     assert content(tmp_path / "folder") == {"old"}
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
-
-
-def test_a_link_leads_to_what_is_replaced(tmp_path) -> None:
-    write(tmp_path / "folder", "old")
-    (tmp_path / "link").symlink_to(tmp_path / "folder")
-    write(tmp_path / "link", "new")
-    assert (tmp_path / "link").is_symlink()
-    assert content(tmp_path / "folder") == {"new"}
 
 
 @pytest.mark.parametrize("step", [1, 2, 3, 4, 5])

@@ -12,7 +12,7 @@ import pytest
 
 import worker_jobs
 from openvima import multiprocess
-from openvima.errors import ConfigError, SceneError, WorkerError
+from openvima.errors import SceneError, WorkerError
 from openvima.multiprocess import imap_unordered
 
 
@@ -73,13 +73,6 @@ def test_a_script_without_a_guard_is_named_and_not_a_lack_of_memory(tmp_path: Pa
     assert 'if __name__ == "__main__":' in last and "memory" not in last
 
 
-def test_one_worker_counts_over_all_items(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    counts = []
-    list(imap_unordered(worker_jobs.write_number, [tmp_path / "a", tmp_path / "b"], 1, report=counts.append))
-    assert counts == [3, 6]
-
-
 @pytest.mark.slow
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     paths = [tmp_path / "a", tmp_path / "b"]
@@ -106,12 +99,6 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     finally:
         for pid in filter(is_alive, workers):
             os.kill(pid, signal.SIGKILL)
-
-
-@pytest.mark.parametrize("num_workers", [0, -1, 5000])
-def test_a_number_of_workers_that_cannot_be_is_refused(num_workers: int) -> None:
-    with pytest.raises(ConfigError, match=rf"workers is {num_workers}; it must lie within 1 … 1024\."):
-        list(imap_unordered(worker_jobs.write_number, [], num_workers))
 
 
 @pytest.mark.parametrize(

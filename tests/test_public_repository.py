@@ -71,12 +71,3 @@ def test_the_container_follows_the_commands_of_the_readme() -> None:
     assert f"openvima {tests} " in container
     command = yaml.safe_load(re.search(r"^CMD (.*)$", container, re.MULTILINE)[1])
     assert f"\n{' '.join(command[:-1])} " in readme
-
-
-def test_issue_templates_are_forms() -> None:
-    forms = [f for f in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml") if f.name != "config.yml"]
-    assert len(forms) == 3
-    for form in forms:
-        values = yaml.safe_load(form.read_text("utf-8"))
-        assert {"name", "description", "body"} <= set(values)
-        assert all(field["attributes"]["label"] for field in values["body"])

@@ -2,11 +2,10 @@
 
 import importlib
 import inspect
-import sys
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import pytest
 from openvima import TabletopEnv
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.evaluation import EpisodeOutcome, Results, Row
-from openvima.scene import Prompt, RenderedPrompt
+from openvima.scene import Prompt
 
 PACKAGES = ("", ".data", ".evaluation", ".env", ".tasks", ".scene", ".policies", ".serving")
 MANY = 200
@@ -113,20 +112,3 @@ def test_names_are_escaped_and_numbers_shown(shown: dict[str, Any]) -> None:
     assert "a &lt;b&gt;" in shown["dataset"]._repr_html_()
     prompt = Prompt("Say <i> {a}.", shown["prompt"].images[:0])
     assert "Say &lt;i&gt;" in (prompt._repr_html_() or "")
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_notebooks_without_jinja_show_text(
-    kind: str, shown: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from openvima import html
-
-    html._environment.cache_clear()
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    assert shown[kind]._repr_html_() is None
-
-
-def test_a_prompt_that_does_not_match_its_images_is_text(shown: dict[str, Any]) -> None:
-    assert RenderedPrompt("Put {a} there.", {})._repr_html_() is None
-    demo = replace(shown["demonstration"], prompt=RenderedPrompt("Put {a} there.", {}))
-    assert demo._repr_html_() is None

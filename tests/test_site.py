@@ -10,7 +10,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from build_site import Pages, code_page, site_path
-from notebook_pages import cells, run, write_notebooks
+from notebook_pages import cells
 from openvima.tasks import list_tasks, task_spec
 from reference_pages import public_names
 
@@ -80,12 +80,6 @@ def test_the_site_builds_without_warnings_dead_links_and_missing_names(tmp_path:
         assert page.count('class="output"') >= 4, notebook
 
 
-def test_a_dead_link_is_found(tmp_path: Path) -> None:
-    (tmp_path / "a.html").write_text('<a id="x" href="b.html#y"></a><a href="b.html#z"></a><img src="c.png">')
-    (tmp_path / "b.html").write_text('<a id="y" href="a.html#x"></a><a href="https://other.site/"></a>')
-    assert sorted(dead_links(tmp_path)) == ["a.html: b.html#z", "a.html: c.png"]
-
-
 def test_public_names_are_those_of_every_package_and_the_errors() -> None:
     names = public_names()
     assert {"make", "play", "compose"} <= set(names["openvima"])
@@ -146,20 +140,3 @@ def test_the_notebook_is_that_of_its_script_and_has_pictures(script: Path) -> No
 
 def test_notebooks_are_small() -> None:
     assert sum(path.with_suffix(".ipynb").stat().st_size for path in NOTEBOOKS) <= 1_500_000
-
-
-@pytest.mark.slow
-def test_the_command_writes_the_notebooks(tmp_path: Path) -> None:
-    write_notebooks(tmp_path)
-    for script in NOTEBOOKS:
-        written = json.loads((tmp_path / f"{script.stem}.ipynb").read_text(encoding="utf-8"))
-        kept = json.loads(script.with_suffix(".ipynb").read_text(encoding="utf-8"))
-        assert source(written) == source(kept)
-        assert outputs(written) == outputs(kept)
-
-
-def test_a_cell_shows_what_it_prints_and_returns() -> None:
-    names: dict[str, object] = {}
-    assert run("x = 3", names, "cell") == ("", "")
-    printed, returned = run("print('a < b')\nx + 1", names, "cell")
-    assert printed == '<pre class="output">a &lt; b</pre>' and ">4<" in returned

@@ -7,11 +7,9 @@ from pathlib import Path
 import pytest
 
 from openvima import user_code
-from openvima.errors import ConfigError, SceneError
+from openvima.errors import ConfigError
 from openvima.user_code import (
     call_function,
-    is_code,
-    load_file,
     load_function,
     source_hash,
     without_folder,
@@ -117,25 +115,3 @@ def test_what_cannot_be_loaded_is_named_in_one_line(source, message, file, monke
         call_function(source, what="policy")
     assert "\n" not in str(caught.value)
     assert not {"bad", "syntax", "leaves", "missing"} & (set(sys.modules) - modules)
-
-
-def test_errors_of_the_package_pass_unchanged(file):
-    file.write_text("from openvima.errors import SceneError\ndef make():\n    raise SceneError('it is lost')")
-    with pytest.raises(SceneError, match=r"^it is lost$"):
-        call_function(f"{file}:make", what="policy")
-
-
-@pytest.mark.parametrize("text", ["a.b:make", "x y.py:make", "/a/b=c/x.py:make", "./x.py:_Policy"])
-def test_code_is_told_from_its_form(text):
-    assert is_code(text)
-
-
-@pytest.mark.parametrize("text", ["ws://127.0.0.1:8000", "run:1", "runs/a:b", "a:", ":b", "x.py", "own/er"])
-def test_other_names_are_no_code(text):
-    assert not is_code(text)
-
-
-def test_a_file_must_be_a_python_file(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("x = 1\n")
-    with pytest.raises(ConfigError, match=r"FILES names '.*notes.txt', which is no Python file"):
-        load_file(tmp_path / "notes.txt", what="FILES")

@@ -4,8 +4,6 @@ import hashlib
 import io
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -87,17 +85,6 @@ def test_an_import_equals_its_checkout(checkout):
     )
 
 
-def test_the_pack_is_loaded_once(checkout):
-    import_pack(checkout)
-    assert load_assets("original") is load_assets("original")
-
-
-def test_without_an_import_the_command_is_named():
-    with pytest.raises(AssetError, match=r"not been imported.*`openvima assets import CHECKOUT`"):
-        load_assets("original")
-    assert imported_pack() is None
-
-
 def test_missing_and_damaged_files_are_named_and_the_rest_is_imported(checkout):
     in_pack(checkout, "kitting/cross.obj").unlink()
     in_pack(checkout, "textures/granite.png").write_bytes(png(100)[:-20])
@@ -169,17 +156,6 @@ def test_a_changed_byte_in_the_archive_is_noticed(checkout):
         load_assets("original").geometry("heart", SIZE)
 
 
-def test_decoded_files_that_were_damaged_are_decoded_again(checkout):
-    import_pack(checkout)
-    decoded = list(cache_dir().rglob("*.npy"))
-    assert len(decoded) == 4  # two meshes and two images
-    for path in decoded:
-        path.write_bytes(path.read_bytes()[:-20])
-    assets = OriginalAssets(checkout)  # has loaded nothing yet, unlike the import
-    assert assets.texture("granite").min() == assets.texture("granite").max() == 100
-    assert set(np.unique(assets.geometry("cross", SIZE).visual.vertices[..., 2] != 0)) == {False, True}
-
-
 needs_reference = pytest.mark.skipif(
     not (REFERENCE / original.PACK_FOLDER).is_dir(),
     reason=f"{REFERENCE} is absent; OPENVIMA_REFERENCE_ASSETS names another folder",
@@ -217,18 +193,3 @@ def test_golden_import_equals_the_checkout_bit_for_bit(imported_reference, monke
                 else mine == other
             )
             assert same, name
-
-
-@needs_reference
-def test_golden_import_is_the_same_in_another_process(imported_reference):
-    code = (
-        "import hashlib; from openvima.catalog import load_assets; p = load_assets('original');"
-        "d = hashlib.sha256(p.texture('tiger').tobytes());"
-        "d.update(p.geometry('pan', (0.1, 0.1, 0.1)).visual.vertices.tobytes()); print(d.hexdigest())"
-    )
-    environment = {**os.environ, "OPENVIMA_CACHE": str(imported_reference)}
-    runs = {
-        subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, env=environment).stdout
-        for _ in "ab"
-    }
-    assert len(runs) == 1

@@ -69,14 +69,6 @@ def test_a_function_registers_assets_once_and_names_the_pack_without_its_folder(
     assert EnvConfig(assets=BAR).record()["assets"] == "user_shapes.py:bar"
 
 
-def test_a_function_may_return_a_pack_and_nothing_else() -> None:
-    assert load_assets(f"{FILE}:pack").name == "user_shapes.py:pack"
-    with pytest.raises(AssetError, match="returned a int; return None, or an object with the methods"):
-        load_assets(f"{FILE}:number")
-    with pytest.raises(ConfigError, match="no function 'nothing'"):
-        load_assets(f"{FILE}:nothing")
-
-
 def test_a_record_never_runs_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(FILE.parent)
     with pytest.raises(AssetError, match=r"user_shapes\.py:bar, code that is not run"):

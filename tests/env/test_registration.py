@@ -5,9 +5,7 @@ import sys
 
 import pytest
 
-from openvima.env import register_environments
-from openvima.env.registration import environment_id, make
-from openvima.errors import ConfigError
+from openvima.env.registration import environment_id
 from openvima.tasks import list_tasks
 
 
@@ -47,19 +45,3 @@ def test_openvima_alone_does_not_import_gymnasium() -> None:
     code = "import openvima, sys; print('gymnasium' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"levels": "L1"}, "'levels'. Did you mean 'level'.*render_mode.*difficulty"),
-    ],
-)
-def test_what_is_no_option_is_named(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        make("rotate", **options)
-
-
-def test_registering_twice_changes_nothing() -> None:
-    register_environments()  # Gymnasium warns when a name is overridden, and warnings are errors here
-    register_environments()

@@ -1,18 +1,13 @@
 """Episodes prepared ahead."""
 
 import zlib
-from collections.abc import Callable
 from typing import Any  # infos are nested dictionaries
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import create_empty_array
 
 import openvima
 from openvima.env import TabletopEnv, stack_actions
-from openvima.env.vector import _Part
 from openvima.errors import ConfigError, SamplingError
 from openvima.scene import RenderedPrompt
 from openvima.tasks import sample_episode
@@ -122,67 +117,6 @@ def test_what_cannot_be_prepared_raises_and_changes_nothing(monkeypatch: pytest.
             env.prepare(5)
     assert env.episode.seed == 3
     assert start_of(env, seed=5) == start_of(TabletopEnv("rotate"), seed=5)
-
-
-class Recorder(gymnasium.Env):
-    """Lasts `length` steps, and records what it is asked to do."""
-
-    observation_space = gymnasium.spaces.Discrete(2)
-
-    def __init__(self, length: int, calls: list[tuple[int, str]], index: int) -> None:
-        self.length, self.num_steps, self.record = length, 0, lambda name: calls.append((index, name))
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[int, dict]:
-        self.record("reset")
-        self.num_steps = 0
-        return 0, {}
-
-    def step(self, action: object) -> tuple[int, float, bool, bool, dict]:
-        self.num_steps += 1
-        return 1, 0.0, self.num_steps == self.length, False, {}
-
-    def prepare(self, seed: None) -> None:
-        self.record("prepare")
-        raise SamplingError("a reset will report it")
-
-
-def recorders(mode: AutoresetMode) -> tuple[_Part, Callable[[], list[tuple[int, str]]]]:
-    """Three environments, of which the last one ends first, and what prepares all that can be."""
-    calls: list[tuple[int, str]] = []
-    envs = [Recorder(length, calls, index) for index, length in enumerate([9, 9, 1])]
-    played = _Part(envs, [()] * 3, mode, create_empty_array(Recorder.observation_space, 3))
-
-    def prepared() -> list[tuple[int, str]]:
-        calls.clear()
-        while played.prepare():
-            pass
-        return list(calls)
-
-    return played, prepared
-
-
-def test_each_is_prepared_once_and_first_what_the_next_step_resets() -> None:
-    played, prepared = recorders(AutoresetMode.NEXT_STEP)
-    assert prepared() == []  # no episode has begun
-    played.reset([None, None, None], np.ones(3, bool))
-    played.step(np.zeros(3))
-    assert prepared() == [(2, "prepare"), (0, "prepare"), (1, "prepare")]
-    assert prepared() == []
-    played.step(np.zeros(3))
-    assert prepared() == [(2, "prepare")]
-
-
-@pytest.mark.parametrize(
-    ("mode", "expected"), [(AutoresetMode.NEXT_STEP, [(2, "prepare")]), (AutoresetMode.DISABLED, [])]
-)
-def test_resets_with_seeds_are_not_expected_to_be_followed_by_others(
-    mode: AutoresetMode, expected: list[tuple[int, str]]
-) -> None:
-    played, prepared = recorders(mode)
-    played.reset([1, 2, 3], np.ones(3, bool))
-    assert prepared() == []
-    played.step(np.zeros(3))
-    assert prepared() == expected
 
 
 @pytest.mark.slow

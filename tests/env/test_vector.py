@@ -18,7 +18,6 @@ from openvima.errors import (
     ConfigError,
     EpisodeError,
     OracleError,
-    SamplingError,
     UnknownTaskError,
 )
 from openvima.policies import RandomPolicy
@@ -192,16 +191,6 @@ def test_prompts_and_observations_feed_a_policy(pair: VectorEnv) -> None:
     policy.reset([single.prompt])
     assert frozen(actions[1]) == frozen(policy.act([observation])[0])
     pair.step(stack_actions(actions))
-
-
-def test_after_a_reset_that_failed_no_step_moves_anything() -> None:
-    mode = AutoresetMode.NEXT_STEP
-    envs = TabletopVectorEnv([Faulty, Faulty], [(), ()], mode, 0)
-    envs.reset(seed=[1, 2])
-    with pytest.raises(SamplingError):
-        envs.reset(seed=[3, 13])
-    with pytest.raises(EpisodeError, match=r"0, 1 have no running episode; call reset\(\)"):
-        envs.step(stack_actions([None, None]))
 
 
 def test_after_a_step_that_failed_no_step_moves_anything(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -387,14 +376,6 @@ def test_what_cannot_be_built_is_refused_at_once(num_workers: int) -> None:
         build("rotate", 1, autoreset_mode="Never")
     with pytest.raises(ConfigError, match="an entry of tasks is 5; give a name, or a mapping with 'task'"):
         build([5])
-
-
-@pytest.mark.parametrize("num_workers", [-1, 3])
-def test_a_number_of_workers_that_cannot_be_is_refused(num_workers: object) -> None:
-    with pytest.raises(
-        ConfigError, match=f"num_workers is {num_workers!r}; with 2 sub-environments give 0 to 2"
-    ):
-        openvima.make_vec("rotate", 2, num_workers=num_workers)
 
 
 def test_environments_of_different_spaces_do_not_make_a_batch() -> None:

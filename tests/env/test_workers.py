@@ -2,8 +2,6 @@
 
 import functools
 import os
-import pickle
-import select
 import signal
 import subprocess
 import sys
@@ -15,7 +13,6 @@ import gymnasium
 import pytest
 from gymnasium.vector import AutoresetMode
 
-import openvima
 from faulty_environments import FailsToStart, Faulty
 from openvima.env import stack_actions
 from openvima.env.vector import TabletopVectorEnv
@@ -104,14 +101,6 @@ def test_an_error_in_a_worker_reaches_the_caller_and_ends_all() -> None:
 
 
 @pytest.mark.slow
-def test_an_error_that_cannot_be_sent_ends_all_too() -> None:
-    envs = build()
-    with pytest.raises(WorkerError, match="cannot be pickled"):
-        envs.reset(seed=[14, 1])
-    assert not any(process.is_alive() for process in envs.processes)
-
-
-@pytest.mark.slow
 def test_a_killed_worker_is_reported_and_ends_all() -> None:
     envs = build()
     envs.reset(seed=0)
@@ -124,43 +113,9 @@ def test_a_killed_worker_is_reported_and_ends_all() -> None:
     envs.close()
 
 
-@pytest.mark.slow
-def test_closing_after_a_kill_is_quiet() -> None:
-    envs = build()
-    envs.processes[0].kill()
-    envs.processes[0].join()
-    envs.close()
-    assert [process.exitcode for process in envs.processes] == [-signal.SIGKILL, -signal.SIGTERM]
-
-
 def test_a_worker_that_does_not_start_is_reported() -> None:
     with pytest.raises(WorkerError, match=r"0 \(exit code 3\).* could not start: .*__main__"):
         build(FailsToStart())
-
-
-@pytest.mark.slow
-def test_an_argument_that_cannot_be_sent_is_refused_and_changes_nothing() -> None:
-    envs = build()
-    envs.reset(seed=0)
-    with pytest.raises((AttributeError, pickle.PicklingError)):
-        envs.call("prepare", lambda: 0)
-    assert envs.get_attr("step_s") == (0.0, 0.0)
-    envs.close()
-
-
-@pytest.mark.slow
-def test_closed_environments_leave_no_file_handles() -> None:
-    def num_handles() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
-    counts = []
-    for _ in range(2):
-        envs = openvima.make_vec("rotate", 2, num_workers=2)
-        envs.reset(seed=0)
-        envs.close()
-        del envs
-        counts.append(num_handles())
-    assert counts[1] <= counts[0]  # the first starts the process that looks after shared resources
 
 
 @pytest.mark.slow
@@ -174,26 +129,6 @@ def test_ctrl_c_ends_everything_with_one_traceback(start: Start) -> None:
     assert process.returncode == -signal.SIGINT
     assert errors.count("Traceback") == 1
     assert errors.endswith("KeyboardInterrupt\n")
-    wait_until_gone(workers)
-
-
-@pytest.mark.slow
-def test_workers_leave_ctrl_c_to_their_parent_from_the_first_moment_on(start: Start) -> None:
-    process = start(SCRIPT + GUARD + "main()")
-    process.stdout.readline()
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    while not select.select([process.stdout], [], [], 0.005)[0]:  # until all have started
-        for pid in children.read_text(encoding="utf-8").split():
-            os.kill(int(pid), signal.SIGINT)
-    workers = [int(pid) for pid in process.stdout.readline().split()]
-    assert len(workers) == 2
-    for pid in workers:
-        os.kill(pid, signal.SIGINT)
-    time.sleep(0.2)
-    assert all(map(is_running, workers))
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=300)
-    assert errors.count("Traceback") == 1
     wait_until_gone(workers)
 
 
@@ -219,12 +154,3 @@ def test_workers_do_not_outlive_their_parent(start: Start) -> None:
     _, errors = process.communicate(timeout=300)
     assert "Traceback" not in errors
     wait_until_gone(workers)
-
-
-@pytest.mark.slow
-def test_a_script_without_a_guard_gets_a_hint(start: Start) -> None:
-    process = start(SCRIPT + "main()")
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 1
-    assert "WorkerError: the worker of sub-environment" in errors
-    assert 'need `if __name__ == "__main__":`' in errors

@@ -247,12 +247,6 @@ def test_whole_frames_are_halved_with_halves_rounded_up() -> None:
         assert (whole_frames(dict.fromkeys(VIEWS, corner)).crops == mean).all()
 
 
-@pytest.mark.parametrize(("height", "width"), [(7, 12), (8, 11), (0, 12)])
-def test_frames_that_cannot_be_halved_are_refused(height: int, width: int) -> None:
-    with pytest.raises(ShapeError, match="even height and width"):
-        whole_frames(noise(shape=(height, width)))
-
-
 def test_images_of_another_shape_or_dtype_are_refused() -> None:
     rgb, segm = noise(), empty()
     with pytest.raises(ShapeError, match="rgb 'front'"):
@@ -261,44 +255,6 @@ def test_images_of_another_shape_or_dtype_are_refused() -> None:
         extract_objects({**rgb, "front": rgb["front"].transpose(1, 2, 0)}, segm, [ID])
     with pytest.raises(ShapeError, match="segm 'top'"):
         extract_objects(rgb, {**segm, "top": segm["top"][:-1]}, [ID])
-
-
-def test_a_missing_view_is_named() -> None:
-    rgb, segm = noise(), empty()
-    with pytest.raises(PolicyError, match="rgb lacks the view top; it must hold an image of front and top"):
-        extract_objects({"front": rgb["front"]}, segm, [ID])
-    with pytest.raises(PolicyError, match="segm lacks the view front"):
-        extract_objects(rgb, {"top": segm["top"]}, [ID])
-    with pytest.raises(PolicyError, match="rgb lacks the view front and top"):
-        whole_frames(rgb["front"])
-
-
-@pytest.mark.parametrize("number", [-1, 256])
-def test_ids_that_no_segmentation_holds_are_refused(number: int) -> None:
-    with pytest.raises(PolicyError, match="0 … 255"):
-        extract_objects(noise(), empty(), [5, number])
-
-
-@pytest.mark.parametrize("part", ["rgb", "segm", "ee"])
-def test_a_missing_part_of_an_observation_is_named(part: str) -> None:
-    seen = {"rgb": noise(), "segm": empty(), "ee": 0}
-    del seen[part]
-    with pytest.raises(PolicyError, match=f"no '{part}'; it must hold 'rgb' and 'ee'"):
-        observe(seen)
-
-
-@pytest.mark.parametrize("effector", [2, -1, 0.0, "suction", None, [0]])
-def test_an_end_effector_that_does_not_exist_is_refused(effector: object) -> None:
-    with pytest.raises(PolicyError, match=r"must be 0 \(suction\) or 1 \(spatula\)"):
-        observe({"rgb": noise(), "segm": empty(), "ee": effector})
-
-
-def test_observations_and_prompt_images_of_another_size_are_refused() -> None:
-    rgb, segm = noise(shape=(64, 128)), empty((64, 128))
-    with pytest.raises(ShapeError, match=r"\(3, 64, 128\); it must be \(3, 128, 256\)"):
-        observe({"rgb": rgb, "segm": segm, "ee": 0})
-    with pytest.raises(ShapeError, match=r"\(3, 128, 256\)"):
-        observe_prompt_image(PromptImage("scene", "scene", rgb, segm, ()))
 
 
 def test_an_image_of_more_objects_than_any_scene_is_refused_before_it_is_cropped(monkeypatch) -> None:

@@ -5,11 +5,8 @@ import re
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from openvima.catalog import OBJECTS, TEXTURES, load_assets
-from openvima.catalog.procedural import ProceduralAssets
-from openvima.errors import AssetError
 from openvima.render import Rasteriser, gallery
 from openvima.render.gallery import PICTURES, draw_thumbnail, write_gallery
 
@@ -42,20 +39,6 @@ def test_letters_stand_upright_and_a_hole_is_transparent(rasteriser) -> None:
     letter = draw_thumbnail(rasteriser, "letter A", "blue", "top")[..., 3]
     assert letter[:80].astype(bool).sum() < letter[160:].astype(bool).sum()  # narrow above, wide below
     assert draw_thumbnail(rasteriser, "ring", "blue", "top")[120, 160, 3] == 0
-
-
-class _Incomplete(ProceduralAssets):
-    """A pack without tiger fur and hearts."""
-
-    def texture(self, texture_name: str) -> np.ndarray:
-        if texture_name == "tiger":
-            raise AssetError("textures/tiger.jpg is missing")
-        return super().texture(texture_name)
-
-    def geometry(self, object_name, size, scale=(1.0, 1.0, 1.0)):
-        if object_name == "heart":
-            raise AssetError("kitting/heart.obj is missing")
-        return super().geometry(object_name, size, scale)
 
 
 @pytest.fixture
@@ -100,20 +83,3 @@ def test_the_page_says_where_things_are_used(tmp_path, quick_portraits) -> None:
     assert "D_train" in cards["letter A"] and "9.0 × 10.3 × 3.3 cm" in cards["letter A"]
     assert "78, 121, 167" in cards["blue"] and "C2" in cards["blue"]
     assert "256 × 256 pixels" in cards["tiger"]
-
-
-@pytest.mark.slow
-def test_swatches_show_the_whole_texture_in_a_bounded_size(tmp_path, quick_portraits) -> None:
-    write_gallery(tmp_path, load_assets())
-    with Image.open(tmp_path / PICTURES / "texture-polka-dot.png") as swatch:
-        assert swatch.size == (288, 240)
-    with Image.open(tmp_path / PICTURES / "texture-blue.png") as swatch:
-        assert swatch.getcolors() == [(swatch.width * swatch.height, (78, 121, 167))]
-
-
-@pytest.mark.slow
-def test_what_a_pack_lacks_is_reported_and_the_rest_is_shown(tmp_path, quick_portraits) -> None:
-    page, problems = write_gallery(tmp_path, _Incomplete())
-    assert set(problems) == {"textures/tiger.jpg is missing", "kitting/heart.obj is missing"}
-    text = page.read_text(encoding="utf-8")
-    assert "texture tiger is missing" in text and 'id="heart"' in text

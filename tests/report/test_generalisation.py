@@ -8,7 +8,7 @@ from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.report import write_report
-from openvima.report.ablations import rate_figures, rated
+from openvima.report.ablations import rate_figures
 from openvima.report.published import models_by_task, published_task_table, published_tasks
 from openvima.report.table import Estimate, Table
 from openvima.report.tables import FAMILIES, family_table, level_drop_table, level_figure
@@ -68,11 +68,6 @@ def test_the_drop_is_absolute_and_relative_with_intervals_and_published_ones_bes
     assert [figure.tick(x) for x in (0.0, 1.0, 2.0)] == ["L1", "L2", "L4"]
 
 
-def test_one_level_has_no_drop():
-    results = Results(whole("mine", L1=16))
-    assert level_drop_table(results) is None and level_figure(results) is None
-
-
 @pytest.fixture
 def ablated() -> Results:
     plain = [row("mine", task, "L1", n) for task, n in (("rotate", 20), ("twist", 10))]
@@ -97,12 +92,6 @@ def test_rates_become_curves_with_the_plain_score_at_zero(ablated):
     assert crowded.panels[0].title == "L1 (1 task)"
     assert [(crowded.tick(point.x), point.rate) for point in default.points] == [("default", 1)]
     assert [(point.x, round(point.rate, 3)) for point in curve.points] == [(2, 0.6), (6, 0.3)]
-
-
-def test_only_a_number_after_a_name_is_a_rate():
-    assert rated("masked_words:0.5") == ("masked_words", 0.5)
-    for name in ("", "no_prompt", "a:0.5", "masked_words:nan", "masked_words:0.2+noisy_boxes:3", "a:1+b"):
-        assert rated(name) == (name, None)
 
 
 def test_all_published_rates_by_task_stand_beside_measured_ones():

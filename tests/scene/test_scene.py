@@ -141,11 +141,6 @@ def test_a_rendered_prompt_reads_as_an_interleaved_sequence() -> None:
     assert prompt.sequence() == ["Put the", a, "into the", b, "."]
 
 
-def test_a_rendered_prompt_without_an_image_is_refused() -> None:
-    with pytest.raises(PromptError, match="names images"):
-        RenderedPrompt("Put the {a}.", {}).sequence()
-
-
 BLOCK_SIZE = (0.03, 0.03, 0.03)
 
 

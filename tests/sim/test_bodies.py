@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.scene import Action, Pose, Scene
+from openvima.scene import Pose, Scene
 from openvima.sim import World
 from openvima.sim.bodies import Bodies
 from openvima.sim.model import body_shape
@@ -77,16 +77,6 @@ def test_friction_of_a_pair_is_the_product_of_both(sliding, ground, friction) ->
     assert way == pytest.approx(speed**2 / (2 * friction * 9.8), rel=0.12)  # v² / (2 μ g)
 
 
-def test_two_slippery_bodies_have_the_product_too() -> None:
-    size = 0.03
-    scene = table(("small block", 0.5, 0.0, 0.0), fixed=(("small block", 0.5, 0.0, 0.0),))
-    bodies = Bodies(scene.with_poses({5: Pose((0.495, 0.0, 0.014 + size))}), ASSETS)
-    bodies.tick(60)
-    bodies._velocities[0, 0] = 0.15
-    bodies.tick(120)
-    assert bodies.pose(0).x - 0.495 == pytest.approx(0.15**2 / (2 * 0.25 * 9.8), rel=0.12)
-
-
 def test_bodies_at_rest_need_no_physics_and_others_do() -> None:
     scene = table(("letter A", 0.4, 0.0, 0.0), ("block", 0.6, 0.0, 0.0))
     assert is_at_rest(Bodies(scene, ASSETS))
@@ -124,15 +114,6 @@ def test_random_actions_never_lose_a_body(seed) -> None:
             else:
                 assert -0.03 < now.pose.z < 0.6, (action, now)
                 assert now.pose.planar_distance(before.pose) < 3.0, (action, now)
-
-
-@pytest.mark.slow
-def test_a_heap_of_bodies_in_one_another_comes_apart() -> None:
-    names = ("bowl", "container", "letter A") * 3
-    bodies = [(name, 0.5 + 0.01 * i, 0.01 * i, 0.3 * i) for i, name in enumerate(names)]
-    world = World(table(*bodies), ASSETS)
-    world.execute(Action.planar((0.5, 0.0), (0.6, 0.2)))
-    assert all(abs(placement.pose.z) < 0.6 for placement in world.scene.placements)
 
 
 def digest() -> str:

@@ -67,13 +67,6 @@ def test_an_interrupted_study_ends_with_the_same_points(tmp_path: Path) -> None:
     assert [cost["demonstrations"] for cost in (*costs["all"], *costs["half"])] == [2, 1]
 
 
-def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
-    study = replace(STUDY, runs=(Run("oracle", policy="oracle"),))
-    (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ConfigError, match="not empty and holds no study"):
-        run_study(study, INPUTS, tmp_path)
-
-
 def test_a_folder_of_another_study_or_of_another_process_is_refused(tmp_path: Path) -> None:
     study = replace(STUDY, runs=(Run("oracle", policy="oracle"),))
     run_study(study, INPUTS, tmp_path)

@@ -67,11 +67,6 @@ def test_odd_sizes_are_refused_before_a_file_is_made(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_frames_of_another_size_are_refused(tmp_path):
-    with pytest.raises(ShapeError, match="the video takes"):
-        write_video(tmp_path / "video.mp4", [plain((0, 0, 0)), plain((0, 0, 0), width=66)])
-
-
 def test_an_interrupted_video_leaves_the_earlier_one(tmp_path):
     path = write_video(tmp_path / "video.mp4", [plain((9, 9, 9))] * 3)
     whole = path.read_bytes()
@@ -120,30 +115,12 @@ def test_a_narrow_strip_wraps_and_nothing_is_cut_off(prompt):
         assert len(columns_of(narrow, colour)) == len(columns_of(wide, colour))
 
 
-def test_a_picture_wider_than_the_strip_is_scaled_down(prompt):
-    strip = draw_prompt_strip(prompt, width=60)
-    assert strip.shape[1] == 60
-    assert columns_of(strip, RED).max() < 60 - 2
-
-
 @pytest.mark.parametrize("width", [60, 200, 333, 768])
 def test_strips_have_the_asked_width_and_an_even_height(prompt, width):
     strip = draw_prompt_strip(prompt, width=width)
     assert strip.dtype == np.uint8
     assert strip.shape[1:] == (width, 3)
     assert strip.shape[0] % 2 == 0
-
-
-def test_strips_of_equal_prompts_are_equal(prompt):
-    assert np.array_equal(draw_prompt_strip(prompt, width=500), draw_prompt_strip(prompt, width=500))
-
-
-def test_a_full_stop_stays_with_the_picture_before_it(prompt):
-    for width in range(150, 420, 9):
-        strip = draw_prompt_strip(prompt, width=width)
-        ink = (strip < 60).all(axis=2)
-        below = ink[rows_of(strip, RED).max() + 12 :]
-        assert not below.any(), f"the full stop went to a line of its own at width {width}"
 
 
 def test_pictures_of_objects_are_cut_to_the_object(prompt):
