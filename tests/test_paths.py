@@ -11,11 +11,8 @@ from openvima.data import Dataset, GenerateConfig, verify
 from openvima.data.lerobot import LerobotConfig
 from openvima.data.published import ImportConfig
 from openvima.data.subsets import MergeConfig, SubsetConfig
-from openvima.errors import InputFileError, UnknownPolicyError
 from openvima.evaluation import EvaluationConfig, Results, score
 from openvima.evaluation.config import plan
-from openvima.evaluation.sources import policy_sources
-from openvima.input_files import cache_dir, expand_home
 from openvima.policies import RandomPolicy, load_policy
 
 
@@ -84,21 +81,6 @@ def test_settings_with_a_list_take_a_single_name_and_any_list(make: Callable[...
     assert getattr(make(**{name: ["rotate", "twist"]}), name) == ("rotate", "twist")
 
 
-def test_a_single_data_set_is_merged_alone(home: Path) -> None:
-    assert MergeConfig("~/a", Path("b")).sources == (home / "a",)  # type: ignore[arg-type]
-
-
-def test_policies_may_be_paths(home: Path) -> None:
-    config = EvaluationConfig((Path("run"), "mine=~/other", "oracle"))  # type: ignore[arg-type]
-    assert [source.source for source in config.sources] == ["./run", f"{home}/other", "oracle"]
-    assert [source.name for source in config.sources] == ["run", "mine", "oracle"]
-
-
-def test_initial_weights_may_be_a_path(home: Path) -> None:
-    assert training(init_from=Path("run")).init_from == "./run"
-    assert training(t5="~/t5-base").t5 == f"{home}/t5-base"
-
-
 @pytest.mark.parametrize("kind", [str, Path])
 def test_a_policy_is_loaded_from_text_path_and_home(home: Path, kind: Callable) -> None:
     pytest.importorskip("torch")
@@ -109,12 +91,6 @@ def test_a_policy_is_loaded_from_text_path_and_home(home: Path, kind: Callable) 
     policy.save_pretrained(kind("~/runs/mine"))
     for given in ("runs/mine", "~/runs/mine"):
         assert isinstance(load_policy(kind(given)), NetworkPolicy)
-
-
-def test_a_path_is_never_the_name_of_a_policy(home: Path) -> None:
-    assert isinstance(load_policy("random"), RandomPolicy)
-    with pytest.raises(UnknownPolicyError, match=r"\./random"):
-        load_policy(Path("random"))
 
 
 @pytest.mark.parametrize("kind", [str, Path])
@@ -129,59 +105,7 @@ def test_data_and_results_are_named_by_text_path_and_home(home: Path, kind: Call
     assert not Path("~").exists()
 
 
-def test_a_file_of_settings_names_the_home(home: Path) -> None:
-    pytest.importorskip("torch")
-    from openvima.training.recipes import read_settings
-
-    Path("run.yaml").write_text("out: ~/run\ndata: ~/demos\ninit_from: ~/first\n", encoding="utf-8")
-    settings = read_settings(Path("run.yaml"))
-    assert training(**settings).out == home / "run"
-    assert training(**settings).data == home / "demos"
-    assert training(**settings).init_from == str(home / "first")
-
-
-def test_an_existing_path_is_a_policy_whatever_it_is_named(home: Path) -> None:
-    for name in ("lr=0.001", "mine"):
-        (home / "runs" / name).mkdir(parents=True)
-    sources = policy_sources(["runs/lr=0.001", "mine2=runs/mine", "x=./my policies.py:make"])
-    assert [source.name for source in sources] == ["lr-0.001", "mine2", "x"]
-    assert [source.source for source in sources] == ["runs/lr=0.001", "runs/mine", "./my policies.py:make"]
-
-
 def test_batches_of_other_processes_have_whole_paths(home: Path) -> None:
     (home / "lr=0.001").mkdir()
     (batch,) = plan(EvaluationConfig("lr=0.001", tasks="rotate", levels="L1", episodes=1))  # type: ignore
     assert batch.with_whole_paths().source == str(home / "lr=0.001")
-
-
-def test_a_detector_lies_at_home(home: Path) -> None:
-    from openvima.detector import detector_folder
-
-    (home / "boxes").mkdir()
-    assert detector_folder("~/boxes") == home / "boxes"
-    with pytest.raises(InputFileError, match="no folder"):
-        detector_folder("~/others")
-
-
-@pytest.mark.parametrize(
-    ("given", "expanded"),
-    [
-        ("~/demos", "HOME/demos"),
-        ("--out=~/demos", "--out=HOME/demos"),
-        ("--loader.object-cache=~/a b", "--loader.object-cache=HOME/a b"),
-        ("mine=~/runs/lr=0.1", "mine=HOME/runs/lr=0.1"),
-        ("~", "HOME"),
-        ("runs/~/a", "runs/~/a"),
-        ("--out=a~", "--out=a~"),
-        ("Put the ~ here", "Put the ~ here"),
-    ],
-)
-def test_words_name_the_home(given: str, expanded: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/users/me")
-    assert expand_home(given) == expanded.replace("HOME", "/users/me")
-
-
-def test_the_cache_may_be_named_from_home(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/users/me")
-    monkeypatch.setenv("OPENVIMA_CACHE", "~/cache")
-    assert cache_dir() == Path("/users/me/cache")

@@ -8,7 +8,7 @@ import pytest
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
 from openvima.catalog.procedural import ProceduralAssets
-from openvima.errors import AssetError, UnknownNameError
+from openvima.errors import AssetError
 
 SIZE = (0.16, 0.16, 0.05)
 
@@ -61,11 +61,6 @@ def test_shared_arrays_cannot_be_written_to():
 def test_objects_of_one_size_share_their_shape():
     pack = ProceduralAssets()
     assert pack.geometry("hexagon", (0.13, 0.14, 0.035)) is pack.geometry("hexagon", (0.14, 0.13, 0.035))
-
-
-def test_an_unknown_texture_is_refused():
-    with pytest.raises(UnknownNameError, match="Did you mean 'tiger'"):
-        ProceduralAssets().texture("tigre")
 
 
 def test_shapes_and_textures_are_equal_in_another_process():

@@ -22,7 +22,7 @@ from openvima.catalog import (
 )
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.original import OriginalAssets
-from openvima.errors import AssetError, ConfigError, ShapeError, UnknownNameError
+from openvima.errors import AssetError, ConfigError, UnknownNameError
 from user_shapes import CORNERS, TRIANGLES, boxes, restored_assets
 
 SIZE = (0.06, 0.04, 0.02)
@@ -151,21 +151,6 @@ def test_an_unfit_mesh_is_refused_with_the_name_and_the_limit(mesh: Any, message
 
 
 @pytest.mark.parametrize(
-    "mesh",
-    [
-        (CORNERS,),
-        3,
-        (CORNERS[:, :2], TRIANGLES),
-        (CORNERS, TRIANGLES.astype(float)),
-        ([[1], [1, 2]], TRIANGLES),
-    ],
-)
-def test_arrays_of_another_form_are_refused(mesh: Any) -> None:
-    with pytest.raises(ShapeError, match=r"'brick'.* give an OBJ file, or"):
-        register_brick(mesh=mesh)
-
-
-@pytest.mark.parametrize(
     "text",
     [
         "",
@@ -267,19 +252,3 @@ def test_an_unfit_png_file_is_refused(tmp_path: Path, content: bytes, message: s
     file.write_bytes(content)
     with pytest.raises(AssetError, match=f"'news'.*{message}"):
         register_texture("news", file)
-
-
-@pytest.mark.parametrize(
-    ("image", "error"),
-    [
-        (np.zeros((4, 4, 3)), ShapeError),
-        (np.zeros((4, 4), np.uint8), ShapeError),
-        (np.zeros((4, 4, 4), np.uint8), ShapeError),
-        (np.zeros((0, 4, 3), np.uint8), AssetError),
-        (np.zeros((1, 1025, 3), np.uint8), AssetError),
-        ([[1], [1, 2]], ShapeError),
-    ],
-)
-def test_an_unfit_array_is_no_texture(image: np.ndarray, error: type[Exception]) -> None:
-    with pytest.raises(error, match="texture 'news'"):
-        register_texture("news", image)

@@ -8,10 +8,9 @@ import pytest
 
 import openvima
 from openvima.env import TabletopEnv
-from openvima.errors import ActionError, OracleError, SamplingError
+from openvima.errors import OracleError, SamplingError
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from openvima.scene.action import COMMAND_HIGH, COMMAND_LOW, HIGHEST_TIP_Z_M
-from openvima.sim.tool_world import ToolWorld
 
 FIRST_SEED = 3_000_000
 LONGEST_HOLD = 12  # steps
@@ -98,16 +97,3 @@ def test_one_command_repeated_into_a_corner_stops_there(task: str) -> None:
                 assert observation in env.observation_space
                 if terminated or truncated:
                     break
-
-
-def test_errors_and_a_tool_that_has_left_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*args: object, **options: object) -> None:
-        raise ActionError("too far")
-
-    env = make("rotate")
-    monkeypatch.setattr(
-        "openvima.env.running_episode.ToolRun.observed_tool", lambda _: {"tool": np.full(5, 0.9)}
-    )
-    assert "the tool is at (0.9000" in explore(env, 0, steps=1)[-1]
-    monkeypatch.setattr(ToolWorld, "command", fail)
-    assert "ActionError in fail: too far" in explore(env, 0, steps=1)[-1]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from openvima.catalog import load_assets
-from openvima.errors import ConfigError, ShapeError
+from openvima.errors import ShapeError
 from openvima.render import CAMERAS, FRONT, TOP, VIEWS, channels_first, channels_last, project, unproject
 from openvima.render.labels import cell_centres, label_raster
 from openvima.render.raycast import Hit, first_hit, object_below
@@ -45,25 +45,9 @@ def test_a_pixel_of_the_plain_image_is_the_lower_left_one_of_its_enlarged_block(
     )
 
 
-def test_an_enlarged_image_leaves_out_the_same_triangles() -> None:
-    assert TOP.enlarged(3).min_doubled_area_px2 == pytest.approx(9 * TOP.min_doubled_area_px2)
-
-
 def test_a_point_behind_the_camera_is_refused_by_name() -> None:
     with pytest.raises(ShapeError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
         project(np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 1001.0]]), TOP)
-
-
-def test_points_and_pixels_of_wrong_length_are_refused() -> None:
-    with pytest.raises(ShapeError, match="length 3"):
-        project(np.zeros((4, 2)), TOP)
-    with pytest.raises(ShapeError, match="length 2"):
-        unproject(np.zeros(3), TOP)
-
-
-def test_an_image_cannot_be_shrunk() -> None:
-    with pytest.raises(ConfigError, match="from 1"):
-        TOP.enlarged(0)
 
 
 @pytest.mark.parametrize("leading", [(), (5,), (2, 5)])

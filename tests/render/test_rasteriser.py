@@ -6,7 +6,7 @@ import pytest
 from openvima.catalog import OBJECTS
 from openvima.catalog.bodies import block
 from openvima.catalog.procedural import ProceduralAssets
-from openvima.errors import ConfigError, ShapeError, UnknownNameError
+from openvima.errors import ConfigError, ShapeError
 from openvima.render import CAMERAS, VIEWS, Drawable, Rasteriser, project
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
 from sim_cases import COLOURS, BoxAssets
@@ -172,12 +172,6 @@ def test_unfit_ids_textures_and_factors_are_refused(rasteriser) -> None:
         rasteriser.scene(Scene(()), extra=[Drawable(mesh, pose, 3, np.zeros((4, 4)))])
     with pytest.raises(ConfigError):
         rasteriser.scene(Scene(()), enlarge=0)
-
-
-def test_an_unknown_object_is_reported_as_such() -> None:
-    scene = Scene((Placement(5, "teapot", "red", BLOCK, Pose((0.5, 0.0, 0.0))),))
-    with pytest.raises(UnknownNameError, match="teapot"):
-        Rasteriser(ProceduralAssets()).scene(scene)
 
 
 @pytest.mark.parametrize("name", [name for name in OBJECTS if name not in ("stand", "disk")])

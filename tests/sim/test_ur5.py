@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openvima.errors import ActionError, ShapeError
+from openvima.errors import ActionError
 from openvima.sim import ur5
 
 EXAMPLES = [
@@ -57,15 +57,3 @@ def test_a_point_beyond_reach_is_refused_and_the_limit_is_named() -> None:
     with pytest.raises(ActionError):
         ur5.inverse(0.05, 0.0, 0.1, 0.0)
     assert ur5.highest_tip_z(1.5, 0.0) == -math.inf
-
-
-def test_the_farthest_distance_is_where_the_highest_point_is_asked_for() -> None:
-    for z in (0.005, 0.1, 0.3):
-        assert ur5.highest_tip_z(ur5.farthest_tip_distance(z), 0.0) == pytest.approx(z, abs=1e-9)
-    with pytest.raises(ActionError):
-        ur5.farthest_tip_distance(1.0)
-
-
-def test_joints_of_another_shape_are_refused() -> None:
-    with pytest.raises(ShapeError, match="6"):
-        ur5.link_frames(np.zeros(7))
