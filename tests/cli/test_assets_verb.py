@@ -37,12 +37,6 @@ def test_a_gallery_prints_its_page(tmp_path, monkeypatch, capsys):
     assert "31 objects, 82 textures" in page.read_text(encoding="utf-8")
 
 
-def test_a_gallery_of_an_unknown_pack_writes_nothing(tmp_path, capsys):
-    assert main(["assets", "gallery", "--assets", "orignal", "--out", str(tmp_path / "gallery")]) == 2
-    assert "Did you mean 'original'?" in capsys.readouterr().err
-    assert not (tmp_path / "gallery").exists()
-
-
 def test_an_import_says_how_many_files_it_took(tmp_path, monkeypatch, capsys):
     assert import_small_pack(tmp_path, monkeypatch) == 0
     assert "2 of 2 files imported" in capsys.readouterr().out
@@ -57,11 +51,6 @@ def test_an_incomplete_import_lists_what_it_lacks_and_ends_with_1(tmp_path, monk
     assert "1 not imported" in printed.err and "pallet/pallet.urdf differs" in printed.err
     pack = original.imported_pack()
     assert pack is not None and len(pack.files) == 1
-
-
-def test_a_folder_that_is_no_checkout_is_wrong_usage(tmp_path, capsys):
-    assert main(["assets", "import", str(tmp_path)]) == 2
-    assert "give the folder of a VIMABench checkout" in capsys.readouterr().err
 
 
 def test_info_without_an_import_names_the_command(capsys):

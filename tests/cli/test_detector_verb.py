@@ -16,7 +16,6 @@ from openvima.detector import config as sizes  # noqa: E402
 from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
 from openvima.detector.config import DetectorConfig  # noqa: E402
 from openvima.detector.network import MaskRCNN  # noqa: E402
-from openvima.policies.base import torch_threads  # noqa: E402
 from small_networks import one_level_detector  # noqa: E402
 
 
@@ -93,17 +92,6 @@ def test_invalid_options_of_evaluate_give_a_one_line_error(detector, data, capsy
     assert re.search(message, told)
 
 
-def test_scores_do_not_depend_on_the_number_of_threads(detector, data, capsys):
-    def scored(threads: int) -> str:
-        with torch_threads(threads):
-            words = [str(detector), "--data", str(data), "--frames", "4", "--json"]
-            assert main(["detector", "evaluate", *words]) == 0
-            assert torch.get_num_threads() == threads
-        return capsys.readouterr().out
-
-    assert scored(1) == scored(2)
-
-
 def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):
     from openvima.detector import checkpoint
 
@@ -129,13 +117,3 @@ def test_evaluate_plays_with_the_boxes_of_a_trained_detector(detector, tmp_path,
     assert main(["evaluate", *words, *more]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row.get("ablation", "") for row in rows] == ["", "detected_boxes"]
-
-
-@pytest.mark.slow
-def test_demo_records_with_the_boxes_of_a_trained_detector(detector, tmp_path, capsys):
-    video = tmp_path / "video.mp4"
-    words = ["demo", "rotate", "--policy", "untrained", "--out", str(video)]
-    assert main([*words, "--boxes", f"detector={detector}"]) == 0
-    assert video.stat().st_size > 0
-    assert main(["demo", "rotate", "--boxes", "detector"]) == 2
-    assert "uses no boxes" in capsys.readouterr().err

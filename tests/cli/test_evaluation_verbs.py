@@ -14,14 +14,6 @@ def test_tasks_lists_prompt_tool_levels_and_steps(capsys):
     assert "sweep_without_exceeding" in shown and "spatula" in shown and "train L1 L2" in shown
 
 
-def test_tasks_breaks_no_placeholder_on_a_narrow_terminal(capsys, monkeypatch):
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["tasks"]) == 0
-    shown = capsys.readouterr().out
-    assert "{angle_in_degree}" in shown and "8 + 2" in shown
-
-
 def test_tasks_speaks_json(capsys):
     assert main(["tasks", "--json"]) == 0
     tasks = {task["name"]: task for task in json.loads(capsys.readouterr().out)}
@@ -148,11 +140,6 @@ def test_a_preset_is_no_policy(words, tmp_path, monkeypatch, capsys):
 def test_a_report_of_nothing_is_status_2(tmp_path, capsys):
     assert main(["report", str(tmp_path)]) == 2
     assert "openvima evaluate" in capsys.readouterr().err
-
-
-def test_recording_without_a_report_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--policy", "oracle", "--record-video", "rotate/3", "--no-report"]) == 2
-    assert "--record-video needs the report" in capsys.readouterr().err
 
 
 def test_jobs_of_an_array_share_an_evaluation(tmp_path, capsys):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from openvima.cli.main import main
-from openvima.cli.terminal import Pace, plain_lines
+from openvima.cli.terminal import plain_lines
 from openvima.data import Dataset, Shard
 
 WORDS = ["generate", "--tasks", "rotate", "--episodes", "5"]
@@ -67,22 +67,3 @@ def test_without_a_terminal_progress_is_a_line_at_each_stage_and_each_minute(
     assert lines[1] == "training: 60 of 400 (15 %), 1.0/s, 0:05:40 left; pretraining: loss 60"
     assert lines[3] == "training: 150 of 400 (37 %); cloning: loss 150"
     assert lines[-1] == "training: 400 of 400 (100 %), 1.0/s; cloning: loss 400"
-
-
-def test_less_than_one_a_second_is_a_number_a_minute(capsys: pytest.CaptureFixture[str]) -> None:
-    now = iter([0.0, 0.0, 90.0, 90.0])
-    report = plain_lines("evaluation", clock=lambda: next(now))
-    report(0, 32, "")
-    report(16, 32, "")
-    assert capsys.readouterr().err.splitlines()[1] == "evaluation: 16 of 32 (50 %), 10.7/min, 0:01:30 left"
-
-
-def test_the_pace_leaves_out_the_start_of_the_workers() -> None:
-    now = iter([40.0, 100.0, 102.0, 104.0])
-    pace = Pace(lambda: next(now))
-    pace.update(0)
-    assert "left" not in pace.summary(0, 1000)
-    for written in (10, 30, 60):
-        pace.update(written)
-    assert pace.rate == 12.5
-    assert pace.summary(60, 45_060) == "60 of 45,060 (0 %), 12.5/s, 1:00:00 left"

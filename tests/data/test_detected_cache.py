@@ -95,17 +95,6 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
         ObjectCache(dataset, variant="clumsy-3")
 
 
-@pytest.mark.slow
-def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None:
-    folders = [
-        open_object_cache(Dataset(copy), folder=tmp_path / str(workers), boxes=CLUMSY, workers=workers).folder
-        for workers in (1, 2)
-    ]
-    one, two = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in folders)
-    assert one == two
-    assert len(one) == 6
-
-
 def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
     dataset, seen = Dataset(copy), []
 

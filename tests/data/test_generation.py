@@ -1,7 +1,6 @@
 """What generating leaves in a folder, and what it makes of folders that hold something already."""
 
 import json
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from openvima.data import (
 )
 from openvima.data.encoding import Skipped
 from openvima.data.planning import SEEDS_PER_EPISODE, SPARE_SEEDS
-from openvima.data.subsets import SubsetConfig, sample
 from openvima.env import TabletopEnv
 from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.scene import Outcome
@@ -183,21 +181,6 @@ def test_failed_episodes_can_be_asked_for_later_and_are_extended(tmp_path: Path)
     assert contents(tmp_path / "at_last") == contents(tmp_path / "at_once")
 
 
-@pytest.mark.usefixtures("clumsy")
-def test_a_folder_of_failed_episodes_is_not_left_to_grow_old(tmp_path: Path) -> None:
-    generate(config(tmp_path, keep_failed=True))
-    with pytest.raises(DatasetError, match="Give --keep-failed"):
-        generate(config(tmp_path))
-    generate(config(tmp_path, tasks=("rotate",), episodes=1, start_seed=30, force=True))
-    assert not any((tmp_path / "failed").glob("*"))
-
-
-def test_without_failed_episodes_there_is_no_folder_for_them(tmp_path: Path) -> None:
-    generate(config(tmp_path, tasks=("rotate",), episodes=1, keep_failed=True))
-    generate(config(tmp_path, tasks=("rotate",), episodes=1, keep_failed=True))  # nothing is left to do
-    assert not (tmp_path / "failed").exists()
-
-
 def test_every_episode_is_a_solved_one_as_the_environment_shows_it(whole: Path) -> None:
     dataset = Dataset(whole)
     assert len(dataset) == 6
@@ -234,14 +217,6 @@ def test_the_index_tells_where_episodes_are(whole: Path) -> None:
         _ = dataset[6]
 
 
-def test_a_dataset_can_be_sent_to_another_process(whole: Path) -> None:
-    dataset = Dataset(whole, tasks=["rotate"])
-    _ = dataset[0]
-    copy = pickle.loads(pickle.dumps(dataset))
-    assert copy[1].content_hash() == dataset[1].content_hash()
-    assert len(copy) == 3
-
-
 def test_folders_that_are_no_data_set_are_refused(whole: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="there is no folder"):
         Dataset(tmp_path / "gone")
@@ -262,21 +237,6 @@ def test_folders_that_are_no_data_set_are_refused(whole: Path, tmp_path: Path) -
     (tmp_path / "dataset.json").write_bytes((whole / "dataset.json").read_bytes())
     with pytest.raises(DatasetError, match=r"index\.parquet is missing"):
         Dataset(tmp_path)
-
-
-def test_what_another_command_made_is_not_taken_for_a_part_of_the_work(whole: Path, tmp_path: Path) -> None:
-    out = sample(SubsetConfig(whole, tmp_path / "sample"), 1.0)
-    before = contents(out)
-    with pytest.raises(DatasetError, match="`openvima data sample` made it"):
-        generate(config(out, shard_size=None))
-    assert contents(out) == before
-
-
-@pytest.mark.usefixtures("clumsy")
-def test_nothing_is_generated_into_the_folder_of_failed_episodes(tmp_path: Path) -> None:
-    generate(config(tmp_path, tasks=("rotate",), keep_failed=True))
-    with pytest.raises(DatasetError, match="belongs to another data set"):
-        generate(config(tmp_path / "failed", tasks=("rotate",)))
 
 
 @pytest.mark.parametrize("images", [True, False])

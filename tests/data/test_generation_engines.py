@@ -10,7 +10,7 @@ import pytest
 import worker_jobs
 from openvima.data import GenerateConfig, generate, plan
 from openvima.data.manifest import is_finished
-from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
+from openvima.errors import ConfigError, MissingExtraError
 from openvima.multiprocess import ray_imap_unordered
 from small_data_sets import config, contents
 
@@ -65,28 +65,6 @@ def test_ray_stopped_by_hand_leaves_whole_files_and_is_continued(
     assert ray.is_initialized()  # as it was found
 
 
-def test_jobs_on_ray_use_one_thread_each(
-    tmp_path: Path, ray: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    counts = []
-    paths = [tmp_path / str(k) for k in range(3)]
-    done = list(ray_imap_unordered(worker_jobs.write_number, paths, 2, report=counts.append))
-    assert sorted(item for item, _ in done) == paths
-    assert [path.read_text() for path in paths] == ["1"] * 3
-    assert counts[-1] == 9
-
-
-def test_an_error_of_a_job_on_ray_reaches_the_caller(ray: ModuleType) -> None:
-    with pytest.raises(SceneError, match=r"^job 1 fails$"):
-        list(ray_imap_unordered(worker_jobs.fail, [0, 1, 2], 2))
-
-
-def test_a_job_of_ray_that_always_dies_is_reported(ray: ModuleType) -> None:
-    with pytest.raises(WorkerError, match=r"worker of the Ray cluster died.*same command continues"):
-        list(ray_imap_unordered(worker_jobs.die, [0, 1, 2], 2))
-
-
 def test_a_job_of_ray_whose_worker_was_killed_runs_again(ray: ModuleType, tmp_path: Path) -> None:
     paths = [tmp_path / str(k) for k in range(3)]
     done = list(ray_imap_unordered(worker_jobs.die_at_first, paths, 2))
@@ -129,20 +107,6 @@ def test_a_range_of_shards_is_all_that_is_written_and_reported(tmp_path: Path) -
     assert reports[-1] == (3, 3, "")
 
 
-def test_the_plain_command_finishes_what_ranges_began(whole: Path, tmp_path: Path) -> None:
-    generate(config(tmp_path, shard_range=(2, 3)))
-    generate(config(tmp_path))
-    assert contents(tmp_path) == contents(whole)
-
-
-def test_a_range_leaves_the_temporary_files_of_other_ranges_alone(tmp_path: Path) -> None:
-    names = [block.path.name for block in plan(config(tmp_path))]
-    for name in names[:2]:
-        (tmp_path / f".{name}.123.tmp").write_bytes(b"half")
-    generate(config(tmp_path, shard_range=(1, 2)))
-    assert sorted(contents(tmp_path)) == [f".{names[0]}.123.tmp", names[1]]
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -157,12 +121,6 @@ def test_a_range_leaves_the_temporary_files_of_other_ranges_alone(tmp_path: Path
 def test_settings_that_contradict_each_other_are_refused(changes: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=message):
         config(tmp_path, **changes)
-
-
-def test_a_range_beyond_the_last_shard_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"shard_range is 4:6, but shards are numbered from 0 to 3"):
-        generate(config(tmp_path / "out", shard_range=(4, 6)))
-    assert not (tmp_path / "out").exists()
 
 
 def test_large_shards_are_handed_out_first(tmp_path: Path) -> None:

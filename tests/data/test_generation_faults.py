@@ -1,9 +1,7 @@
 """Killed in the middle or on a full disk: no damaged file, nothing finished lost, and the command goes on."""
 
-import contextlib
 import errno
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -16,7 +14,6 @@ import numpy as np
 import pytest
 
 import generation_server
-from openvima.cli.main import main
 from openvima.data import Dataset, generate
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, StorageError
@@ -127,28 +124,6 @@ def _whole_shards(folder: Path, expected: dict[str, bytes]) -> set[str]:
     return {name for name, content in found.items() if content == expected[name]}
 
 
-@pytest.mark.slow
-def test_the_command_killed_with_its_workers_is_continued(whole: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    words = f"generate --tasks {','.join(TASKS)} --episodes 3 --shard-size 2 --workers 2 --out".split()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "openvima", *words, str(out)],
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 300
-    try:
-        while not any(out.glob("*.arrow")) and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    generate(config(out))
-    assert contents(out) == contents(whole)
-
-
 def test_a_run_stopped_by_hand_leaves_whole_files_and_is_continued(whole: Path, tmp_path: Path) -> None:
     def stop(done: int, total: int, note: str) -> None:
         if done == 3:  # in the middle of the writing of the second shard
@@ -209,37 +184,6 @@ def test_a_disk_that_cannot_keep_the_bytes_leaves_no_file_behind(
     with pytest.raises(StorageError, match=r"No space left on device\. 0 of 4 shards are whole"):
         generate(config(tmp_path))
     assert contents(tmp_path) == {}
-
-
-def test_a_quota_reached_while_writing_loses_no_finished_shard(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    generate(config(tmp_path, episodes=1))
-    before = contents(tmp_path)
-    largest = max(map(len, before.values()))
-    words = f"generate --tasks {','.join(TASKS)} --episodes 3 --shard-size 2 --out {tmp_path}".split()
-    with _largest_file(largest + 1000):
-        assert main(words) == 1
-    message = capsys.readouterr().err.strip().splitlines()[-1]
-    assert f"cannot write to {tmp_path}: File too large. 2 of 4 shards are whole and were kept" in message
-    assert "same command then goes on" in message
-    there = contents(tmp_path)
-    del before["dataset.json"]
-    assert there.items() <= before.items()
-    assert {f"{task}-train-00000.arrow" for task in TASKS} <= there.keys()
-    assert main(words) == 0
-    assert contents(tmp_path) == contents(whole)
-
-
-@contextlib.contextmanager
-def _largest_file(num_bytes: int) -> Iterator[None]:
-    """Let the system refuse to make a file longer than that, as a quota does."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.slow

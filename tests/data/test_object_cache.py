@@ -1,7 +1,6 @@
 """The object cache: equal to preprocessing anew, written once, never trusted when damaged or old."""
 
 import os
-import pickle
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from openvima.data import Dataset, GenerateConfig, generate, object_cache
+from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.object_cache import CacheFile, ObjectCache, open_object_cache
 from openvima.data.preprocessed import preprocess
 from openvima.errors import DatasetError
@@ -99,49 +98,6 @@ def test_a_truncated_file_is_made_anew(copy: Path, size: int) -> None:
     assert path.read_bytes() == whole
 
 
-def test_a_shard_of_demonstrations_is_no_cache_file(copy: Path) -> None:
-    with pytest.raises(DatasetError, match="is no readable file"):
-        CacheFile(next(copy.glob("*.arrow")))
-    with pytest.raises(DatasetError, match="is no readable file"):
-        CacheFile(copy / "gone.arrow")
-
-
-def test_a_folder_that_cannot_be_made_is_named(copy: Path) -> None:
-    (copy / "blocked").write_text("a file")
-    with pytest.raises(DatasetError, match=r"cannot write the object cache to .*blocked"):
-        open_object_cache(Dataset(copy), folder=copy / "blocked")
-    with pytest.raises(DatasetError, match="Did you mean 'frames'"):
-        open_object_cache(Dataset(copy), "frame")  # type: ignore[arg-type]
-
-
-def test_a_cache_can_be_sent_to_another_process(demos: Path) -> None:
-    cache = open_object_cache(Dataset(demos, tasks=["rotate"]))
-    _ = cache[0]
-    again = pickle.loads(pickle.dumps(cache))
-    assert_equal(again[3], cache[3])
-    assert [episode.seed for episode in again[1:3]] == [cache[1].seed, cache[2].seed]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_damage_is_found_or_harmless(copy: Path, kind) -> None:
-    cache = open_object_cache(Dataset(copy, tasks=["rotate"]), kind)
-    path = cache.folder / "rotate-train-00000.arrow"
-    whole, rng = path.read_bytes(), np.random.default_rng(0)
-    for _ in range(100):
-        content, start = bytearray(whole), int(rng.integers(len(whole)))
-        content[start : start + 8] = rng.bytes(min(8, len(whole) - start))
-        path.unlink()  # the cache has the old file mapped
-        path.write_bytes(content)
-        try:
-            file = CacheFile(path)
-            episodes = [file[row] for row in range(len(file))]
-        except DatasetError:
-            continue
-        for row, episode in enumerate(episodes):
-            assert_equal(episode, cache[row])
-
-
 @pytest.mark.parametrize("part", ["objects.boxes", "images", "text"])
 def test_a_damaged_row_is_named_where_others_are_read(copy: Path, part: str) -> None:
     cache = open_object_cache(Dataset(copy, tasks=["rotate"]))
@@ -155,21 +111,6 @@ def test_a_damaged_row_is_named_where_others_are_read(copy: Path, part: str) -> 
     assert_equal(damaged[0], cache[0])
     with pytest.raises(DatasetError, match=r"00000\.arrow .* row 1 of 2 is wrong.*`openvima data"):
         damaged[1]
-
-
-def test_files_of_another_version_are_named_and_made_anew(copy: Path, monkeypatch) -> None:
-    monkeypatch.setattr(object_cache, "CACHE_VERSION", 3)
-    folder = open_object_cache(Dataset(copy)).folder
-    monkeypatch.undo()
-    with pytest.raises(
-        DatasetError, match=r"of version '3', not 7\)\. .*`openvima data preprocess` makes it"
-    ):
-        CacheFile(next(folder.iterdir()))
-    with pytest.raises(DatasetError, match=r"lacks 6 shards, .*`openvima data preprocess .*` writes them"):
-        ObjectCache(Dataset(copy))
-    notes = set()
-    again = open_object_cache(Dataset(copy), report=lambda done, total, note: notes.add(note)).folder
-    assert again != folder and notes == {"extracting objects anew; delete objects-v3 of older versions"}
 
 
 def test_any_tool_that_reads_arrow_reads_a_file(demos: Path) -> None:

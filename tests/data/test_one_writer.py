@@ -1,6 +1,5 @@
 """A data folder has one writer; disjoint ranges of shards have one each. A full disk leaves nothing half."""
 
-import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,14 +60,6 @@ def test_a_second_process_that_preprocesses_is_refused(source: Path, capsys) -> 
     assert contents(cache) == before
 
 
-def test_the_command_ends_with_one_line_and_status_1(source: Path, tmp_path: Path, capsys) -> None:
-    with holding(tmp_path / "out"):
-        assert main(["data", "merge", str(source), str(tmp_path / "out")]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "FolderLockedError" in line
-    assert "Wait for it, stop it, or give another folder." in line
-
-
 def test_disjoint_ranges_are_written_together_and_finished_by_the_last(tmp_path: Path) -> None:
     whole = contents(generate(config(tmp_path / "whole")))
     out = tmp_path / "out"
@@ -84,32 +75,3 @@ def test_disjoint_ranges_are_written_together_and_finished_by_the_last(tmp_path:
     assert not (out / "dataset.json").exists()
     generate(config(out, shard_range=(0, 2)))
     assert contents(out) == whole
-
-
-def test_a_finished_set_is_left_to_whoever_finishes_it(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("openvima.data.generation.FINISH_S", 0.3)
-    whole = contents(generate(config(tmp_path / "out")))
-    (tmp_path / "out" / "dataset.json").unlink()
-    with holding(tmp_path / "out", 2, 4), pytest.raises(FolderLockedError):
-        generate(config(tmp_path / "out", shard_range=(0, 2)))
-    generate(config(tmp_path / "out", shard_range=(0, 2)))
-    assert contents(tmp_path / "out") == whole
-
-
-@pytest.mark.parametrize("name", ["merge", "sample", "split", "export"])
-def test_a_full_disk_ends_in_one_line_and_leaves_nothing_half_written(
-    source: Path, tmp_path: Path, monkeypatch, name: str
-) -> None:
-    out, before = tmp_path / "out", contents(tmp_path)
-
-    def full(*arguments: object, **options: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("openvima.data.shard._Sink.write", full)
-    monkeypatch.setattr("shutil.copyfile", full)
-    monkeypatch.setattr("openvima.data.lerobot_files.pq.ParquetWriter.write_table", full)
-    with pytest.raises(OSError, match="No space left") as found:
-        writers(source, out)[name]()
-    assert str(found.value.filename).startswith(str(out))
-    assert contents(tmp_path) == before
-    assert not out.exists()

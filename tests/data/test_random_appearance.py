@@ -1,6 +1,5 @@
 """Demonstrations with random appearance: another look, the same task."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from openvima.data.rerender import (
     RandomAppearance,
     with_random_appearance,
 )
-from openvima.errors import DatasetError
 from openvima.scene import Placement, Problem, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.novel_words import MEANINGS
@@ -196,9 +194,3 @@ def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFi
     for wrong in (["--rerendered", "-1"], ["--rerendered", "0", "--boxes", "detector"]):
         assert main(["data", "preprocess", str(copy), *wrong]) == 2
         assert "it must be 0 or more, and without --boxes" in capsys.readouterr().err
-
-
-def test_demonstrations_without_scenes_are_refused(demos: Path):
-    shard = Dataset(demos).shard(Dataset(demos).shard_names()[0])
-    with pytest.raises(DatasetError, match="has no scenes"):
-        with_random_appearance(replace(shard[0], scenes=()), shard.info, 0)

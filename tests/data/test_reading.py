@@ -1,6 +1,5 @@
 """Reading of data sets, and their format on disk."""
 
-import json
 import pickle
 import re
 import subprocess
@@ -89,19 +88,6 @@ def test_a_step_of_one_view_has_no_other(shard: Shard) -> None:
     assert list(observation["rgb"]) == ["front"]
 
 
-def test_damage_in_other_columns_is_not_met(tmp_path: Path, demo: Demonstration, info: ShardInfo) -> None:
-    path = write(tmp_path / "b.arrow", info, [demo]).path
-    content = bytearray(path.read_bytes())
-    middle = len(content) // 2  # among the images, which come last
-    content[middle : middle + 8192] = bytes(8192)
-    path.write_bytes(content)
-    damaged = Shard(path)
-    with pytest.raises(DatasetError):
-        _ = damaged[0]
-    assert damaged.read(0, ["prompt"]) == {"prompt": demo.prompt.text}
-    assert damaged.step(0, 1, views=["top"]).action == demo.actions[1]
-
-
 def test_columns_not_asked_for_are_not_decompressed(shard: Shard) -> None:
     def most_bytes(columns: list[str]) -> int:
         usual = pa.default_memory_pool()
@@ -118,13 +104,6 @@ def test_columns_not_asked_for_are_not_decompressed(shard: Shard) -> None:
     assert most_bytes(["seed", "pose0_position"]) < some
     assert frames <= most_bytes(["segm_top"]) < frames + some
     assert 3 * frames <= most_bytes(["rgb_top", "seed"]) < 3 * frames + some
-
-
-def test_what_is_read_belongs_to_the_reader(shard: Shard) -> None:
-    first = shard.read(1, ["segm_top"])["segm_top"]
-    kept = first.copy()
-    first[:] = 0
-    assert np.array_equal(shard.read(1, ["segm_top"])["segm_top"], kept)
 
 
 def test_unknown_columns_views_and_steps_are_refused(shard: Shard) -> None:
@@ -180,31 +159,10 @@ def test_colours_are_joined_and_parted_pixel_by_pixel() -> None:
     assert planes(joined).flags.c_contiguous
 
 
-def test_the_schema_says_how_images_are_shaped() -> None:
-    for name, (_, shape) in ARRAYS.items():
-        told = (COLUMNS.field(name).metadata or {}).get(b"shape")
-        if told is not None and name != "poses":
-            assert json.loads(f"[{told.decode()}]") == list(shape)
-
-
-def test_a_loop_over_a_shard_ends_after_its_last_row(shard: Shard, demo: Demonstration) -> None:
-    hashes = [found.content_hash() for found in shard]
-    assert hashes[1:] == [demo.content_hash()]
-    with pytest.raises(IndexError, match=r"record 2 of 2 in .*a\.arrow; count from 0 to 1"):
-        shard[2]
-
-
 def test_naming_no_task_is_an_error(tmp_path: Path, info: ShardInfo, made_up: MadeUp) -> None:
     write_folder(tmp_path, info, [[made_up(1)]])
     with pytest.raises(DatasetError, match=r"no task is named; .* has stack\."):
         Dataset(tmp_path, tasks=[])
-
-
-def test_a_column_may_be_named_twice_and_poses_with_their_steps(shard: Shard) -> None:
-    for columns in (["poses", "steps"], ["steps", "poses"], ["seed", "seed"]):
-        found = shard.read(0, columns)
-        assert found.keys() == {*columns}
-        assert all(np.array_equal(found[name], shard.read(0, [name])[name]) for name in columns)
 
 
 PAGE = (Path(__file__).parents[2] / "docs/format.md").read_text(encoding="utf-8")

@@ -142,12 +142,6 @@ def test_an_episode_stays_in_its_part_when_data_are_added() -> None:
         assert names(small, before[part]) <= names(large, after[part])
 
 
-def test_small_samples_lie_in_all_parts() -> None:
-    index = index_of(5000)
-    sampled = select_sample(index, 0, fraction=0.1)
-    assert abs(assign_splits(index, HALVES, 0)["a"][sampled].mean() - 0.5) < 0.1
-
-
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
@@ -163,14 +157,6 @@ def test_small_samples_lie_in_all_parts() -> None:
 def test_parts_that_make_no_sense_are_refused(text: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
         parse_splits(text)
-
-
-def test_a_sample_has_a_fraction_or_a_number(tmp_path: Path, write_folder: WriteFolder) -> None:
-    source = write_folder(tmp_path / "demos")
-    assert main(["data", "sample", str(source), str(tmp_path / "two"), "--episodes", "2"]) == 0
-    assert Dataset(tmp_path / "two").index.column("task").to_pylist() == ["rotate"] * 2 + ["stack"] * 2
-    for size in ([], ["--episodes", "2", "--fraction", "0.5"]):
-        assert main(["data", "sample", str(source), str(tmp_path / "none"), *size]) == 2
 
 
 def test_a_sample_holds_the_records_unchanged(tmp_path: Path, write_folder: WriteFolder) -> None:
@@ -210,13 +196,6 @@ def test_a_split_gives_each_episode_to_one_part(tmp_path: Path, write_folder: Wr
     folder = split(SubsetConfig(source, tmp_path / "parts"), HALVES)
     assert sorted(path.name for path in folder.iterdir()) == ["a", "b"]
     assert sorted(episodes(folder / "a") + episodes(folder / "b")) == episodes(source)
-
-
-def test_a_split_without_episodes_is_refused(tmp_path: Path, write_folder: WriteFolder) -> None:
-    source = write_folder(tmp_path / "demos", range(2))
-    with pytest.raises(DatasetError, match="fall into split tiny"):
-        split(SubsetConfig(source, tmp_path / "parts"), Splits({"tiny": 0.0001, "rest": 0.9999}))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["demos"]
 
 
 def test_subsets_can_be_narrowed_to_tasks(tmp_path: Path, write_folder: WriteFolder) -> None:

@@ -70,13 +70,6 @@ def test_episodes_that_two_forms_leave_equal_are_merged_once(tmp_path: Path) -> 
     assert len(Dataset(merged)) == 2
 
 
-def test_forms_that_differ_are_merged(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    merged = merge(MergeConfig(folders, tmp_path / "merged"))
-    assert len(Dataset(merged)) == 4
-    found = verify(merged, VerifyConfig(replay=None))
-    assert not found.problems and found.num_replayed == 4
-
-
 def test_all_means_the_tasks_with_a_text_form(tmp_path: Path) -> None:
     every = GenerateConfig(out=tmp_path, env_config=TEXT).resolved_tasks()
     assert "rotate" in every and "rearrange" not in every

@@ -9,7 +9,7 @@ import pytest
 from openvima import compose
 from openvima.catalog import load_assets
 from openvima.data import Dataset, VerifyConfig, record_demonstration, verify
-from openvima.data.user_demonstrations import SHARD_SIZE, demonstrate
+from openvima.data.user_demonstrations import demonstrate
 from openvima.env import EnvConfig
 from openvima.errors import DatasetError
 from openvima.render.raycast import first_hit
@@ -104,20 +104,6 @@ def test_the_same_demonstration_is_recorded_once(tmp_path: Path) -> None:
     assert (tmp_path / "dataset.json").read_bytes() == before
 
 
-def test_a_folder_of_other_data_is_left_alone(tmp_path: Path, data_folder: Path) -> None:
-    before = {path: path.read_bytes() for path in data_folder.glob("*.*")}
-    assert "holds other data" in refusal(data_folder, scene(), clicked(scene(), random.Random(0)))
-    assert {path: path.read_bytes() for path in data_folder.glob("*.*")} == before
-
-
-def test_a_killed_session_leaves_a_folder_that_the_next_one_finishes(tmp_path: Path) -> None:
-    rng = random.Random(0)
-    record_demonstration(tmp_path, scene(), clicked(scene(), rng))
-    (tmp_path / "dataset.json").rename(tmp_path / ".dataset.json.old")  # as while a shard is written
-    assert record_demonstration(tmp_path, scene(), clicked(scene(), rng)) == 2
-    assert verify(tmp_path, ALL).is_clean and len(Dataset(tmp_path)) == 2
-
-
 def test_a_recording_killed_after_its_shard_is_finished_by_the_same_one(tmp_path: Path) -> None:
     solution = clicked(scene(), random.Random(0))
     record_demonstration(tmp_path, scene(), solution)
@@ -128,28 +114,8 @@ def test_a_recording_killed_after_its_shard_is_finished_by_the_same_one(tmp_path
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_shards_of_users_have_a_largest_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert SHARD_SIZE > 2
-    monkeypatch.setattr("openvima.data.user_demonstrations.SHARD_SIZE", 2)
-    rng = random.Random(0)
-    for _ in range(3):
-        record_demonstration(tmp_path, scene(), clicked(scene(), rng))
-    assert [path.name for path in sorted(tmp_path.glob("*.arrow"))] == [
-        "composed-train-00000.arrow",
-        "composed-train-00001.arrow",
-    ]
-    assert len(Dataset(tmp_path)) == 3
-
-
 def test_sweeps_name_the_block_and_its_zone(tmp_path: Path) -> None:
     objects = [("small block", "red", (0.5, 0.1)), ("three-sided rectangle", "blue", (0.5, -0.2))]
     episode = compose(objects, "Sweep {a}.", goals=[("swept_into", "a", "b")], end_effector="spatula")
     demo = demonstrate(episode, [Action.planar((0.5, 0.106), (0.5, -0.2325))])
     assert demo.outcome.success and (demo.pick_ids, demo.place_ids) == ((4,), (5,))
-
-
-@pytest.fixture
-def data_folder(tmp_path: Path, made_up, info) -> Path:
-    from small_data_sets import with_plain_images, write_folder
-
-    return write_folder(tmp_path / "other", info, [[with_plain_images(made_up(1))]])

@@ -27,7 +27,6 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.planning import COMMAND
 from openvima.data.verification import Verification
-from openvima.errors import ConfigError, DatasetError
 from openvima.scene import Action, Outcome
 from small_data_sets import contents, finish, with_plain_images, write_folder
 
@@ -74,19 +73,6 @@ def test_a_generated_data_set_is_clean_and_replays(whole: Path) -> None:
     assert found.notes == ()
     assert (found.num_shards, found.num_episodes, found.num_replayed) == (4, 6, 6)
     assert calls[-1] == (6, 6, "replaying")
-
-
-def test_one_episode_of_each_task_is_replayed_by_default(whole: Path) -> None:
-    assert verify(whole).num_replayed == len(TASKS)
-    assert verify(whole, NONE).num_replayed == 0
-
-
-@pytest.mark.slow
-def test_two_workers_find_the_same(folder: Path) -> None:
-    (folder / FIRST).write_bytes(b"")
-    (folder / "extra.arrow").write_bytes(b"")
-    one, two = verify(folder), verify(folder, VerifyConfig(workers=2))
-    assert one == two
 
 
 def test_a_shard_that_the_manifest_does_not_list_is_named(folder: Path) -> None:
@@ -212,22 +198,6 @@ def test_every_task_replays(tmp_path: Path) -> None:
     assert found.num_replayed == found.num_episodes >= 13
 
 
-def test_data_without_images_are_compared_after_rendering(tmp_path: Path) -> None:
-    config = GenerateConfig(out=tmp_path, tasks=("rotate",), episodes=2, images=False)
-    found = verify(generate(config), ALL)
-    assert found.is_clean, found.problems
-    assert (found.num_episodes, found.num_replayed) == (2, 2)
-
-
-def test_settings_and_folders_that_cannot_be_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="replay is -1"):
-        VerifyConfig(replay=-1)
-    with pytest.raises(ConfigError, match="workers is 0"):
-        VerifyConfig(workers=0)
-    with pytest.raises(DatasetError, match="holds no data set"):
-        verify(tmp_path)
-
-
 def test_the_command_exits_with_0_without_problems(whole: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["data", "verify", str(whole), "--replay", "1"]) == 0
     shown = capsys.readouterr().out
@@ -258,13 +228,6 @@ def test_the_command_that_is_named_makes_a_damaged_file_again(folder: Path, whol
         command = f"openvima generate --out {folder} --tasks {','.join(TASKS)} --episodes 3 --shard-size 2"
     assert main(shlex.split(command)[1:]) == 0
     assert contents(folder) == contents(whole)
-
-
-def test_the_command_refuses_what_is_no_number_of_episodes(
-    whole: Path, capsys: pytest.CaptureFixture
-) -> None:
-    assert main(["data", "verify", str(whole), "--replay", "some"]) == 2
-    assert "--replay is 'some'" in capsys.readouterr().err
 
 
 def test_shards_of_failed_episodes_are_verified_too(folder: Path, made_up: MadeUp, info: ShardInfo) -> None:

@@ -1,7 +1,6 @@
 """Annotated frames of demonstrations, and their augmentation."""
 
 import numpy as np
-import pytest
 
 from openvima.data import Dataset
 from openvima.detector.frames import (
@@ -75,14 +74,6 @@ def test_held_out_frames_are_the_same_for_the_same_seed(data):
     assert len(list(held_out_frames(source, 30, seed=3))) == 30  # more than there are episodes
 
 
-def test_some_episodes_only(data):
-    dataset = Dataset(data)
-    some, every = FrameSampler(dataset, np.array([4])), FrameSampler(dataset)
-    assert len(some) == 1
-    ours, theirs = some.sample(0, np.random.default_rng(0)), every.sample(4, np.random.default_rng(0))
-    assert np.array_equal(ours[0].rgb, theirs[0].rgb)
-
-
 def test_mirroring_twice_changes_nothing_and_once_moves_boxes_with_masks(rectangles):
     frame = rectangles()
     once, twice = flip_horizontally(frame), flip_horizontally(flip_horizontally(frame))
@@ -128,10 +119,3 @@ def test_one_colour_becomes_one_colour_and_two_stay_two():
         mixed = mix_channels(pixels, np.random.default_rng(seed))
         assert np.array_equal(mixed[:, 0], mixed[:, 1])
         assert not np.array_equal(mixed[:, 0], mixed[:, 2])
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_equal_generators_sample_equal_frames(data, seed):
-    source = FrameSampler(Dataset(data))
-    first, second = (source.sample(2, np.random.default_rng(seed)) for _ in range(2))
-    assert np.array_equal(first[0].rgb, second[0].rgb)

@@ -1,16 +1,12 @@
 """Training: what a run leaves, going on after an interruption, and what is refused."""
 
 import json
-import signal
-import subprocess
-import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from openvima.data import Dataset
 from openvima.detector import config as sizes
@@ -22,7 +18,6 @@ from openvima.training.config import RuntimeConfig, ScheduleConfig
 from openvima.training.detector import DetectorTrainingConfig, train_detector
 from openvima.training.detector.config import FrameLoaderConfig
 from openvima.training.detector.stage import split_episodes
-from openvima.training.validation import flatten
 
 
 @pytest.fixture
@@ -77,50 +72,6 @@ def test_an_interrupted_run_ends_with_the_weights_of_one_that_was_not(settings, 
     one, other = weights(whole / last), weights(run / last)
     assert all(torch.equal(one[name], other[name]) for name in one if "num_batches" not in name)
     assert [line["step"] for line in lines(run) if "loss" in line] == [1, 2]
-
-
-TRAIN = """
-import json, os, signal, sys
-from pathlib import Path
-from openvima.detector import config as sizes
-from openvima.detector.config import DetectorConfig
-from openvima.training.detector import DetectorTrainingConfig, stage, train_detector
-
-tiny, settings = json.loads(sys.argv[1])
-sizes.DETECTORS["small"] = lambda: DetectorConfig.from_dict(tiny)
-write, calls = stage.write_network, []
-
-def dying(*arguments):
-    calls.append(arguments)
-    write(*arguments)
-    if len(calls) == 2:  # metrics and weights are written, the optimizer's state is not
-        os.kill(os.getpid(), signal.SIGKILL)
-
-stage.write_network = dying
-settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
-train_detector(DetectorTrainingConfig.of(settings))
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(settings, tiny, tmp_path):
-    plain = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in flatten(asdict(settings)).items()
-    }
-    argument = json.dumps([tiny.to_dict(), plain])
-    killed = subprocess.run([sys.executable, "-c", TRAIN, argument], capture_output=True, check=False)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
-    assert load_network(settings.out).config == tiny
-    run, whole = train_detector(settings), train_detector(replace(settings, out=tmp_path / "whole"))
-    for file in (whole / "checkpoints").rglob("*.safetensors"):
-        ours, theirs = load_file(run / file.relative_to(whole)), load_file(file)
-        assert ours.keys() == theirs.keys()
-        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
-    assert {path.name for path in (run / "checkpoints").iterdir()} == {
-        path.name for path in (whole / "checkpoints").iterdir()
-    }
-    assert (run / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()
 
 
 def test_other_settings_do_not_continue_a_run(settings):

@@ -101,13 +101,6 @@ def test_policies_without_a_common_episode_are_refused():
     assert default_pairs(Results(rows)) == []
 
 
-def test_unknown_policies_and_ablations_are_named(found):
-    with pytest.raises(UnknownPolicyError, match=r"no policy 'bb'\. Did you mean 'b'"):
-        compare(found, "a", "bb")
-    with pytest.raises(UnknownPolicyError, match=r"no ablation of a 'no_promt'\. Did you mean 'no_prompt'"):
-        compare(found, "a", "a:no_promt")
-
-
 def test_unasked_the_first_learned_policy_meets_all_but_the_oracle(results):
     assert default_pairs(results) == [("mine", "random")]
     without = Results(results.rows[3:], results.config, results.versions, results.policies)
@@ -130,12 +123,6 @@ def test_the_record_is_plain_values(found):
         "p_holm": mcnemar(8, 2)[0],
         "verdict": "noise",
     }
-
-
-def test_a_colon_in_the_name_of_a_policy_is_no_mark_of_a_ablation(found):
-    renamed = replace(found, rows=tuple(replace(r, policy=f"{r.policy}@10:30") for r in found.rows))
-    pairs = [("a@10:30", "b@10:30"), ("a@10:30:no_prompt", "a@10:30")]
-    assert [c.a for c in compare_pairs(renamed, pairs)] == [a for a, _ in pairs]
 
 
 def test_ablations_with_rates_are_named_after_their_policy_and_paired_where_scenes_are_the_same():

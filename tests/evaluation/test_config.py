@@ -8,7 +8,6 @@ import pytest
 from openvima.env import EnvConfig
 from openvima.errors import (
     ConfigError,
-    InputFileError,
     UnknownPolicyError,
     UnknownTaskError,
 )
@@ -28,14 +27,6 @@ def test_batches_do_not_depend_on_the_number_of_workers():
     one, three = (EvaluationConfig(("oracle", "random"), workers=workers) for workers in (1, 3))
     assert plan(one) == plan(three)
     assert one.record() == three.record()
-
-
-def test_another_device_is_recorded_and_makes_other_batches():
-    usual, other = (EvaluationConfig(("untrained",), device=device) for device in ("cpu", "cuda"))
-    assert "device" not in usual.record()
-    assert other.record() == {**usual.record(), "device": "cuda"}
-    assert {batch.device for batch in plan(other)} == {"cuda"}
-    assert plan(usual)[0].key("same") != plan(other)[0].key("same")
 
 
 def test_all_takes_from_each_level_the_tasks_that_it_holds():
@@ -170,11 +161,6 @@ def test_names_of_policies_are_checked_before_any_weights_are_read(monkeypatch, 
     with pytest.raises(error) as refusal:
         evaluate(EvaluationConfig(("openvima-small", policy), ("rotate",), ("L1",), out=tmp_path / "out"))
     assert str(refusal.value).isprintable() and not (tmp_path / "out").exists()
-
-
-def test_a_folder_without_weights_is_refused(tmp_path):
-    with pytest.raises(InputFileError, match="holds no weights"):
-        weights_hash(tmp_path)
 
 
 def test_the_hash_of_a_run_changes_with_its_weights_only(tmp_path):

@@ -79,14 +79,3 @@ def test_an_address_without_a_cluster_is_refused_before_anything_is_played(tmp_p
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match="no Ray cluster answers"):
         evaluate(replace(NETWORK, out=tmp_path, engine="ray", address="127.0.0.1:1"))
-
-
-def test_a_policy_server_gives_the_same_outcomes(whole: Path, tmp_path: Path) -> None:
-    pytest.importorskip("websockets")
-    pytest.importorskip("msgpack")
-    from openvima.policies import load_policy
-    from openvima.serving import serve_in_thread
-
-    with serve_in_thread(load_policy("untrained")) as address:
-        path = evaluate(replace(NETWORK, policies=(f"untrained={address}",), out=tmp_path))
-    assert Results.read(path).rows == Results.read(whole).rows

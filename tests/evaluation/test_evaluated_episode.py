@@ -18,7 +18,6 @@ from openvima.evaluation.recording import record_episode
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from openvima.policies.naming import CHECKPOINTS_FOLDER
-from openvima.sim.ur5 import HOME
 from openvima.video.recorder import SceneRenderer
 
 
@@ -100,12 +99,6 @@ def test_no_code_that_results_name_runs_unless_it_is_trusted(
         replace(found, batch=replace(found.batch, boxes="evil.py:boxes")).load_policy()
 
 
-def test_episodes_at_once_share_no_policy(evaluation: Path) -> None:
-    found = evaluated_episode(evaluation, "random", "rotate", "L1", 60)
-    first, second = (getattr(found.load_policy(), "_policy") for _ in range(2))  # noqa: B009
-    assert first is not second
-
-
 @pytest.fixture(scope="module")
 def env():
     return TabletopEnv("rotate", level="L1", domain="eval", realtime=True)
@@ -139,15 +132,6 @@ def test_equal_episodes_give_equal_videos(env, tmp_path):
     for name in ("a.mp4", "b.mp4"):
         record_episode(env, OracleRolloutPolicy(), 1, tmp_path / name, with_prompt=False, enlarge=1)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
-
-
-def test_the_arm_is_drawn_only_when_asked(env):
-    env.reset(seed=2)
-    renderer = SceneRenderer(env, enlarge=1)
-    bare, with_arm = renderer.draw(env.scene, joints=None), renderer.draw(env.scene, HOME)
-    assert bare.shape == (128, 256, 3)
-    assert np.array_equal(bare, np.moveaxis(env.reset(seed=2)[0]["rgb"]["front"], 0, -1))
-    assert (bare != with_arm).any()
 
 
 def test_the_image_of_an_episode_has_prompt_start_and_end(tmp_path):

@@ -162,15 +162,6 @@ def test_an_episode_is_played_from_its_file(tmp_path: Path) -> None:
         play(episode, "oracle", video="a.avi")
 
 
-@pytest.mark.slow
-def test_demo_records_an_episode_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("av")
-    scene = save_episode(compose(OBJECTS, PROMPT, goals=[("in", "a", "b")]), tmp_path / "scene.yaml")
-    assert main(["demo", "--episode", str(scene), "--out", str(tmp_path / "x.mp4")]) == 0
-    assert "by oracle: solved; 1 step" in capsys.readouterr().out
-    assert (tmp_path / "x.mp4").stat().st_size > 1000
-
-
 def test_demo_takes_a_task_or_a_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo"]) == 2 and main(["demo", "rotate", "--episode", "x.yaml"]) == 2
     assert "either a TASK or --episode FILE" in capsys.readouterr().err
@@ -178,13 +169,3 @@ def test_demo_takes_a_task_or_a_file(capsys: pytest.CaptureFixture[str]) -> None
     assert "leave them out" in capsys.readouterr().err
     assert main(["demo", "--episode", "missing.yaml"]) == 2
     assert "missing.yaml" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("returned", [["because"], None])
-def test_an_explanation_of_another_kind_is_refused(returned: object, tmp_path: Path) -> None:
-    pytest.importorskip("av")
-    policy = FirstIntoSecond()
-    policy.explain = lambda: returned  # type: ignore[attr-defined]
-    with pytest.raises(PolicyError, match=r"explain\(\) of .* returned .*; give a list of an Explanation"):
-        play(compose(OBJECTS, PROMPT), policy, video=tmp_path / "a.mp4", explain=True)
-    assert not list(tmp_path.glob("*.mp4"))

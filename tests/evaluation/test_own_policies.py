@@ -2,7 +2,6 @@
 
 import json
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +9,13 @@ import pytest
 
 from openvima import user_code
 from openvima.cli.main import main
-from openvima.errors import ConfigError, PolicyError, UnknownWordWarning
+from openvima.errors import ConfigError, PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.evaluation.config import Batch
-from openvima.evaluation.runner import Job
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy, load_policy
 from openvima.policies.loading import parameters_hash
-from openvima.report.videos import record_clip
 
 CODE = """
 from openvima.policies import RandomPolicy
@@ -120,15 +117,6 @@ def test_exceptions_in_some_episodes_are_counted_kept_and_verified(file, capsys)
     assert verify_results(Path("evaluation")).is_verified
 
 
-def test_an_episode_in_which_the_policy_raises_at_once_has_a_video_too(file):
-    file.write_text(edited("return 1 / 0"))
-    batch = Batch("bad", f"{file}:make", "rotate", "L1", first_seed=1, episodes=1)
-    clip = record_clip(Job(batch, ""), lambda _: None)
-    assert (clip.success, clip.steps) == (False, 0)
-    assert "bad raised ZeroDivisionError" in clip.reason
-    assert clip.video
-
-
 def test_exhausted_memory_is_no_error_of_the_policy(file, capsys):
     file.write_text(edited("raise RuntimeError('cannot allocate memory')"))
     words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "1", "--no-report"]
@@ -184,36 +172,3 @@ def test_weights_of_torch_modules_are_hashed_by_value():
     assert parameters_hash(Held(1)) == parameters_hash(Held(1)) != parameters_hash(Held(2))
     assert parameters_hash(Held(1).network) is not None
     assert parameters_hash(RandomPolicy()) is None
-
-
-READER = """
-from openvima.policies import RandomPolicy
-from openvima.policies.tokenizer import Vocabulary, WordTokenizer
-
-class Reader(RandomPolicy):
-    tokenizer = WordTokenizer(Vocabulary(("rotate", "the", "degrees", ".")))
-
-    def reset(self, prompts):
-        super().reset(prompts)
-        for prompt in prompts:
-            self.tokenizer.encode(prompt.text.replace("{", "").replace("}", ""))
-"""
-
-
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
-def test_words_that_are_unknown_in_several_tasks_are_one_line(workers, file, capsys) -> None:
-    Path("reader.py").write_text(READER)
-    words = ["--tasks", "rotate,visual_manipulation", "--levels", "L1", "--episodes", "2", "--no-report"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
-        assert main(["evaluate", "--policy", "reader.py:Reader", *words, "--workers", workers]) == 0
-    (line,) = (line for line in capsys.readouterr().err.splitlines() if "UnknownWordWarning" in line)
-    assert "'degree" not in line and "'into'" in line and "'put'" in line
-
-
-def test_scores_of_several_tasks_warn_of_unknown_words_once(file) -> None:
-    Path("reader.py").write_text(READER)
-    tasks = ("rotate", "visual_manipulation")
-    with pytest.warns(UnknownWordWarning) as caught:
-        score({"reader": load_policy("reader.py:Reader")}, **CELLS | {"tasks": tasks})
-    assert len(caught) == 1 and "'put'" in str(caught[0].message)

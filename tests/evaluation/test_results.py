@@ -71,17 +71,6 @@ def test_tasks_that_are_mostly_solved_without_a_prompt_are_named(results, tmp_pa
     assert not results.unneeded_prompts()
 
 
-def test_results_of_before_there_were_ablations_are_read(results, tmp_path):
-    content = json.loads(results.to_json())
-    for row in content["rows"]:
-        del row["ablation"]
-        for outcome in row["outcomes"]:
-            del outcome["near_ties"], outcome["oracle_max_steps"]
-    path = tmp_path / "results.json"
-    path.write_text(json.dumps(content))
-    assert Results.read(path).rows == results.rows
-
-
 def test_level_means_weigh_the_tasks_of_a_level_alike(results):
     means = {(mean.policy, mean.level): mean for mean in results.level_means()}
     assert means["mine", "L1"].mean == pytest.approx(0.75)
@@ -135,19 +124,6 @@ def test_a_failed_write_leaves_the_old_file_and_no_temporary_one(tmp_path):
 )
 def test_equal_causes_of_different_objects_count_as_one(reason, kind):
     assert failure_kind(reason) == kind
-
-
-def test_a_file_that_is_no_text_is_damaged(tmp_path):
-    (tmp_path / "results.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DatasetError, match="no UTF-8 text"):
-        Results.read(tmp_path)
-
-
-def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path):
-    with (tmp_path / "results.json").open("wb") as stream:
-        stream.truncate(2**40)
-    with pytest.raises(DatasetError, match="more than"):
-        Results.read(tmp_path)
 
 
 def test_a_number_that_is_not_finite_is_not_written(results, tmp_path):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from openvima.env import EnvConfig
-from openvima.errors import AssetError, ConfigError, FolderLockedError, InputFileError
+from openvima.errors import AssetError, ConfigError, FolderLockedError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 from openvima.evaluation.config import plan
 from worker_jobs import holding
@@ -174,27 +174,3 @@ def test_a_second_evaluation_in_a_folder_is_refused_at_once(tmp_path):
         pytest.raises(FolderLockedError, match=rf"by process {process.pid}\b"),
     ):
         evaluate(replace(ORACLE, out=tmp_path))
-
-
-def test_outcomes_of_another_evaluation_that_was_killed_go_with_the_next(first, tmp_path):
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "of_others.json").write_text("[]")
-    (tmp_path / "results.json").write_bytes(first.read_bytes())
-    evaluate(replace(ORACLE, out=tmp_path))
-    assert not (tmp_path / "parts").exists()
-
-
-def test_a_damaged_checkpoint_is_named_before_episodes_of_other_policies(tmp_path, monkeypatch):
-    pytest.importorskip("torch")
-    from openvima.policies import preset
-    from openvima.policies.build import build_network
-    from openvima.policies.checkpoint import save_checkpoint
-
-    save_checkpoint(build_network(preset("nano"), seed=0), tmp_path / "mine")
-    weights = tmp_path / "mine" / "model.safetensors"
-    weights.write_bytes(weights.read_bytes()[:-4])
-    monkeypatch.setattr(runner, "_play_all", lambda *arguments: pytest.fail("episodes were played"))
-    policies = ("oracle", str(tmp_path / "mine"))
-    with pytest.raises(InputFileError, match="is damaged"):
-        evaluate(replace(ORACLE, policies=policies, out=tmp_path / "out"))
-    assert not (tmp_path / "out").exists()

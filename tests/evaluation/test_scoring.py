@@ -132,13 +132,6 @@ def test_a_policy_that_raises_in_one_episode_loses_that_episode_only(error, tmp_
     assert Results.read(results.write(tmp_path / "results.json")) == results
 
 
-def test_a_policy_that_raises_in_all_of_a_later_batch_loses_that_batch_only():
-    bad = {prompt_of("visual_manipulation", seed) for seed in (0, 1)}
-    cells = {"tasks": ("rotate", "visual_manipulation"), "levels": "L1", "episodes": 2}
-    results = score({"mine": Raising(bad, after=0)}, **cells)
-    assert [row.failures.get(POLICY_ERROR, 0) for row in results.rows] == [0, 2]
-
-
 def test_a_policy_that_never_acts_is_an_error():
     bad = {prompt_of("rotate", seed) for seed in (0, 1)}
     message = (
@@ -146,17 +139,6 @@ def test_a_policy_that_never_acts_is_an_error():
     )
     with pytest.raises(PolicyError, match=message):
         score({"mine": Raising(bad, after=0)}, tasks="rotate", levels="L1", episodes=2)
-
-
-def test_a_policy_that_plays_each_episode_but_not_the_batch_is_an_error():
-    class One(RandomPolicy):
-        def reset(self, prompts):
-            if len(prompts) > 1:
-                raise PolicyError("fewer, please")
-            super().reset(prompts)
-
-    with pytest.raises(PolicyError, match="fewer, please"):
-        score({"mine": One()}, tasks="rotate", levels="L1", episodes=2)
 
 
 class Given:
@@ -195,21 +177,3 @@ def test_tensors_with_gradients_are_an_error_that_names_policy_task_and_seed(nes
     ) as error:
         score({"mine": policy}, **cells)
     assert "\n" not in str(error.value)
-
-
-def test_actions_that_raise_when_read_are_an_error_of_the_policy():
-    class Odd:
-        def __array__(self, *args: object, **kwargs: object) -> None:
-            raise OSError("lost")
-
-    with pytest.raises(PolicyError, match=r"mine raised OSError: lost.*in rotate, L1, seed 0"):
-        score({"mine": Given(Odd)}, tasks="rotate", levels="L1", episodes=1)
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64", "bfloat16"])
-def test_tensors_without_gradients_are_actions(dtype):
-    """NumPy knows no bfloat16: such an action is an invalid one, and ends the episode."""
-    torch = pytest.importorskip("torch")
-    policy = Given(lambda: torch.full((2,), 0.5, dtype=getattr(torch, dtype)))
-    (row,) = score({"mine": policy}, tasks="rotate", levels="L1", episodes=1).rows
-    assert ("NumPy cannot convert" in row.outcomes[0].reason) == (dtype == "bfloat16")

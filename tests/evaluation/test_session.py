@@ -111,13 +111,6 @@ def test_the_first_difference_of_two_runs() -> None:
     assert first_difference(runs[0].steps, other.steps) == 1
 
 
-def test_own_policies_share_no_episodes() -> None:
-    first, second = (load_own_rollout_policy("random") for _ in range(2))
-    one, other = EpisodeSession(EPISODE, first), EpisodeSession(EPISODE, second)
-    assert one.propose().action == other.propose().action
-    assert load_own_rollout_policy("random") is not first
-
-
 def test_a_composed_scene_ends_from_its_file_as_it_did_in_its_session(tmp_path: Path) -> None:
     assets, goals = load_assets("procedural"), (("in", "a", "b"), ("in", "c", "b"))
     scene = Composition((), "Put the {a} and the {c} into the {b}.", goals=goals, max_steps=3)

@@ -75,17 +75,6 @@ def test_intervals_of_one_paired_difference_cover_the_truth_at_their_rate(a, b):
     assert 0.93 < coverage <= 1
 
 
-@pytest.mark.parametrize("episodes", [8, 50])
-@pytest.mark.slow
-def test_intervals_of_mean_differences_cover_the_truth_at_their_rate(episodes):
-    rng = np.random.default_rng(episodes)
-    a, b = np.array([0.98, 0.9, 0.7, 0.5, 0.3]), np.array([0.98, 0.95, 0.5, 0.4, 0.3])
-    hits = 0
-    for _ in range(SIMULATIONS):
-        hits += is_inside(float(np.mean(a - b)), mean_difference(paired_outcomes(rng, a, b, episodes))[1])
-    assert LEAST < hits / SIMULATIONS <= MOST
-
-
 def test_mcnemars_test_raises_no_more_false_alarms_than_it_says():
     rng = np.random.default_rng(7)
     rates = np.array([0.9, 0.7, 0.5, 0.2])

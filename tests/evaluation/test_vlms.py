@@ -2,29 +2,24 @@
 
 import itertools
 import json
-import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from tests.chat_server import ChatServer, chat_server, images_of, refused, text_of
 
 from openvima.cli.main import main
-from openvima.data.chat import UNREADABLE, ChatFormat
+from openvima.data.chat import ChatFormat
 from openvima.data.chat_settings import VlmOptions
 from openvima.env import EnvConfig
-from openvima.errors import AnswerError, LimitReachedError, MissingExtraError, PolicyError, ServerError
+from openvima.errors import LimitReachedError, MissingExtraError, PolicyError, ServerError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
-from openvima.evaluation.chat import said_in, summarise
-from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.sources import PolicySource
 from openvima.policies.naming import PolicyRef
-from openvima.serving.chat import ChatClient, VlmConfig, VlmPolicy
+from openvima.serving.chat import VlmConfig
 
 KEY = "sk-secret-of-a-test"
 SURE = '{"pick": [500, 500], "place": [600, 500], "rotate": 0}'
@@ -141,64 +136,6 @@ def test_garbage_is_a_failed_episode_each(tmp_path: Path) -> None:
     (mistakes,) = Results.read(path).policies["model-7b"]["answers"]["mistakes"]
     assert mistakes == {"kind": "unreadable answer", "episodes": 3 * len(GARBAGE)}
     assert main(["verify-results", str(tmp_path)]) == 0
-
-
-def garbage(rng: np.random.Generator) -> str:
-    """An answer without an action: of nothing, of noise, or with one value that cannot be."""
-    digits = "".join(map(str, rng.integers(10, size=rng.integers(10, 8000))))
-    zero = int(rng.choice([0x660, 0x966]))  # of Arabic, of Devanagari
-    foreign = "".join(chr(zero + int(digit)) for digit in digits[:3])
-    noise = "".join(map(chr, rng.integers(0x3000, size=rng.integers(200))))
-    controls = "".join(map(chr, rng.choice([0, 7, 27, 0x85, 0x202E, 0xD800, 0xFEFF], size=9)))
-    deep = "[" * int(rng.integers(2, 4000))
-    values = [
-        "NaN",
-        "-Infinity",
-        "1e999",
-        f"-{digits}",
-        f"9{digits}",
-        "null",
-        "true",
-        '"left"',
-        f'"{foreign}"',
-    ]
-    values += [foreign, controls, deep, "[1, 2]", '{"x": 1}', "", "-0.5", "1001"]
-    value = values[rng.integers(len(values))]
-    answers = [f'{{"pick": [{value}, 1], "place": [1, 1], "rotate": 0}}']
-    answers += [f'{{"pick": [1, 1], "place": [1, {value}], "rotate": 0}}', f"{noise}{{{value}", controls]
-    answers += [f"<html><body>{noise}</body></html>", value, " " * int(rng.integers(9)), deep, noise]
-    answers += [SURE[: rng.integers(len(SURE))], f'{{"action": {{"pick": {value}}}}}']
-    answers += ['{"pick": [1, 1], "place": [1, 1], "rotate": "left"}']
-    return answers[rng.integers(len(answers))]
-
-
-def test_a_thousand_answers_of_garbage_are_counted_each() -> None:
-    rng = np.random.default_rng(0)
-    said = [garbage(rng) for _ in range(996)]
-    said += ["x" * 10_000_000, "{" * 10_000_000, '{"pick": [' + "9" * 10_000_000, SURE + " " * 10_000_000]
-    env = EnvConfig().make("rotate", "L1", domain="eval")
-    seen, _ = env.reset(seed=0)
-    left, lock = iter(said), threading.Lock()
-
-    def reply(body: dict[str, Any]) -> str:
-        with lock:
-            return next(left)
-
-    with chat_server(reply) as server:
-        policy = VlmPolicy(ChatClient("m", VlmConfig(server.url, options=VlmOptions(enlarge=1))))
-        policy.reset([env.prompt] * len(said))
-        decisions = policy.act([seen] * len(said))
-    assert all(isinstance(decision, AnswerError) for decision in decisions)
-    assert all(str(error).isprintable() and len(str(error)) < 200 for error in decisions)
-    assert len({error.kind for error in decisions}) == 5
-    failed = EpisodeOutcome(0, False, 0, "", UNREADABLE)
-    steps = [
-        [said_in(env, answer, decision)]
-        for answer, decision in zip(policy.answers, decisions, strict=True)
-        if answer is not None
-    ]
-    counted = summarise([(failed, each) for each in steps])
-    assert counted["mistakes"] == [{"kind": UNREADABLE, "episodes": 1000}]
 
 
 @pytest.mark.parametrize(
@@ -368,46 +305,6 @@ def test_threads_change_nothing(tmp_path: Path) -> None:
     for record in records:
         del record["sha256"], record["policies"]["model-7b"]["server"]  # another port
     assert records[0] == records[1]
-
-
-PROGRAM = """
-import sys
-from pathlib import Path
-from openvima.cli.main import main
-words = ["evaluate", "--policy", "vlm:some/model-7b", "--tasks", "rotate,novel_noun", "--levels", "L1,L2"]
-sys.exit(main([*words, "--episodes", "4", "--no-report", "--vlm.concurrency", "4", *sys.argv[1:]]))
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_evaluation_goes_on_to_the_same_results(tmp_path: Path) -> None:
-    asked = threading.Event()
-
-    def reply(body: dict[str, Any]) -> str:
-        time.sleep(0.05)
-        if len(server.bodies) > 12:
-            asked.set()
-        return SURE
-
-    def words(out: str) -> list[str]:
-        return [sys.executable, "-c", PROGRAM, "--base-url", server.url, "--out", str(tmp_path / out)]
-
-    with chat_server(reply) as server:
-        subprocess.run(words("whole"), check=True)
-        whole = len(server.bodies)
-        server.bodies.clear()
-        server.answered.clear()
-        asked.clear()
-        with subprocess.Popen(words("killed")) as first:
-            try:
-                assert asked.wait(600)
-            finally:
-                first.kill()
-        subprocess.run(words("killed"), check=True)
-        assert len(server.answered) - len({*server.answered}) <= 4  # those that were on their way
-        assert len({*server.answered}) == whole
-    results = [(tmp_path / out / "results.json").read_bytes() for out in ("whole", "killed")]
-    assert results[0] == results[1]
 
 
 def test_a_dry_run_shows_the_message_and_asks_nothing(

@@ -99,12 +99,6 @@ def test_actions_of_another_shape_end_the_evaluation(policy: Any, given: np.ndar
         score({"bad": remote}, **ROTATE, control=policy.control)
 
 
-def test_a_model_without_an_action_is_named(policy: Any) -> None:
-    policy.model = lambda text, images, state: np.zeros((0, 5), np.float32)
-    with pytest.raises(PolicyError, match="silent raised IndexError"):
-        score({"silent": policy}, **ROTATE, control=policy.control)
-
-
 def test_an_action_that_is_not_finite_fails_the_episode_and_the_results_say_so(policy: Any) -> None:
     numbers = {"primitives": 12, "end_effector": 5}[policy.control]
     policy.model = lambda text, images, state: np.full(numbers, np.nan, np.float32)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from openvima.errors import ConfigError
 from openvima.policies import preset
 from openvima.policies.batch import Batch
 from openvima.policies.build import PolicyConfig, build_network
@@ -21,7 +20,6 @@ from openvima.policies.nn.actions import (
     to_unit_range,
 )
 from openvima.policies.nn.heads import (
-    AutoregressiveConfig,
     AutoregressiveHead,
     ComponentTokens,
 )
@@ -287,49 +285,3 @@ def test_switches_change_nothing_else_and_can_be_undone() -> None:
     assert with_visual_residual(with_head(both, "bins"), False) == plain
     midas = preset("midas-nano")
     assert (both.images, both.prompt, both.head) == (midas.images, midas.prompt, midas.head)
-
-
-def test_the_head_that_a_network_has_changes_nothing() -> None:
-    assert with_head(preset("vima-nano"), "bins") == preset("vima-nano")
-
-
-def test_vectors_without_spread_are_refused() -> None:
-    with pytest.raises(ConfigError, match="token_std is 0; it must be above 0"):
-        AutoregressiveConfig(token_std=0)
-
-
-def test_a_pointer_model_has_no_bins_to_decode_one_by_one() -> None:
-    with pytest.raises(ConfigError, match="take nano-bins"):
-        with_head(preset("nano"), "autoregressive")
-
-
-def chance_of_either(config: PolicyConfig, demonstration) -> float:
-    """Train on one situation with two demonstrated actions; return the probability of either."""
-    network = build_network(config, seed=0).eval()
-    batch, _ = read(network, [demonstration] * 2)
-    actions = batch.targets.actions_BTC.clone()
-    actions[1, :, [0, 1, 6]] = actions[1, :, [1, 0, 7]] + 0.3  # another place to pick from, and one to put
-    targets, prompts, history = replace(batch.targets, actions_BTC=actions), batch.prompts, batch.history
-    _, images = examples_of([demonstration] * 2, Processor.of(config.inputs))
-    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=0.0)
-    for _ in range(50):
-        features = network.encode_images(images)
-        optimizer.zero_grad()
-        network.loss(network.encode_prompt(prompts, features), history, features, targets)[0].backward()
-        optimizer.step()
-    with torch.no_grad():
-        _, _, logits = forward(network, network.encode_prompt(prompts, features), history, features, targets)
-    bins_BTC = encode_bins(to_unit_range(actions))
-    probabilities = [
-        score.softmax(-1).gather(-1, bins_BTC[..., c, None])[:, 0, 0] for c, score in enumerate(logits)
-    ]
-    return torch.stack(probabilities).prod(0).sum().item()
-
-
-@pytest.mark.slow
-def test_two_right_answers_are_not_mixed(demonstrations) -> None:
-    """Three components differ: decoded independently, one of the two actions comes out once in four times."""
-    single = next(demo for demo in demonstrations if demo.num_steps == 1)
-    plain = preset("vima-nano")
-    assert chance_of_either(with_head(plain, "autoregressive"), single) > 0.9
-    assert chance_of_either(plain, single) < 0.3

@@ -103,19 +103,3 @@ def test_of_t5_words_and_all_but_two_layers_are_frozen() -> None:
     size = policy_size(preset("vima-2m"))
     assert size.parts["prompt"].frozen == words + position_biases + 10 * layer
     assert all(count.frozen == 0 for part, count in size.parts.items() if part != "prompt")
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("nano", ("pointer", 128, 2, 4)),
-        ("vima-200m", ("vima", 768, 11, 24)),
-        ("gato-200m", ("gato", 768, 22, 24)),
-        ("flamingo-2m", ("flamingo", 256, 1, 8)),
-        ("gpt-9m", ("gpt", 320, 6, 10)),
-        ("midas-92m", ("midas", 640, 14, 20)),
-    ],
-)
-def test_architecture_width_layers_and_heads_are_reported(name: str, expected: tuple) -> None:
-    size = policy_size(preset(name))
-    assert (size.architecture, size.width, size.num_layers, size.num_heads) == expected

@@ -1,10 +1,8 @@
 """Bundled checkpoints by name. Most tests replace the checkpoint with a small network."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,10 +11,9 @@ from openvima.cli.main import main
 from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.errors import InputFileError, PolicyError, UnknownPolicyError
 from openvima.evaluation import Results
-from openvima.evaluation.config import Batch
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
-from openvima.evaluation.sources import policy_sources, weights_hash
+from openvima.evaluation.sources import weights_hash
 from openvima.policies import load_policy, presets
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
@@ -29,7 +26,6 @@ from openvima.policies.naming import (
     find_checkpoint,
 )
 from openvima.report import videos
-from openvima.report.videos import find_metrics
 from openvima.training import TrainingConfig
 from openvima.training.building import build_learner
 from small_networks import narrow_small
@@ -74,15 +70,6 @@ def test_it_is_loaded_by_its_name_and_never_computes_in_float16(bundled: Path, d
     assert dtypes == {torch.float64}
 
 
-def test_storing_in_float16_and_then_in_float32_changes_nothing(bundled: Path, demonstrations) -> None:
-    assert main(["policies", "convert", SMALL, "wide"]) == 0
-    actions = []
-    for policy in (load_policy(SMALL), load_policy("wide")):
-        policy.reset([demonstrations[0].prompt])
-        actions.append(policy.act([demonstrations[0].observation(0)])[0])
-    assert all(np.array_equal(actions[0][key], actions[1][key]) for key in actions[0])
-
-
 def test_the_message_for_an_unknown_name_lists_the_bundled_checkpoint(bundled: Path) -> None:
     with pytest.raises(
         UnknownPolicyError,
@@ -115,47 +102,6 @@ def test_a_checkpoint_here_of_the_same_name_is_not_mistaken_for_it(bundled: Path
     here = load_policy(f"./{SMALL}").network.query
     assert torch.equal(here.float(), build_network(narrow_small(), seed=6).query)
     assert weights_hash(f"./{SMALL}") == weights_hash(Path(SMALL)) != weights_hash(bundled)
-
-
-def test_other_folders_and_files_here_do_not_replace_it(bundled: Path) -> None:
-    Path(SMALL).mkdir()
-    Path(SMALL, "metrics.jsonl").write_text("{}")
-    Path("metrics.jsonl").write_text("{}")
-    load_policy(SMALL)
-    batch = Batch(SMALL, SMALL, "rotate", "L1", first_seed=0, episodes=1)
-    assert batch.with_whole_paths().source == SMALL
-    assert not find_metrics(policy_sources((SMALL,)))
-
-
-def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(bundled: Path, capsys) -> None:
-    policies = f"{SMALL},mine={SMALL},copy={bundled}"
-    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "2", "--videos", "0", "--out", SMALL]
-    assert main(["evaluate", "--policy", policies, *words]) == 0
-    results = Results.read(Path(SMALL, "results.json"))
-    sha = weights_hash(bundled)
-    own = {"kind": "run", "bundled": SMALL, "sha256": sha}
-    assert results.policies == {SMALL: own, "mine": own, "copy": {"kind": "run", "sha256": sha}}
-    first, *others = (results.row(name, "rotate", "L1").outcomes for name in results.policies)
-    assert all(other == first for other in others)
-    assert main(["report", SMALL, "--out", "again.html"]) == 0
-    assert f"--policy {SMALL},mine={SMALL},copy=RUN " in Path("again.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.slow
-def test_it_is_recorded_and_listed_and_shown(bundled: Path, capsys) -> None:
-    assert main(["demo", "rotate", "--policy", SMALL, "--out", "video.mp4"]) == 0
-    assert Path("video.mp4").stat().st_size > 0
-    size = (bundled / "model.safetensors").stat().st_size
-    capsys.readouterr()
-    for words in (["list"], ["show", SMALL]):
-        assert main(["policies", *words]) == 0
-        shown = capsys.readouterr().out
-        for text in (f"{size / 1e6:.1f} MB", BUNDLED[SMALL].trained_on, str(bundled / MODEL_CARD)):
-            assert text in shown
-    assert main(["policies", "list", "--json"]) == 0
-    (record,) = (each for each in json.loads(capsys.readouterr().out) if each["name"] == SMALL)
-    assert record["bytes"] == size
-    assert record["model_card"] == str(bundled / MODEL_CARD)
 
 
 def test_training_begins_with_it(bundled: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -245,32 +245,6 @@ def test_images_announced_ahead_are_detected_in_batches_and_give_the_same_object
     assert detector.batches == [8, 2]
 
 
-def test_only_the_latest_images_are_kept() -> None:
-    detector = Bright()
-    extractor = DetectedObjects(detector, cache_size=2)
-    for level in (0, 10, 0, 20, 0, 10):  # 10 is dropped for 20
-        extractor.in_observation(observation(bright(level)))
-    assert len(detector.batches) == 4
-    extractor.extract_ahead([observation(bright(level)) for level in (30, 40, 50, 60)], [])
-    assert detector.batches[4:] == [4]  # no more than are kept
-
-
-def test_a_single_object_and_a_scene_of_equal_pixels_are_kept_apart() -> None:
-    extractor = DetectedObjects(Fixed(plain((0, 0, 9, 9), (200, 9, 220, 30)), plain()), cache_size=2)
-    assert len(extractor.in_prompt_image(prompt_image("object"))) == 1
-    assert len(extractor.in_prompt_image(prompt_image("scene"))) == 2
-
-
-def test_without_a_cache_nothing_is_detected_ahead_and_equal_images_again() -> None:
-    detector = Bright()
-    extractor = DetectedObjects(detector)
-    extractor.extract_ahead([observation(bright(10))] * 2, [])
-    assert detector.batches == []
-    for _ in range(2):
-        extractor.in_observation(observation(bright(10)))
-    assert detector.batches == [2, 2]
-
-
 def test_an_extractor_is_told_ahead_of_the_images_of_a_batch() -> None:
     from openvima.policies.processor import Processor
 
@@ -336,15 +310,3 @@ def test_impossible_detections_are_refused_at_once(make, error: type, message: s
 def test_detections_that_do_not_fit_the_image_are_refused(found, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         DetectedObjects(Fixed(found, plain())).in_observation(observation())
-
-
-def test_images_that_no_detector_was_made_for_are_refused() -> None:
-    extractor = DetectedObjects(Fixed(plain(), plain()))
-    with pytest.raises(PolicyError, match="no 'rgb'"):
-        extractor.in_observation({"ee": 0})
-    with pytest.raises(PolicyError, match="rgb lacks the view top"):
-        extractor.in_observation({"rgb": {"front": noise()["front"]}, "ee": 0})
-    with pytest.raises(ShapeError, match=r"\(3, 128, 256\)"):
-        extractor.in_observation(observation({view: image[:, :64] for view, image in noise().items()}))
-    with pytest.raises(PolicyError, match="prompt image 'thing' lacks the view front"):
-        extractor.in_prompt_image(prompt_image("object", {"top": noise()["top"]}))

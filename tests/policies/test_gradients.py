@@ -132,11 +132,6 @@ def test_the_loss_reaches_every_parameter_that_is_not_frozen_and_no_frozen_one(
     assert {name for name, p in model.named_parameters() if not p.requires_grad} == FROZEN[trained_layers]
 
 
-def test_words_can_be_trained_with_a_frozen_text_encoder(demonstrations) -> None:
-    model, moved = reached(published_layout("gpt", prompt_sizes(0, train_words=True)), demonstrations)
-    assert names(model) - moved == FROZEN[0] - {"prompt.words.weight"}
-
-
 @pytest.mark.parametrize("architecture", PUBLISHED)
 def test_the_published_presets_freeze_the_words_and_all_but_two_layers_of_t5(architecture) -> None:
     prompt = preset(f"{architecture}-2m").prompt
@@ -168,25 +163,3 @@ def test_a_prompt_of_words_alone_leaves_no_graph_in_a_frozen_text_encoder() -> N
     encoder = prompt_encoder(0)
     encoder.out.requires_grad_(False)
     assert not encoded(encoder, torch.zeros(0, 16)).requires_grad
-
-
-def kept_for_backward(trained_layers: int | None) -> int:
-    """How many numbers a forward pass keeps for the gradients."""
-    encoder, sizes = prompt_encoder(trained_layers), {}
-
-    def note(tensor):
-        sizes[tensor.untyped_storage().data_ptr()] = tensor.numel()
-        kept.append(tensor)  # else its memory would be used again, and counted once
-        return tensor
-
-    kept: list = []
-    with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        encoded(encoder, torch.ones(4, 16))
-    own = {parameter.untyped_storage().data_ptr() for parameter in encoder.parameters()}
-    return sum(size for place, size in sizes.items() if place not in own)
-
-
-def test_frozen_layers_keep_less_for_the_backward_pass() -> None:
-    frozen, two_trained, trained = (kept_for_backward(layers) for layers in (0, 2, None))
-    assert frozen < 0.8 * two_trained
-    assert two_trained < trained

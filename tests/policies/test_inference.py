@@ -214,11 +214,6 @@ def test_an_episode_that_ended_stays_ended(policy, prompts, pool) -> None:
     assert policy.act([None, None, None]) == [None, None, None]
 
 
-def blank(observation: dict) -> dict:
-    """The same with nothing to see."""
-    return {**observation, "segm": {view: np.zeros_like(segm) for view, segm in observation["segm"].items()}}
-
-
 def broken(observation: dict) -> dict:
     return {**observation, "rgb": {view: rgb.astype(np.float32) for view, rgb in observation["rgb"].items()}}
 
@@ -330,24 +325,6 @@ def test_acting_before_a_reset_is_refused(small_sizes, pool) -> None:
 
 
 @for_two_networks
-def test_a_reset_without_prompts_is_refused(policy) -> None:
-    with pytest.raises(PolicyError, match="reset got no prompts"):
-        policy.reset([])
-
-
-@for_two_networks
-def test_one_prompt_or_observation_is_no_batch(policy, prompts, pool) -> None:
-    for wrong in (prompts[0], ["Put it there."]):
-        with pytest.raises(
-            PolicyError, match=r"reset takes a list of rendered prompts, such as \[env\.prompt"
-        ):
-            policy.reset(wrong)
-    policy.reset(prompts[:1])
-    with pytest.raises(PolicyError, match=r"act takes a list of observations, .* such as \[observation\]"):
-        policy.act(pool[0])
-
-
-@for_two_networks
 def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(policy, prompts) -> None:
     prompt = replace(prompts[0], text=f"Juggle {prompts[0].text} Wildly!")
     with pytest.warns(UnknownWordWarning, match="in training: 'juggle', 'wildly'[.]") as caught:
@@ -386,36 +363,11 @@ def test_a_prompt_of_hundreds_of_kilobytes_is_refused_before_it_is_split(policy,
 
 
 @for_two_networks
-def test_a_batch_too_large_for_its_longest_prompt_is_refused_before_it_is_encoded(
-    policy, prompts, monkeypatch
-) -> None:
-    monkeypatch.setattr(policy.network, "encode_images", lambda images: pytest.fail("encoded"))
-    long = replace(prompts[0], text="put the " * 100 + prompts[0].text)
-    policy = policy.new_session()
-    with pytest.raises(
-        PolicyError, match=r"40 prompts of up to 2\d\d tokens .* takes (1|2)\d of that length"
-    ):
-        policy.reset([long] + [prompts[1]] * 39)
-
-
-@for_two_networks
 def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, pool) -> None:
     policy.reset([prompts[0]])
     with pytest.raises(PolicyError, match=rf"history has 5\d\d tokens; this policy takes {MAX_POSITIONS}"):
         for _ in range(MAX_POSITIONS):
             policy.act([pool[-1]])
-
-
-@for_two_networks
-def test_histories_that_take_too_much_together_are_refused(policy, prompts, pool, monkeypatch) -> None:
-    monkeypatch.setattr("openvima.policies.inference.MAX_CACHED_TOKENS", 60)
-    policy = policy.new_session()
-    policy.reset([prompts[0], prompts[1]])
-    with pytest.raises(
-        PolicyError, match=r"the histories of 2 episodes have \d+ tokens each.* takes 60 in all"
-    ):
-        for _ in range(40):
-            policy.act([pool[-1]] * 2)
 
 
 class Doubled(GroundTruth):
@@ -432,22 +384,3 @@ def test_more_objects_than_fit_are_refused(name, limit, prompts, pool) -> None:
     policy.reset([prompts[0]])
     with pytest.raises(PolicyError, match=rf"shows 6\d\d objects; this policy takes {limit}"):
         policy.act([pool[0]])
-
-
-def test_an_observation_without_objects_is_refused_where_objects_are_what_is_seen(
-    policy, prompts, pool
-) -> None:
-    policy.reset([prompts[0]])
-    if policy.processor.layout == "frames":
-        assert policy.act([blank(pool[0])]) != [None]
-        return
-    with pytest.raises(PolicyError, match="contains no object"):
-        policy.act([blank(pool[0])])
-
-
-def test_frames_of_another_size_are_refused(policy, prompts, pool) -> None:
-    policy.reset([prompts[0]])
-    small = {view: np.ascontiguousarray(rgb[:, :64]) for view, rgb in pool[0]["rgb"].items()}
-    segm = {view: np.ascontiguousarray(segm[:64]) for view, segm in pool[0]["segm"].items()}
-    with pytest.raises(ShapeError, match=r"64, 256\)"):
-        policy.act([{**pool[0], "rgb": small, "segm": segm}])

@@ -37,15 +37,6 @@ def seen(**parts: object) -> dict:
     return {"rgb": noise(), "segm": {view: np.ones((128, 256), np.uint8) for view in VIEWS}, "ee": 0, **parts}
 
 
-def crowded(count: int) -> dict:
-    """An observation of so many objects, of four pixels each."""
-    segm = np.ones((128, 256), np.uint8)
-    for number in range(count):
-        row, column = number // 32 * 4, number % 32 * 8
-        segm[row : row + 2, column : column + 2] = 5 + number
-    return seen(segm=dict.fromkeys(VIEWS, segm))
-
-
 LEFT, RIGHT = [20, 60, 40, 80], [200, 60, 220, 80]
 
 
@@ -127,17 +118,6 @@ def test_prompts_that_do_not_fit_together_are_refused(layout: str, demonstration
     real = replace(image, rgb={view: frame / 255 for view, frame in image.rgb.items()})
     with pytest.raises(ShapeError, match=r"float64.*must be uint8"):
         processor.encode_prompts([replace(prompt, images={**prompt.images, name: real})])
-
-
-@pytest.mark.parametrize("name", ["nano", "vima-nano"])
-def test_more_objects_than_a_history_holds_are_refused(name: str, demonstrations) -> None:
-    """With one token for each object eight steps of 60 fit, with one for each view four."""
-    demo = demonstrations[0]
-    policy = NetworkPolicy(build_network(preset(name), seed=0))
-    policy.reset([demo.prompt])
-    with pytest.raises(PolicyError, match=r"this policy takes 512\. Give.*fewer objects"):
-        for _ in range(9):
-            policy.act([crowded(60)])
 
 
 def test_objects_come_in_the_order_of_their_ids_where_published_policies_know_it(starts) -> None:

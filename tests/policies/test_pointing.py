@@ -14,7 +14,6 @@ from openvima.policies.nn.action_head import ObservationTokens, add_pointing, po
 from openvima.policies.nn.actions import PLACE_NEAR_M, ActionTargets, greedy
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
-from openvima.policies.variants import with_variant
 from openvima.training import TrainingConfig
 from openvima.training.building import build_learner, resolve
 from small_networks import collate_examples, examples_of
@@ -103,22 +102,6 @@ def test_positions_are_those_of_the_objects_that_the_output_points_at():
                 expected[part], near = points[b, t, scores.argmax()], near + (part.start > 0)
         np.testing.assert_allclose(moved[b, t].numpy(), expected, rtol=1e-6)
     assert 0 < near < B * T
-
-
-@pytest.mark.parametrize("name", ["small", "gato-nano", "flamingo-nano"])
-def test_networks_that_cannot_point_refuse_to(name):
-    with pytest.raises(ConfigError, match="points"):
-        with_variant(preset(name), {"points": True})
-
-
-def test_pointing_needs_the_loss_that_teaches_it():
-    settings = {"data": Path("demos"), "out": Path("run"), "preset": "vima-nano", "model.points": True}
-    with pytest.raises(ConfigError, match=r"model\.points is True, but optimizer.pointing_loss_weight is 0"):
-        resolve(TrainingConfig.of(settings))
-    network = build_learner(
-        TrainingConfig.of({**settings, "optimizer.pointing_loss_weight": 1.0}), []
-    ).network
-    assert network.head.points
 
 
 def test_what_is_measured_in_training_is_what_the_policy_does(demonstrations):

@@ -7,8 +7,6 @@ import pytest
 import torch
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts
-from openvima.env import TabletopEnv
-from openvima.errors import UnknownPolicyError
 from openvima.policies import RandomPolicy, load_policy
 from openvima.policies.base import Policy
 from openvima.policies.build import build_network
@@ -68,18 +66,6 @@ def test_actions_are_four_float32_arrays_within_bounds(policy, demonstrations) -
                 assert (action[key] <= np.float32(WORKSPACE_HIGH)).all()
             for key in ("pose0_rotation", "pose1_rotation"):
                 assert (np.abs(action[key]) <= 1).all()
-
-
-def test_the_environment_takes_the_actions(policy) -> None:
-    env = TabletopEnv("sweep_without_exceeding")
-    observation, _ = env.reset(seed=3)
-    policy.reset([env.prompt])
-    for _ in range(2):
-        (action,) = policy.act([observation])
-        observation, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
-            break
-    assert env.action_space.contains(action)
 
 
 def encode_episode(processor: NaiveProcessor, demo) -> list:
@@ -144,11 +130,3 @@ def test_the_random_policy_follows_from_its_seed_and_never_touches_the_global_ge
     assert_equal(drawn[0], drawn[1])
     assert not np.array_equal(drawn[0][0]["pose0_position"], drawn[2][0]["pose0_position"])
     assert (np.random.get_state()[1] == state).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "suggestion"), [("randm", "random"), ("untraind", "untrained"), ("nanobins", "nano-bins")]
-)
-def test_a_mistyped_policy_gets_a_suggestion(name: str, suggestion: str) -> None:
-    with pytest.raises(UnknownPolicyError, match=f"no policy '{name}'. Did you mean '{suggestion}'"):
-        load_policy(name)

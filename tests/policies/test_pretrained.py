@@ -12,11 +12,11 @@ from openvima.errors import InputFileError, MissingExtraError, PolicyError, Serv
 from openvima.evaluation.sources import weights_hash
 from openvima.policies import RandomPolicy, load_policy, preset
 from openvima.policies.build import build_network
-from openvima.policies.checkpoint import load_checkpoint, load_network
+from openvima.policies.checkpoint import load_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.naming import TOKENIZER_FOLDER
 from openvima.policies.t5 import T5Tokenizer
-from openvima.policies.tokenizer import VOCABULARY_FILE, benchmark_vocabulary
+from openvima.policies.tokenizer import VOCABULARY_FILE
 from published_policies import small_vima, write_published, write_tokenizer
 
 HUB_ID = "owner/some.policy-1"
@@ -76,13 +76,6 @@ def test_a_saved_policy_comes_back_in_every_way_of_loading(policy, demonstration
         assert_same_actions(load(str(tmp_path / "saved")), policy, demonstrations)
 
 
-def test_a_policy_is_stored_in_float32_unless_asked(policy, tmp_path) -> None:
-    policy.save_pretrained(tmp_path / "saved")
-    assert load_checkpoint(tmp_path / "saved").query.dtype == torch.float32
-    policy.save_pretrained(tmp_path / "saved", dtype=torch.bfloat16)
-    assert load_checkpoint(tmp_path / "saved").query.dtype == torch.bfloat16
-
-
 def test_options_reach_the_policy(policy, tmp_path) -> None:
     policy.save_pretrained(tmp_path / "saved")
     loaded = load_policy(str(tmp_path / "saved"), dtype=torch.bfloat16)
@@ -129,10 +122,6 @@ def test_without_a_tokenizer_the_error_says_how_to_give_one(published) -> None:
             make()
 
 
-def test_networks_with_fresh_weights_have_the_words_of_the_benchmark(policy) -> None:
-    assert policy.processor.tokenizer.vocabulary == benchmark_vocabulary()
-
-
 def test_a_file_that_is_no_policy_is_refused(tmp_path) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(InputFileError, match=r"notes\.txt is damaged, .* or is no torch zip archive"):
@@ -159,11 +148,6 @@ def test_a_policy_on_the_hub_has_the_hash_of_its_weights(hub, policy, tmp_path) 
     assert weights_hash(HUB_ID) == weights_hash(tmp_path / "snapshot")
 
 
-def test_a_published_file_has_a_hash_of_its_own(published, tmp_path) -> None:
-    other = write_published(build_network(small_vima(), seed=3), tmp_path / "other.ckpt")
-    assert weights_hash(published) != weights_hash(other)
-
-
 def test_without_a_connection_the_error_names_the_repository_in_one_line(hub) -> None:
     with pytest.raises(ServerError) as caught:
         load_policy(HUB_ID)
@@ -188,28 +172,6 @@ def test_the_hub_is_not_asked_for_what_can_be_a_path_only(hub, name, tmp_path, m
     assert not hub.asked
 
 
-def test_the_hub_is_not_asked_for_a_folder_that_is_here(hub, policy, tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    policy.save_pretrained(HUB_ID)
-    load_policy(HUB_ID)
-    assert not hub.asked
-
-
-def test_a_folder_may_have_the_name_of_a_preset(policy, demonstrations, tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    policy.save_pretrained("vima-nano")
-    assert_same_actions(load_policy("vima-nano"), policy, demonstrations)
-
-
-def test_a_folder_named_untrained_is_not_mistaken_for_fresh_weights(tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "untrained").mkdir()
-    with pytest.raises(PolicyError, match=r"'untrained' is a network.*write \./untrained for the folder"):
-        load_policy("untrained")
-    with pytest.raises(InputFileError):
-        load_policy("./untrained")
-
-
 @pytest.mark.parametrize("name", ["nano", "vima-nano"])
 def test_a_preset_has_no_weights_and_the_error_says_how_to_get_some(name) -> None:
     ways = rf"'{name}' is a preset.*`openvima train --preset {name} --data DEMOS --out RUN`.*openvima-small"
@@ -217,14 +179,6 @@ def test_a_preset_has_no_weights_and_the_error_says_how_to_get_some(name) -> Non
         load_policy(name)
     with pytest.raises(InputFileError, match=ways):
         NetworkPolicy.from_pretrained(name)
-
-
-def test_the_error_for_a_published_preset_names_t5_and_the_published_weights() -> None:
-    with pytest.raises(UnknownPolicyError, match=r"--preset vima-2m --t5 t5-base .*published weights"):
-        load_policy("vima-2m")
-    with pytest.raises(UnknownPolicyError) as refusal:
-        load_policy("gato-2m")
-    assert "--t5 t5-base" in str(refusal.value) and "published" not in str(refusal.value)
 
 
 def test_fresh_weights_of_a_preset_have_a_name() -> None:

@@ -203,17 +203,6 @@ def test_sizes_of_every_published_network_follow_from_its_weights(architecture, 
     assert config_from_published(weights, cfg_of(config, architecture)) == config
 
 
-def test_sizes_of_small_networks_follow_from_their_weights(network, architecture) -> None:
-    config = network.config
-    assert config_from_published(to_published(network), cfg_of(config, architecture)) == config
-
-
-def test_heads_are_taken_from_cfg(vima_contents) -> None:
-    cfg = vima_contents["cfg"] | {"sattn_n_heads": 16, "xattn_n_heads": 8}
-    decoder = config_from_published(vima_contents["state_dict"], cfg).decoder
-    assert decoder == DecoderConfig(width=32, num_layers=2, num_self_heads=16, num_cross_heads=8)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -250,12 +239,6 @@ def test_masks_that_some_versions_store_may_be_in_every_file(network, architectu
     prefix = "xattn_gpt" if architecture in DECODER_NAMES else "transformer.lm"
     values["state_dict"][f"policy.{prefix}.h.0.attn.bias"] = torch.ones(1, 1, 512, 512).tril()
     assert_same(load_published(saved(values, tmp_path)).state_dict(), network.state_dict())
-
-
-def test_loading_draws_no_random_numbers(vima_contents, tmp_path) -> None:
-    file, before = saved(vima_contents, tmp_path), torch.get_rng_state()
-    load_published(file)
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_missing_unexpected_and_misshapen_weights_are_listed_in_one_message(vima_contents, tmp_path) -> None:
@@ -315,15 +298,4 @@ def test_a_file_that_was_cut_is_refused(vima_contents, tmp_path, share) -> None:
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
     with pytest.raises(InputFileError, match="ends too early"):
-        load_published(file)
-
-
-@pytest.mark.parametrize("share", [0.01, 0.5, 0.9])
-def test_a_file_with_a_flipped_bit_is_refused(vima_contents, tmp_path, share) -> None:
-    """Torch itself would take damaged weights for whole ones."""
-    file = saved(vima_contents, tmp_path)
-    data = bytearray(file.read_bytes())
-    data[int(share * len(data))] ^= 1
-    file.write_bytes(data)
-    with pytest.raises(InputFileError, match="is damaged"):
         load_published(file)

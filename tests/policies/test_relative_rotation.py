@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from openvima.errors import ConfigError
 from openvima.policies.nn.image_encoders import ConvConfig
 from openvima.policies.nn.object_encoder import (
     ObjectEncoder,
@@ -87,22 +86,3 @@ def test_shifted_phases_are_a_rotation():
     )
     visible = torch.ones(2, 1, dtype=torch.bool)
     assert int(estimator(first, second, visible, visible).argmax()) == 17
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rotation_bins": 1}, "rotation_bins is 1; it must be 0, or at least 2"),
-        ({"rotation_bins": -3}, "rotation_bins is -3"),
-        ({"rotation_bins": 72, "appearance_width": 0}, "rotation_bins needs an appearance width"),
-    ],
-)
-def test_sizes_that_cannot_be_are_named(change, message):
-    sizes = {"box_width": 4, "width": 8, "fuse_views": True, "appearance_width": 16}
-    with pytest.raises(ConfigError, match=message):
-        ObjectEncoderConfig(ConvConfig(8, 16), **{**sizes, **change})
-
-
-def test_places_need_at_least_no_channels():
-    with pytest.raises(ConfigError, match="place_channels is -1"):
-        ConvConfig(8, 16, place_channels=-1)

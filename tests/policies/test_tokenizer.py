@@ -111,10 +111,6 @@ def test_every_prompt_of_the_17_tasks_is_encoded(template: str) -> None:
         assert all(PADDING_ID < part < benchmark_vocabulary().num_ids for part in ids)
 
 
-def test_there_are_as_many_templates_as_tasks() -> None:
-    assert len(TEMPLATES) == 17
-
-
 @pytest.mark.parametrize("texture", TEXTURES)
 def test_every_texture_can_be_named(texture: str) -> None:
     assert len(encode_text(f"the {texture} object")) == len(texture.split()) + 2
@@ -208,10 +204,6 @@ def test_the_words_of_texts_follow_the_unknown_token_in_an_order_of_their_own() 
     assert split_words("BU\N{COMBINING DIAERESIS}RO") == ["büro"]
 
 
-def test_words_of_textures_are_those_of_the_catalogue_that_texts_have() -> None:
-    assert Vocabulary().extended(["the red and polka dot bowl"]).texture_words == ("dot", "polka", "red")
-
-
 def test_new_words_get_ids_behind_the_known_ones() -> None:
     before = Vocabulary().extended(["put the blue bowl"])
     after = before.extended(["sweep the green bowl", "\x1b " + "x" * (MAX_WORD_LENGTH + 1)])
@@ -266,12 +258,3 @@ def test_a_damaged_vocabulary_is_refused(content: str, reason: str, tmp_path) ->
 def test_a_placeholder_without_image_is_refused() -> None:
     with pytest.raises(PromptError):
         encoded(RenderedPrompt("Put the {a} away.", {}))
-
-
-def test_a_client_with_ever_new_words_is_warned_of_a_bounded_number_of_times(recwarn) -> None:
-    tokenizer = WordTokenizer()
-    for number in range(600):
-        tokenizer.encode(f"{number + 1000} {'x' * 10**4}{number}")
-    assert 100 < len(recwarn) <= 300
-    assert len(tokenizer._warned) <= 300 and max(map(len, tokenizer._warned)) <= MAX_WORD_LENGTH
-    assert "Further unknown words are not named." in str(recwarn[-1].message)

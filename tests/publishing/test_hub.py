@@ -127,22 +127,6 @@ def test_a_manifest_of_others_names_no_file_outside(hub: LocalHub, demos: Path) 
 
 
 @pytest.mark.parametrize(
-    "edit",
-    [
-        lambda manifest: manifest["tasks"].update({"[/red]\x1b[2J": manifest["tasks"]["rotate"]}),
-        lambda manifest: manifest.update(command="\x1b]0;owned\x07"),
-    ],
-)
-def test_a_manifest_of_others_shows_nothing_but_lines(hub: LocalHub, demos: Path, edit, capsys) -> None:
-    edit_manifest(demos, edit)
-    hub.repository("evil/demos", "datasets").commit({f.name: f.read_bytes() for f in demos.iterdir()})
-    assert main(["data", "info", "hf://evil/demos"]) in (0, 2)
-    shown = "".join(capsys.readouterr())
-    assert "\x1b]" not in shown and "\x1b[2J" not in shown and "\x07" not in shown
-    assert "Traceback" not in shown
-
-
-@pytest.mark.parametrize(
     ("name", "message"),
     [
         ("hf://owner/nowhere", "the download of owner/nowhere failed: .*[Rr]epository"),

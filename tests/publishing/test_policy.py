@@ -8,9 +8,8 @@ import yaml
 
 from local_hub import LocalHub
 from openvima.cli.main import main
-from openvima.errors import ConfigError, InputFileError, ServerError
+from openvima.errors import ConfigError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
-from openvima.hub import HubName
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=<...>':DeprecationWarning")  # of the client
@@ -125,26 +124,3 @@ def test_without_run_folder_and_results_the_card_says_so(run: Path, tmp_path: Pa
 
 def test_the_bundled_checkpoint_has_a_card_of_its_training(hub: LocalHub) -> None:
     assert "| demonstrations | 52000 |" in policy_card("openvima-small", "owner/small")
-
-
-def test_a_damaged_checkpoint_of_the_hub_is_refused_as_one_of_a_folder(hub: LocalHub, run: Path) -> None:
-    revision = push_policy(run, "owner/first").revision
-    files = dict(hub.repository("owner/first").commits[revision])
-    files["model.safetensors"] = files["model.safetensors"][:-8] + bytes(8)
-    hub.repository("evil/first").commit(files)
-    with pytest.raises(InputFileError, match=r"is damaged: its digest is not the one in config\.yaml"):
-        load_policy("evil/first")
-    files["config.yaml"] = b"training: {preset: 'evil.py:run'}\npolicy: code\n"
-    hub.repository("evil/code").commit(files)
-    with pytest.raises(InputFileError, match="does not describe a 'network' policy"):
-        load_policy("evil/code", trust_code=True)
-
-
-def test_file_names_of_the_hub_do_not_leave_its_cache(hub: LocalHub, run: Path, tmp_path: Path) -> None:
-    hub.repository("evil/names").commit({"tokenizer/../../../../owned.json": b"{}", "config.yaml": b""})
-    with pytest.raises((ServerError, InputFileError)):
-        load_policy("evil/names")
-    import huggingface_hub
-
-    assert not list(Path(huggingface_hub.constants.HF_HOME).rglob("owned.json"))
-    assert str(HubName("evil/names", "main")) == "evil/names@main"

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from openvima.env import TabletopEnv
-from openvima.errors import MessageError, PolicyError, ServerError
+from openvima.errors import PolicyError, ServerError
 from openvima.evaluation import score
 from openvima.policies import RandomPolicy
-from openvima.serving import PROTOCOL, RemotePolicy, serve_in_thread
-from openvima.serving.protocol import decode_observation
-from served_policies import made_up_observation, made_up_prompt, scripted_server
+from openvima.serving import RemotePolicy, serve_in_thread
+from served_policies import made_up_observation, made_up_prompt
 
 TOOL = np.array([0.5, 0.1, 0.3, -1.0, 1.0], np.float32)
 OBSERVATION = {**made_up_observation(1), "tool": TOOL}
@@ -87,42 +86,3 @@ def test_a_malformed_command_ends_the_episode_with_the_reason(given: object, rea
         (row,) = score({"remote": remote}, **ROTATE, control="end_effector").rows
     (outcome,) = row.outcomes
     assert not outcome.success and outcome.steps == 0 and re.search(reason, outcome.reason)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [({}, "action is a dict; it must be an array"), (["left"], "a value of type '<U4' cannot be sent")],
-)
-def test_what_is_no_array_of_numbers_ends_the_evaluation(given: object, message: str) -> None:
-    with (
-        serve_in_thread(Gives(given)) as url,
-        RemotePolicy(url) as remote,
-        pytest.raises(ServerError, match=message),
-    ):
-        score({"remote": remote}, **ROTATE, control="end_effector")
-
-
-def test_an_array_of_a_policy_of_primitives_is_refused() -> None:
-    policy = Gives(np.zeros(12, np.float32))
-    policy.control = "primitives"
-    with serve_in_thread(policy) as url, RemotePolicy(url) as remote:
-        remote.reset([made_up_prompt(1)])
-        with pytest.raises(ServerError, match="action is a ndarray; it must be a map"):
-            remote.act([made_up_observation(1)])
-
-
-@pytest.mark.parametrize("tool", [TOOL[:4], TOOL.astype(np.float64), np.full(5, np.inf, np.float32)])
-def test_a_pose_of_the_tool_in_another_form_is_refused(tool: np.ndarray) -> None:
-    with pytest.raises(MessageError, match=r"tool is float\d\d .* must be float32 \(5,\), all finite"):
-        decode_observation({**OBSERVATION, "tool": tool}, control="end_effector")
-
-
-@pytest.mark.parametrize("control", ["joints", 3, None, ["primitives"]])
-def test_an_unknown_control_is_refused_on_both_sides(control: object) -> None:
-    first = {"protocol": PROTOCOL, "control": control}
-    with scripted_server(metadata=first) as url, pytest.raises(ServerError, match="control of"):
-        RemotePolicy(url)
-    policy = Follows()
-    policy.control = control  # type: ignore[assignment]
-    with pytest.raises(MessageError, match="allowed: primitives, end_effector"), serve_in_thread(policy):
-        pass

@@ -2,7 +2,6 @@
 
 import logging
 import threading
-import time
 from typing import Any
 
 import pytest
@@ -134,11 +133,3 @@ def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCap
         assert isinstance(answer, str)
         assert answer.isprintable() and len(answer) <= 500 and answer.count("y") <= 200 + 10
     assert all(line.isprintable() for line in caplog.text.splitlines()) and "\x1b" not in caplog.text
-
-
-def test_a_prompt_of_many_megabytes_is_refused_at_once() -> None:
-    sent = {"type": "reset", "prompts": [{"text": "put the {a} " * 2_000_000}]}
-    data = pack(sent)
-    started = time.process_time()
-    assert "24,000,000 characters" in str(Session(Untouched(), 64).read(data))
-    assert time.process_time() - started < 2

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from served_policies import Telltale, scripted_server
+from served_policies import Telltale
 
 torch = pytest.importorskip("torch")
 
@@ -22,7 +22,7 @@ from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.presets import preset  # noqa: E402
-from openvima.serving import PROTOCOL, RemotePolicy, serve_in_thread  # noqa: E402
+from openvima.serving import RemotePolicy, serve_in_thread  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding")
 TINY = EvaluationConfig(("random",), TASKS, ("L1",), episodes=3, batch=2)
@@ -105,16 +105,6 @@ def test_an_evaluation_through_a_server_has_the_outcomes_of_one_without(
     assert url not in there.read_text()
 
 
-@pytest.mark.slow
-def test_two_workers_play_through_one_server(tmp_path: Path) -> None:
-    short = replace(TINY, tasks=("rotate",), episodes=2, batch=1)
-    config = replace(short, policies=("random",), out=tmp_path / "one")
-    alone = Results.read(evaluate(config))
-    with serve_in_thread(RandomPolicy()) as url:
-        config = replace(short, policies=(f"random={url}",), out=tmp_path / "two", workers=2)
-        assert Results.read(evaluate(config)).rows == alone.rows
-
-
 def test_outcomes_are_kept_for_the_same_server_and_played_again_for_another(tmp_path: Path) -> None:
     config = replace(TINY, tasks=("rotate",), out=tmp_path)
     with serve_in_thread(RandomPolicy(), about=ABOUT) as url:
@@ -176,12 +166,3 @@ def test_servers_are_named_after_their_address_or_as_asked() -> None:
     assert [source.name for source in sources] == ["127.0.0.1-8000", "mine", "1-8000"]
     assert [source.source for source in sources][1:] == ["wss://a.example/x?b=c", "ws://[::1]:8000/p?q=r"]
     assert {source.kind for source in sources} == {"remote"}
-
-
-def test_metadata_that_is_not_finite_never_reaches_results(tmp_path: Path) -> None:
-    with (
-        scripted_server(metadata={"protocol": PROTOCOL, "score": float("nan")}) as url,
-        pytest.raises(ServerError, match="plain, finite values"),
-    ):
-        evaluate(replace(TINY, policies=(f"hostile={url}",), out=tmp_path / "out"))
-    assert not (tmp_path / "out").exists()

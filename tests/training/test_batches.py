@@ -59,28 +59,11 @@ def test_sorting_by_length_leaves_little_to_pad() -> None:
     assert padded_share(replace(plain, lengths=lengths)) < 0.02
 
 
-def test_the_first_column_of_lengths_counts_most() -> None:
-    lengths = np.array([[2, 1], [1, 9], [1, 3], [2, 0]])
-    order = BatchOrder(4, batch_size=2, lengths=lengths)
-    assert sorted(rows.tolist() for rows in epoch_of(order, 0)) == [[2, 1], [3, 0]]
-
-
 def test_batches_of_all_lengths_are_spread_over_the_epoch() -> None:
     lengths = np.arange(1000) % 10
     order = BatchOrder(1000, batch_size=10, seed=0, lengths=lengths, bucket=100)
     means = np.array([lengths[rows].mean() for rows in epoch_of(order, 0)])
     assert abs(np.corrcoef(means, np.arange(len(means)))[0, 1]) < 0.25
-
-
-def test_neighbours_of_one_epoch_are_strangers_in_the_next() -> None:
-    order = BatchOrder(2000, batch_size=20, seed=0)
-    together = [{frozenset(pair) for rows in epoch_of(order, e) for pair in _pairs(rows)} for e in (0, 1)]
-    by_chance = len(together[0]) * 19 / 1999
-    assert abs(len(together[0] & together[1]) - by_chance) < 5 * np.sqrt(by_chance)
-
-
-def _pairs(rows: np.ndarray) -> list[tuple[int, int]]:
-    return [(int(a), int(b)) for i, a in enumerate(rows) for b in rows[i + 1 :]]
 
 
 def test_the_order_follows_from_its_numbers_alone() -> None:

@@ -15,7 +15,6 @@ from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.scene import ObjectRecord
 from openvima.tasks.prompts import describe, description_of, image_descriptions, synonyms
-from openvima.training import source as source_module
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.augmentation.prompts import (
     describe_objects,
@@ -100,15 +99,6 @@ def test_synonyms_are_aliases_of_the_catalogue(demos) -> None:
     assert 0.3 < np.mean([each["a"] == "cube" for each in said]) < 0.7
 
 
-def test_names_that_no_prompt_can_hold_keep_their_image(demos) -> None:
-    demo = demos["visual_manipulation"]
-    name, *others = demo.prompt.images
-    for bad in ("x" * 300, "a {frame_0}"):
-        image = replace(demo.prompt.images[name], objects=(ObjectRecord(0, bad, "red"),))
-        prompt = replace(demo.prompt, images={**demo.prompt.images, name: image})
-        assert list(image_descriptions(prompt)) == others
-
-
 def test_the_object_cache_holds_the_descriptions(data) -> None:
     dataset = Dataset(data)
     cache = open_object_cache(dataset)
@@ -148,16 +138,6 @@ def test_it_changes_prompts_of_tasks_in_training_only(demos) -> None:
     motion = replace(ALWAYS, inverse_dynamics_prob=1.0)
     never = replace(motion, text_description_prob=0.0)
     assert words(motion, is_training=True) == words(never, is_training=True)
-
-
-def test_descriptions_count_for_the_length_of_prompts(data) -> None:
-    dataset = Dataset(data)
-    tokenizer = WordTokenizer(Vocabulary().extended(training_texts(dataset, ALWAYS)))
-    cache, processor = open_object_cache(dataset), Processor("objects", tokenizer=tokenizer)
-    bounds, _ = source_module._upper_bounds(cache, processor, False, True)
-    for episode, bound in zip(cache, bounds, strict=True):
-        text = with_descriptions(episode, 1.0, np.random.default_rng(0)).prompt.text
-        assert len(tokenizer.encode(text)) <= bound
 
 
 def test_a_description_comes_with_its_article_and_plural() -> None:

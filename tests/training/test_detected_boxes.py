@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from safetensors.torch import load_file
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts
 from openvima.data import Dataset
@@ -18,7 +17,6 @@ from openvima.detector.plugins import PluggedExtractor, detected_object_cache, p
 from openvima.errors import ConfigError
 from openvima.perception.objects import ObjectViews
 from openvima.perception.preprocessing import ImageStack
-from openvima.policies import load_policy
 from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
@@ -27,7 +25,6 @@ from openvima.training.batches import BatchMaker, Example, ExampleSource
 from openvima.training.learner import PolicyCollate
 from openvima.training.source import alternative_source, split_examples
 from plugged_extractors import HOOK, NoisyExtractor
-from small_networks import train_until
 
 
 class Guesses:
@@ -224,41 +221,6 @@ def test_an_example_names_its_images_in_the_stack_of_both(sources) -> None:
     assert [e.episode.seed for e in detected] == [e.episode.seed for e in true]
 
 
-def weights_of(run: Path) -> dict:
-    folder = run / "checkpoints" / "2-cloning-000006"
-    return {**load_file(folder / "model.safetensors"), **load_file(folder / "optimizer.safetensors")}
-
-
-def assert_equal_runs(ours: Path, theirs: Path) -> None:
-    a, b = weights_of(ours), weights_of(theirs)
-    assert a.keys() == b.keys()
-    assert all(torch.equal(a[name], b[name]) for name in a)
-    assert (ours / "metrics.jsonl").read_bytes() == (theirs / "metrics.jsonl").read_bytes()
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"pretraining.finetune_crop_encoder": True, "loader.num_workers": 2},
-        {
-            "augmentation.inverse_dynamics_prob": 0.5,
-            "optimizer.grad_accum_steps": 2,
-            "loader.detected_prob": 0.4,
-            "loader.rerendered_prob": 0.4,
-            "loader.detected_fraction": 0.5,
-        },
-    ],
-)
-@pytest.mark.slow
-def test_a_killed_mixed_run_resumes_exactly(settings, tmp_path, change) -> None:
-    settings |= {"loader.boxes": HOOK, **change}
-    whole = train(TrainingConfig.of({**settings, "out": tmp_path / "whole"}))
-    torn = TrainingConfig.of({**settings, "out": tmp_path / "torn"})
-    train_until(torn, 8)
-    assert_equal_runs(whole, train(torn))
-    load_policy(str(whole))
-
-
 @pytest.mark.slow
 def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(settings, data, tmp_path) -> None:
     short = {**settings, "pretraining.steps": 0, "schedule.steps": 2, "object_cache": tmp_path / "tokens"}
@@ -279,39 +241,6 @@ def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(sett
     written = yaml.safe_load((mixed / "config.yaml").read_text())
     assert written["training"]["loader"]["detected_prob"] == 0.5
     assert written["demonstrations"]["boxes"] == plugged_boxes(HOOK).name
-
-
-@pytest.mark.slow
-def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None:
-    """The same weights get the same score whether or not training used detected boxes."""
-    still = {
-        **settings,
-        "pretraining.steps": 0,
-        "schedule.steps": 1,
-        "optimizer.learning_rate": 0.0,
-        "optimizer.weight_decay": 0.0,
-    }
-    lines = {}
-    for name, share in (("true", 0.0), ("mixed", 0.5), ("detected", 1.0)):
-        boxes = {"loader.boxes": HOOK, "loader.detected_prob": share, "out": tmp_path / name}
-        run = train(TrainingConfig.of({**still, **boxes}))
-        lines[name] = (run / "metrics.jsonl").read_text().splitlines()[1]
-        assert "validation_loss" in lines[name]
-    assert lines["true"] == lines["mixed"] != lines["detected"]
-
-
-@pytest.mark.slow
-def test_another_detector_is_another_run(settings, tmp_path) -> None:
-    file = tmp_path / "extractors.py"
-    file.write_text("from plugged_extractors import make\n")
-    config = TrainingConfig.of(
-        {**settings, "pretraining.steps": 0, "schedule.steps": 2, "loader.boxes": f"{file}:make"}
-    )
-    train(config)
-    train(config)
-    file.write_text("from plugged_extractors import make  # changed\n")
-    with pytest.raises(ConfigError, match=r"demonstrations\.boxes is 'make-\w+' there"):
-        train(config)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Each architecture from demonstrations to actions, on the command line."""
 
-import json
-import re
 import shlex
 from pathlib import Path
 
@@ -12,11 +10,8 @@ from safetensors.torch import load_file
 
 from openvima.cli.main import main
 from openvima.env import TabletopEnv
-from openvima.policies import load_policy, presets
-from openvima.policies.build import build_network
+from openvima.policies import load_policy
 from openvima.scene import Action
-from openvima.training.behaviour_cloning import BehaviourCloning
-from openvima.training.loop import step_seed
 
 STEPS = 3
 
@@ -56,45 +51,6 @@ def test_a_run_makes_a_working_policy(architecture, data, tmp_path) -> None:
     assert_it_acts(tmp_path)
 
 
-def test_an_interrupted_run_resumes_to_a_working_policy(data, tmp_path, monkeypatch) -> None:
-    preset, whole, torn = "vima-nano", tmp_path / "whole", tmp_path / "torn"
-    assert run_train(data, whole, preset) == 0
-    backward = BehaviourCloning.backward
-
-    def interrupted(self: BehaviourCloning, step: int) -> dict[str, float]:
-        if step == 2:
-            raise KeyboardInterrupt
-        return backward(self, step)
-
-    monkeypatch.setattr(BehaviourCloning, "backward", interrupted)
-    assert run_train(data, torn, preset) == 130
-    monkeypatch.undo()
-    assert run_train(data, torn, preset) == 0
-    last = f"checkpoints/2-cloning-{STEPS:06d}/model.safetensors"
-    expected, actual = load_file(whole / last), load_file(torn / last)
-    assert expected.keys() == actual.keys()
-    assert all(torch.equal(tensor, actual[name]) for name, tensor in expected.items())
-    assert_it_acts(torn)
-
-
-@pytest.mark.slow
-def test_without_an_appearance_embedding_there_is_no_pretraining_and_the_image_encoder_is_trained(
-    data, tmp_path, capsys
-) -> None:
-    assert run_train(data, tmp_path, "gpt-nano", "--loader.validation-fraction", 0.3) == 0
-    assert re.search(rf"2-cloning, step {STEPS}, held out: loss .*pick \d+%.*place", capsys.readouterr().err)
-    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["training"]["pretraining"]["steps"] == 0
-    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert {line["name"] for line in lines} == {"2-cloning"}
-    metrics = {name for line in lines for name in line}
-    assert {"accuracy", "place_accuracy", "validation_rotation_accuracy", "query_spread"} <= metrics
-    fresh = build_network(presets.preset("gpt-nano"), seed=step_seed(0, "weights", 0)).state_dict()
-    trained = load_file(tmp_path / f"checkpoints/2-cloning-{STEPS:06d}/model.safetensors")
-    images = [name for name in fresh if name.startswith("images.")]
-    assert all(not torch.equal(fresh[name], trained[name]) for name in images)
-    assert_it_acts(tmp_path)
-
-
 def test_a_finished_run_that_is_to_be_longer_names_the_command_that_goes_on(data, tmp_path, capsys) -> None:
     run = tmp_path / "my run"
     assert run_train(data, run, "vima-nano", "--schedule.warmup-steps", 2) == 0
@@ -113,39 +69,11 @@ def test_a_finished_run_that_is_to_be_longer_names_the_command_that_goes_on(data
     assert (other / "checkpoints" / "2-cloning-000002").is_dir()
 
 
-def test_other_changes_of_a_run_name_no_command(data, tmp_path, capsys) -> None:
-    assert run_train(data, tmp_path, "vima-nano") == 0
-    for changes in (["--schedule.steps", 9, "--seed", 1], ["--schedule.steps", 2]):
-        assert run_train(data, tmp_path, "vima-nano", *changes) != 0
-        error = " ".join(capsys.readouterr().err.split())
-        assert "Give the same settings to continue it" in error and "--init-from" not in error
-    state = tmp_path / f"checkpoints/2-cloning-{STEPS:06d}/state.json"
-    state.write_text(state.read_text().replace(f'"step": {STEPS}', '"step": 1'))  # as if it was killed
-    assert run_train(data, tmp_path, "vima-nano", "--schedule.steps", 9) != 0
-    assert "Give the same settings to continue it" in " ".join(capsys.readouterr().err.split())
-
-
 def test_training_from_a_preset_says_that_it_has_no_weights(data, tmp_path, capsys) -> None:
     assert run_train(data, tmp_path / "run", "vima-nano", "--init-from", "vima-nano") != 0
     error = " ".join(capsys.readouterr().err.split())
     assert "'vima-nano' is a preset: sizes of a network, without weights. Train it" in error
     assert not (tmp_path / "run" / "config.yaml").exists()
-
-
-@pytest.mark.slow
-def test_crops_without_an_appearance_embedding_can_be_pretrained_and_then_stay(data, tmp_path) -> None:
-    options = ("--pretraining.steps", 2, "--pretraining.num-scenes", 40, "--pretraining.batch-size", 16)
-    assert run_train(data, tmp_path, "vima-nano", "--schedule.keep-every", 1, *options) == 0
-    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert any("validation_retrieval_accuracy" in line for line in lines)
-    files = sorted((tmp_path / "checkpoints").glob("*/model.safetensors"))
-    trained = load_file(files[-1])
-    fresh = build_network(presets.preset("vima-nano"), seed=step_seed(0, "weights", 0)).state_dict()
-    crops = [name for name in trained if name.startswith("images.crop_encoder.")]
-    assert crops and any(not torch.equal(trained[name], fresh[name]) for name in crops)
-    first, *_, last = (load_file(file) for file in files if file.parent.name.startswith("2-"))
-    assert all(torch.equal(first[name], last[name]) for name in crops)
-    assert any(not torch.equal(first[name], last[name]) for name in trained)
 
 
 def test_an_unknown_preset_is_wrong_usage_and_leaves_no_run_folder(data, tmp_path, capsys) -> None:

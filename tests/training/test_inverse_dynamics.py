@@ -11,7 +11,6 @@ from safetensors.torch import load_file
 from openvima.cli.main import main
 from openvima.data import Demonstration
 from openvima.data.preprocessed import preprocess
-from openvima.errors import ConfigError
 from openvima.perception.objects import observe, whole_frames
 from openvima.policies import preset
 from openvima.policies.processor import Processor
@@ -20,7 +19,6 @@ from openvima.training.augmentation.demonstrations import DemonstrationAugmentat
 from openvima.training.augmentation.prompts import motion_prompt, motion_text, with_motion_prompt
 from openvima.training.batches import Example
 from openvima.training.building import build_learner
-from openvima.training.config import ModelConfig
 from openvima.training.learner import PolicyCollate
 from small_networks import rngs_of
 
@@ -53,13 +51,6 @@ def test_the_prompt_has_every_frame_and_the_targets_every_action(
             )
         actions = [np.concatenate(list(action.to_arrays().values())) for action in demo.actions]
         np.testing.assert_array_equal(motion.actions, np.float32(actions))
-
-
-def test_only_rows_are_copied(demonstrations_of_several_steps) -> None:
-    tokens = preprocess(demonstrations_of_several_steps[0], "objects")
-    motion = with_motion_prompt(tokens)
-    for name in ("images", "objects", "objects_per_step", "actions"):
-        assert getattr(motion, name) is getattr(tokens, name)
 
 
 @pytest.mark.parametrize("name", PROCESSORS)
@@ -191,44 +182,3 @@ def test_a_pretrained_encoder_is_not_pretrained_again(finetune, settings, tmp_pa
     crops = {name for name in before if name.startswith("images.crop_encoder")}
     assert crops and "decoder.positions.weight" not in kept
     assert crops <= kept if not finetune else not crops <= kept
-
-
-@pytest.mark.slow
-def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
-    first = train(TrainingConfig.of({**settings, "schedule.steps": 1}))
-    other = TrainingConfig(data=data, out=tmp_path / "other", preset="nano", init_from=str(first))
-    with pytest.raises(ConfigError, match=r"of other sizes: images\.crop\.width is 4 there and 32 here"):
-        train(other)
-    assert not other.out.exists()
-
-
-@pytest.mark.parametrize(
-    ("switch", "value"),
-    [
-        ("augmentation.inverse_dynamics_prob", 0.5),
-        ("augmentation.drop_unused_objects_prob", 0.5),
-        ("augmentation.rename_objects_prob", 0.5),
-        ("model.head", "mixture"),
-        ("model.visual_residual", True),
-    ],
-)
-def test_a_custom_learner_has_no_such_setting(switch, value, data, tmp_path) -> None:
-    config = TrainingConfig.of(
-        {"data": data, "out": tmp_path / "run", "preset": "some:learner", switch: value}
-    )
-    with pytest.raises(ConfigError, match=f"does not know {switch}; leave it out"):
-        train(config)
-
-
-def test_parts_of_midas_can_be_switched_on_and_off(data, tmp_path) -> None:
-    def sizes(preset_name: str, head: str, visual_residual: bool):
-        model = ModelConfig(head, visual_residual)
-        config = TrainingConfig(data=data, out=tmp_path, preset=preset_name, model=model)
-        return build_learner(config).network.config
-
-    plain = preset("vima-nano")
-    midas = preset("midas-nano")
-    on = sizes("vima-nano", "autoregressive", True)
-    assert replace(midas, images=on.images, prompt=on.prompt, head=on.head) == midas
-    off = sizes("midas-nano", "bins", False)
-    assert replace(plain, images=off.images, prompt=off.prompt, head=off.head) == plain

@@ -2,11 +2,9 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from openvima.errors import AssetError, ConfigError, DatasetError, InputFileError
 from openvima.policies import load_policy
@@ -15,27 +13,6 @@ from openvima.training.config import ScheduleConfig
 from openvima.training.loop import learning_rate_at, step_generator, step_seed
 from openvima.training.run_folder import RunFolder
 from small_networks import train_until
-
-
-def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:
-    folder = run / "checkpoints" / name
-    return {**load_file(folder / "model.safetensors"), **load_file(folder / "optimizer.safetensors")}
-
-
-@pytest.mark.parametrize("killed_at", [3, 7])
-@pytest.mark.slow
-def test_a_killed_run_resumes_exactly(settings, tmp_path, killed_at):
-    whole = TrainingConfig.of({**settings, "out": tmp_path / "whole"})
-    torn = TrainingConfig.of({**settings, "out": tmp_path / "torn"})
-    train(whole)
-    train_until(torn, killed_at)
-    train(torn)
-    expected, actual = final_weights(whole.out), final_weights(torn.out)
-    assert expected.keys() == actual.keys()
-    for name, tensor in expected.items():
-        assert torch.equal(tensor, actual[name]), name
-    assert (whole.out / "metrics.jsonl").read_bytes() == (torn.out / "metrics.jsonl").read_bytes()
-    assert (whole.out / "config.yaml").read_bytes() == (torn.out / "config.yaml").read_bytes()
 
 
 @pytest.mark.slow
@@ -135,15 +112,6 @@ def test_metrics_have_stage_and_step_and_no_times(settings):
     assert not any("second" in key for line in lines for key in line)
 
 
-@pytest.mark.slow
-def test_a_run_that_was_killed_before_it_could_name_its_best_checkpoint_names_it_later(settings):
-    best = train(TrainingConfig.of(settings)) / "checkpoints" / "best.txt"
-    name = best.read_text()
-    best.unlink()
-    train(TrainingConfig.of(settings))
-    assert best.read_text() == name
-
-
 def test_a_damaged_checkpoint_is_named(settings):
     config = TrainingConfig.of(settings)
     train_until(config, 3)
@@ -151,43 +119,6 @@ def test_a_damaged_checkpoint_is_named(settings):
     weights.write_bytes(weights.read_bytes()[:100])
     with pytest.raises(InputFileError, match="is damaged"):
         train(config)
-
-
-def test_trackers_are_closed_when_a_run_cannot_start(settings, monkeypatch):
-    closed = []
-
-    class Tracker:
-        def close(self):
-            closed.append(True)
-
-    def fails(dataset):
-        raise OSError("no space left")
-
-    monkeypatch.setattr("openvima.training.loop.open_trackers", lambda *_: [Tracker()])
-    monkeypatch.setattr("openvima.training.loop.provenance", fails)
-    with pytest.raises(OSError, match="no space left"):
-        train(TrainingConfig.of(settings))
-    assert closed == [True]
-
-
-@pytest.mark.slow
-def test_partial_checkpoints_are_removed(settings):
-    config = TrainingConfig.of(settings)
-    leftover = config.out / "checkpoints" / "2-cloning-000002.partial"
-    train_until(config, 3)
-    leftover.mkdir()
-    (leftover / "model.safetensors").write_bytes(b"half")
-    train(config)
-    assert not leftover.exists()
-
-
-@pytest.mark.slow
-def test_the_progress_report_ends_at_the_total(settings):
-    seen = []
-    train(TrainingConfig.of(settings), lambda done, total, note: seen.append((done, total, note)))
-    assert seen[-1][:2] == (10, 10)
-    assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
-    assert "rendering scenes" in seen[0][2]
 
 
 def test_an_empty_run_folder_has_no_checkpoint(tmp_path):
@@ -202,19 +133,6 @@ def test_the_last_checkpoint_is_that_of_most_steps_of_the_last_stage(tmp_path):
     for name in ("1-pretraining-2000000", "2-cloning-999000", "2-cloning-1000000"):
         (folder.checkpoints / name).mkdir()
     assert folder.latest().name == "2-cloning-1000000"
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"schedule.steps": 0}, "steps is 0; it must be at least 1"),
-        ({"augmentation.false_positive_prob": 1.5}, "between 0 and 1"),
-        ({"preset": "gato-nanno"}, "no preset 'gato-nanno'. Did you mean 'gato-nano'"),
-    ],
-)
-def test_settings_out_of_range_are_named(settings, change, message):
-    with pytest.raises(ConfigError, match=message):
-        TrainingConfig.of({**settings, **change})
 
 
 @pytest.mark.parametrize(

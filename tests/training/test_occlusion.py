@@ -5,7 +5,7 @@ import torch
 
 from openvima.training.augmentation.crops import with_occlusion
 from openvima.training.loop import step_generator
-from openvima.training.pretraining.pairs import NO_AUGMENTATION, SceneAugmentation, render_pairs
+from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 
 
 @pytest.fixture(scope="module")
@@ -56,12 +56,3 @@ def test_probability_zero_changes_nothing_and_equal_seeds_occlude_equally(pairs)
     assert torch.equal(none.second_view.rotations.nan_to_num(), pairs.second_view.rotations.nan_to_num())
     same = [with_occlusion(pairs, 0.5, step_generator(0, "gaps", 2)).scene_crops for _ in range(2)]
     assert torch.equal(*same)
-
-
-def test_pairs_without_second_view_are_occluded_as_well():
-    once = render_pairs(
-        ("visual_manipulation",), num_scenes=2, seed=0, assets="procedural", augmentation=NO_AUGMENTATION
-    )
-    occluded = with_occlusion(once, 1.0, step_generator(0, "gaps", 0))
-    assert occluded.second_view is None
-    assert not torch.equal(occluded.scene_crops, once.scene_crops.float())

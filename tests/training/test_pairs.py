@@ -7,15 +7,12 @@ import torch
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import pool
 from openvima.catalog.random_pack import RandomAppearanceAssets
-from openvima.policies.nn.image_encoders import ConvConfig
-from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig
 from openvima.tasks import sample_episode
 from openvima.training.augmentation.crops import draw_channel_mixing
 from openvima.training.augmentation.scenes import ShapeKinds, with_random_appearance
 from openvima.training.loop import step_generator
 from openvima.training.parallel import Parallel
 from openvima.training.pretraining import pairs as pairs_module
-from openvima.training.pretraining.losses import contrastive_loss, retrieval_accuracy
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
@@ -99,25 +96,6 @@ def test_channel_mixing_keeps_grey():
     assert (mixings >= 0).all()
     unchanged = (mixings == torch.eye(3)).all(dim=2).all(dim=1).float().mean()
     assert 0.3 < unchanged < 0.8
-
-
-@pytest.mark.slow
-def test_the_contrastive_loss_decreases():
-    torch.manual_seed(0)
-    encoder = ObjectEncoder(
-        ObjectEncoderConfig(ConvConfig(8, 16), box_width=4, width=8, fuse_views=True, appearance_width=16)
-    )
-    pairs = render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural")
-    optimizer = torch.optim.Adam(encoder.parameters(), lr=3e-3)
-    losses = []
-    for step in range(30):
-        loss, _ = contrastive_loss(encoder, pairs, temperature=0.1, generator=step_generator(0, "test", step))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
-    assert retrieval_accuracy(encoder, pairs) > 0.7
 
 
 def test_random_containers_are_gratings_as_often_as_asked():

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch.utils import backend_registration
 
 from openvima.errors import ConfigError
 from openvima.policies import load_policy, presets
@@ -155,52 +154,6 @@ def test_loader_workers_and_gradient_accumulation_change_only_the_last_bits(bins
     assert (plain / "metrics.jsonl").read_bytes() == (ahead / "metrics.jsonl").read_bytes()
     parts = train(TrainingConfig.of({**bins, "out": tmp_path / "parts", "optimizer.grad_accum_steps": 4}))
     assert_alike(plain, parts)
-
-
-@pytest.mark.filterwarnings("ignore:The .grad attribute")  # of the tracer itself
-def test_compiled_layers_train_equally(bins, tmp_path, monkeypatch) -> None:
-    """Traced as for the compiler, but run as they are: generating code takes a minute."""
-    bins |= {"schedule.steps": 2, "schedule.checkpoint_every": 2}
-    plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
-    traced, compiled = [], torch.nn.Module.compile
-
-    def trace(module: torch.nn.Module, **options) -> None:
-        traced.append(type(module).__name__)
-        compiled(module, backend="eager", fullgraph=True, **options)
-
-    monkeypatch.setattr(torch.nn.Module, "compile", trace)
-    torch.compiler.reset()
-    assert_alike(
-        plain, train(TrainingConfig.of({**bins, "out": tmp_path / "traced", "runtime.compile": True}))
-    )
-    torch.compiler.reset()
-    assert {"CrossBlock", "SelfBlock", "TextBlock"} <= set(traced)
-    assert not {"Linear", "Sequential"} & set(traced)
-
-
-@pytest.mark.skipif(
-    not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"), reason="torch is older"
-)
-def test_another_device_trains_equally(bins, tmp_path, monkeypatch) -> None:
-    """No GPU is needed to see that all tensors are on one device."""
-    sizes = presets.preset("small")
-    sizes = replace(sizes, decoder=replace(sizes.decoder, dropout=0.0))  # it draws otherwise there
-    monkeypatch.setitem(presets.PRESETS, "small", lambda: sizes)
-    attributes = {"pretraining.steps": 2, "pretraining.attribute_loss_weight": 0.5}
-    bins |= {"preset": "small", "schedule.steps": 2, "pretraining.hard_negative_prob": 0.4, **attributes}
-    bins |= {"augmentation.text_description_prob": 0.3, "augmentation.distractor_prob": 0.5}
-    here = train(TrainingConfig.of({**bins, "out": tmp_path / "here"}))
-    there = {**bins, "out": tmp_path / "there", "runtime.device": "python"}
-    option, program, settings = script_arguments(there)
-    tests = Path(__file__).parents[1]
-    subprocess.run(
-        [sys.executable, option, "import python_device\n" + program, settings],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tests), os.environ.get("PYTHONPATH", "")])},
-        check=True,
-    )
-    for a, b in zip(losses(here), losses(there["out"]), strict=True):
-        for name in ("stage", "step", "loss", "validation_loss"):
-            assert a.get(name) == (pytest.approx(b[name], rel=1e-3) if name in b else None)
 
 
 def test_a_missing_device_is_named() -> None:

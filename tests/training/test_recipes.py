@@ -173,24 +173,6 @@ def test_steps_replace_the_epochs_of_a_recipe(trained, tmp_path) -> None:
     assert [config.schedule.steps for config in trained][1:] == [5, 7, 5]
 
 
-def test_numbers_of_files_may_have_an_exponent_and_no_point(tmp_path) -> None:
-    file = tmp_path / "mine.yaml"
-    file.write_text("{optimizer: {learning_rate: 1e-4}, object_cache: cache, schedule: {keep_every: null}}")
-    assert read_settings(file) == {
-        "optimizer.learning_rate": 1e-4,
-        "object_cache": Path("cache"),
-        "schedule.keep_every": None,
-    }
-
-
-def test_only_the_first_of_several_processes_prints(trained, monkeypatch, capsys) -> None:
-    words = ["train", "--data", "demos", "--out", "run"]
-    for rank, printed in (("0", "run\n"), ("1", "")):
-        monkeypatch.setenv("RANK", rank)
-        assert main(words) == 0
-        assert capsys.readouterr().out == printed
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -230,9 +212,3 @@ def test_code_that_a_file_names_runs_only_with_trust_code(text: str, tmp_path, m
     assert "names code to run" in capsys.readouterr().err
     assert not (tmp_path / "executed").exists()
     assert read_settings(file, trust_code=True)
-
-
-def test_a_detector_folder_in_a_file_is_no_code(tmp_path) -> None:
-    file = tmp_path / "mine.yaml"
-    file.write_text("loader: {boxes: 'detector=runs/a:b'}")
-    assert read_settings(file) == {"loader.boxes": "detector=runs/a:b"}

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 import threading
 
 import pytest
@@ -11,7 +10,6 @@ from openvima.data import Dataset
 from openvima.errors import FolderLockedError
 from openvima.training import TrainingConfig, train
 from openvima.training.run_folder import (
-    RunFolder,
     git_state,
     provenance,
 )
@@ -39,16 +37,6 @@ def test_a_run_holds_the_lock_until_it_ends(settings) -> None:
     train(config, second)
     assert refused.is_set()
     assert not list(config.out.glob(".lock*"))
-
-
-def test_temporary_files_of_a_killed_run_go_with_the_next(tmp_path) -> None:
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    RunFolder(tmp_path, {"a": 1})
-    leftover = tmp_path / "checkpoints" / f".best.txt.{ended.pid}.tmp"
-    leftover.write_text("half")
-    RunFolder(tmp_path, {"a": 1})
-    assert not leftover.exists()
 
 
 @pytest.mark.slow

@@ -32,7 +32,6 @@ from openvima.training.config import AugmentationConfig
 from openvima.training.policy import scene_tasks
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
-    check_scenes,
     check_words,
     make_order,
     open_demonstrations,
@@ -104,10 +103,6 @@ def test_a_run_says_which_held_out_demonstrations_it_saw(tmp_path):
     )
     assert held_out_data(tmp_path) == ["twist L3", "a\N{REPLACEMENT CHARACTER}[2J"]
     assert held_out_data(tmp_path / "none") == []
-
-
-def test_scenes_are_known_where_demonstrations_are_generated(data):
-    check_scenes(Dataset(data))
 
 
 def test_excluded_tasks_identify_a_run_in_any_order(settings):
@@ -370,13 +365,3 @@ def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, mon
     with pytest.raises(DatasetError, match=r"of sweep_without_exceeding is too long .* takes 30\. .*--tasks"):
         train(config)
     assert not list(config.out.glob("checkpoints/*"))
-
-
-@pytest.mark.slow
-def test_the_check_draws_no_random_numbers(case, monkeypatch) -> None:
-    cache, network, processor = case
-    monkeypatch.setattr(source, "MAX_PROMPT_POSITIONS", 1)  # so that all are read
-    before = torch.get_rng_state()
-    source.check_lengths(cache, network.train(), processor, inverse_dynamics_prob=0.5)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert all(parameter.grad is None for parameter in network.parameters())

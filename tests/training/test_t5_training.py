@@ -11,8 +11,7 @@ pytest.importorskip("transformers")
 from openvima.env import TabletopEnv
 from openvima.errors import ConfigError, InputFileError
 from openvima.policies import load_policy, presets, sizes
-from openvima.policies.build import build_network
-from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
+from openvima.policies.checkpoint import load_checkpoint
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
 from openvima.policies.t5 import T5Tokenizer, load_t5
 from openvima.training import TrainingConfig, train
@@ -118,27 +117,6 @@ def test_a_preset_with_words_takes_a_t5_of_the_size_that_is_named(
         train(TrainingConfig.of({**config, "model.text_encoder": None}))
 
 
-class Killed(BaseException):
-    """Stands for a kill signal."""
-
-
-def kill_at_4(done: int, total: int, note: str) -> None:
-    if done == 4:
-        raise Killed
-
-
-@pytest.mark.slow
-def test_a_killed_run_resumes_without_the_original_t5(t5_settings, t5, tmp_path) -> None:
-    whole = train(TrainingConfig.of({**t5_settings, "out": tmp_path / "whole"}))
-    torn = TrainingConfig.of({**t5_settings, "out": tmp_path / "torn"})
-    with pytest.raises(Killed):
-        train(torn, kill_at_4)
-    moved = t5.rename(t5.with_name("elsewhere"))
-    train(replace(torn, t5=str(moved)))
-    expected, actual = (load_checkpoint(checkpoints(run)[-1]).state_dict() for run in (whole, torn.out))
-    assert all(torch.equal(tensor, actual[name]) for name, tensor in expected.items())
-
-
 def test_a_preset_with_t5_needs_its_source(t5_settings) -> None:
     with pytest.raises(ConfigError, match="'tiny-t5' encodes prompts with T5; set t5"):
         train(TrainingConfig.of({**t5_settings, "t5": None}))
@@ -169,13 +147,3 @@ def test_init_from_brings_its_tokenizer(t5_settings, t5, tmp_path) -> None:
     weights = load_checkpoint(checkpoints(first)[-1]).state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in learner.network.state_dict().items())
     assert checkpoints(train(TrainingConfig.of(again)))
-
-
-def test_weights_without_a_tokenizer_need_its_source(t5_settings, t5, tmp_path) -> None:
-    network = build_network(small_t5_vima(), seed=3)
-    save_checkpoint(network, tmp_path / "bare")
-    begun = {**t5_settings, "init_from": str(tmp_path / "bare")}
-    with pytest.raises(ConfigError, match="no tokenizer of T5 is stored; set t5, too"):
-        train(TrainingConfig.of({**begun, "t5": None}))
-    learner = build_learner(TrainingConfig.of(begun))
-    assert torch.equal(learner.network.prompt.words.weight, network.prompt.words.weight)  # not those of t5

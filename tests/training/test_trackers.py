@@ -103,23 +103,3 @@ def test_without_wandb_its_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(MissingExtraError, match=r"runtime\.wandb is 'robots'.*openvima\[wandb\]"):
         WandbTracker(tmp_path, "robots", {})
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of wandb and its dependencies
-def test_wandb_writes_a_run_without_a_connection(
-    animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("wandb", reason="wandb is not installed: pip install 'openvima[wandb]'")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    for step in (7, 9):
-        tracker = WandbTracker(tmp_path, "robots", {"preset": "nano"})
-        tracker.add("2-cloning", {"loss": 0.25}, step)
-        tracker.add_animations("2-cloning", [animation], step + 1)
-        tracker.close()
-    name = (tmp_path / "wandb_log" / "id.txt").read_text()
-    runs = sorted((tmp_path / "wandb_log" / "wandb").glob(f"offline-run-*-{name}"))
-    assert runs and all((run / f"run-{name}.wandb").stat().st_size > 1000 for run in runs)
-    videos = [file for run in runs for file in run.rglob("*.gif")]
-    assert {file.read_bytes() for file in videos} == {animation.gif()}

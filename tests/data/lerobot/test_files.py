@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from openvima.data import Demonstration, lerobot_files
+from openvima.data import Demonstration
 from openvima.data.lerobot_files import (
     DATA_PATH,
     QUANTILES,
@@ -105,16 +105,6 @@ def test_files_stay_below_their_limit_and_hold_all_rows_in_order(tmp_path: Path,
     assert all(file.stat().st_size < limit for file in files)
 
 
-def test_rows_written_together_share_a_row_group(tmp_path: Path) -> None:
-    with NumberedTable(tmp_path, DATA_PATH, limit_bytes=10**6, group_bytes=500) as table:
-        for start in range(0, 300, 30):
-            table.write(pa.table({"x": pa.array(range(start, start + 30))}))
-    file = pq.ParquetFile(next(tmp_path.rglob("*.parquet")))
-    sizes = [file.metadata.row_group(n).num_rows for n in range(file.num_row_groups)]
-    assert len(sizes) > 1
-    assert all(size % 30 == 0 for size in sizes)
-
-
 def smallest_not_exceeded_by(values: np.ndarray, share: float) -> float:
     """The definition of a quantile, taken literally."""
     return min(v for v in values if np.mean(values <= v) >= share)
@@ -132,12 +122,6 @@ def test_numbers_get_the_statistics_of_numpy(length: int) -> None:
     assert found["count"].tolist() == [length]
 
 
-def test_the_extremes_of_truth_values_are_truth_values() -> None:
-    found = value_statistics(np.array([False, False, True]))
-    assert (found["min"].tolist(), found["max"].tolist()) == ([False], [True])
-    assert found["mean"] == pytest.approx(1 / 3)
-
-
 def test_pictures_get_the_statistics_of_their_pixels_by_channel() -> None:
     pictures = np.random.default_rng(0).integers(20, 200, (3, 3, 4, 8), dtype=np.uint8)
     found = pixel_statistics(count_pixels(pictures, 3), 3)
@@ -149,12 +133,6 @@ def test_pictures_get_the_statistics_of_their_pixels_by_channel() -> None:
             assert found[name][channel, 0, 0] == smallest_not_exceeded_by(pixels, share)
     assert found["mean"].shape == (3, 1, 1)
     assert found["count"].tolist() == [3]
-
-
-def test_one_picture_counts_for_each_frame_that_shows_it() -> None:
-    picture = np.random.default_rng(0).integers(0, 256, (1, 3, 4, 8), dtype=np.uint8)
-    often = np.repeat(picture, 5, axis=0)
-    np.testing.assert_array_equal(count_pixels(picture, 5), count_pixels(often, 5))
 
 
 LARGE = 10**9
@@ -201,12 +179,6 @@ def test_colours_survive_within_two_levels(tmp_path: Path) -> None:
     assert np.abs(np.moveaxis(read, -1, 1).astype(int) - shown).max() <= 2
 
 
-def test_what_browsers_play_has_half_the_resolution_of_colours(tmp_path: Path) -> None:
-    path = write(tmp_path, [pictures(2)], pixels="yuv420p")
-    with av.open(str(path)) as container:
-        assert container.streams.video[0].codec_context.pix_fmt == "yuv420p"
-
-
 def test_one_picture_is_shown_for_the_whole_episode(tmp_path: Path) -> None:
     with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video:
         video.write(pictures(1), num_frames=4)
@@ -231,19 +203,3 @@ def test_files_stay_below_their_limit(tmp_path: Path) -> None:
         with av.open(str(file)) as container:
             assert container.streams.video[0].frames == 2 * len(firsts)
         assert firsts == list(range(0, 2 * len(firsts), 2))
-
-
-def test_a_file_is_closed_after_so_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lerobot_files, "MAX_FRAMES", 4)
-    with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video:
-        places = [video.write(pictures(1), num_frames=3) for _ in range(3)]
-    assert [(number.file, first) for number, first in places] == [(0, 0), (0, 3), (1, 0)]
-
-
-def test_nothing_is_in_the_way_of_the_first_error(tmp_path: Path) -> None:
-    with (
-        pytest.raises(ZeroDivisionError),
-        NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video,
-    ):
-        video.write(pictures(1), num_frames=1)
-        raise ZeroDivisionError

@@ -1,7 +1,6 @@
 """Published episodes become demonstrations, from archives and folders, of both generations."""
 
 import dataclasses
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -97,14 +96,6 @@ def test_both_generations_and_both_forms_hold_the_same(path: Path, tmp_path: Pat
             assert dataclasses.replace(a, outcome=reason).content_hash() == b.content_hash()
 
 
-def test_pickles_of_protocol_5_hold_the_same(tmp_path: Path) -> None:
-    read = []
-    for protocol in (4, 5):
-        files = {"rearrange/000000": SCENE.files(PUBLISHED, protocol)}
-        read.append(PublishedData(write_folder(tmp_path / str(protocol), files))[0].content_hash())
-    assert read[0] == read[1]
-
-
 def test_the_folder_of_one_task_is_enough(tmp_path: Path) -> None:
     write_folder(tmp_path, episodes())
     data = PublishedData(tmp_path / "simple_manipulation")
@@ -132,26 +123,6 @@ def test_what_is_not_there_is_said(path: Path, tmp_path: Path) -> None:
         PublishedData(tmp_path / "missing.zip")
     with pytest.raises(DatasetError, match="holds no episodes"):
         PublishedData(tmp_path)
-
-
-def test_folders_of_unknown_tasks_are_named_and_left_out(tmp_path: Path) -> None:
-    strange = {**episodes(), "juggle/000001": {"obs.pkl": b""}}
-    data = PublishedData(write_zip(tmp_path / "a.zip", strange))
-    assert len(data) == 3
-    assert [broken.member for broken in data.broken_folders] == ["vima_v6/juggle"]
-
-
-def test_an_episode_that_is_there_twice_is_refused(tmp_path: Path) -> None:
-    twice = {**episodes(), "visual_manipulation/000004": {"obs.pkl": b""}}
-    with pytest.raises(DatasetError, match="visual_manipulation 000004 twice"):
-        PublishedData(write_zip(tmp_path / "a.zip", twice))
-
-
-def test_objects_can_be_sent_to_other_processes(path: Path) -> None:
-    data = PublishedData(path, tasks=["rearrange"])
-    again = pickle.loads(pickle.dumps(data))
-    assert again.keys == data.keys
-    assert again[0].content_hash() == data[0].content_hash()
 
 
 def test_parts_are_disjoint_complete_and_always_the_same() -> None:
@@ -293,18 +264,6 @@ def test_a_broken_episode_is_named_and_skipped(
     assert broken[number].member == f"rotate/{number:06d}"
     with pytest.raises(DatasetError, match=r"vima\.zip: rotate/\d+: .*" + reason):
         data.read("rotate", f"{number:06d}")
-
-
-def test_folders_name_what_is_broken_too(tmp_path: Path) -> None:
-    write_folder(tmp_path, {f"rotate/00000{number}": WHOLE for number in range(4)})
-    shutil.rmtree(tmp_path / "rotate/000001/rgb_top")
-    (tmp_path / "rotate/000002/obs.pkl").write_bytes(b"")
-    (tmp_path / "rotate/000000/notes.txt").write_bytes(bytes(100))
-    broken: list[Broken] = []
-    assert len(list(PublishedData(tmp_path).demonstrations(on_broken=broken.append))) == 2
-    assert [entry.member for entry in broken] == ["rotate/000001", "rotate/000002"]
-    assert "rgb_top has 0 images" in broken[0].reason
-    assert "obs.pkl: it is truncated or no pickle of data" in broken[1].reason
 
 
 def test_a_source_that_vanishes_is_no_pile_of_broken_episodes(tmp_path: Path) -> None:

@@ -1,9 +1,7 @@
 """Pickles are read as data: what they hold comes out, and nothing that they name is ever run."""
 
-import copyreg
 import functools
 import io
-import math
 import os
 import pickle
 import struct
@@ -61,11 +59,6 @@ def test_arrays_come_back(dtype: str, protocol: int) -> None:
             assert not read.flags.writeable
 
 
-def test_arrays_that_cannot_be_written_come_back() -> None:
-    array = np.frombuffer(b"abcd", np.uint8)
-    assert np.array_equal(as_array(read_pickle(pickle.dumps(array, 5))), array)
-
-
 @pytest.mark.parametrize(
     ("args", "is_sound"),
     [
@@ -93,22 +86,6 @@ def test_arrays_of_protocol_5_fit_their_bytes(args: tuple, is_sound: bool) -> No
         return
     with pytest.raises(DatasetError, match="no pickle of data"):
         read_pickle(pickled)
-
-
-@pytest.mark.parametrize("opcode", [b"\x97", b"\x98"])
-def test_buffers_outside_of_the_pickle_are_refused(opcode: bytes) -> None:
-    with pytest.raises(DatasetError, match="no pickle of data"):
-        read_pickle(b"\x80\x05N" + opcode + b".")
-
-
-def test_bytes_that_can_be_written_are_data_and_no_tool() -> None:
-    content = b"\x96" + struct.pack("<Q", 3) + b"abc"
-    assert read_pickle(b"\x80\x05" + content + b".") == bytearray(b"abc")
-    for use in (b")R", b"}Nsb", b")\x81"):
-        with pytest.raises(DatasetError, match="no pickle of data"):
-            read_pickle(b"\x80\x05" + content + use + b".")
-    with pytest.raises(DatasetError, match="truncated"):
-        read_pickle(b"\x80\x05\x96" + b"\xff" * 8 + b"abc.")
 
 
 @pytest.mark.parametrize("number", [np.int64(-3), np.float32(0.5), np.bool_(True), np.uint8(9)])
@@ -197,20 +174,6 @@ def test_hostile_pickles_are_refused_and_nothing_runs(kind: str, tmp_path: Path)
         assert f"names {kind}," in str(error.value)
 
 
-def test_functions_that_other_code_has_registered_are_refused(tmp_path: Path) -> None:
-    marker = tmp_path / "marker"
-    content = PROTO + b"\x82\x07" + text(f"touch {marker}") + b"\x85R."
-    copyreg.add_extension("os", "system", 7)
-    try:
-        with pytest.raises(DatasetError, match=r"names os\.system"):
-            read_pickle(content)
-        assert not marker.exists()
-        pickle.loads(content)
-        assert marker.exists(), "this pickle is not hostile"
-    finally:
-        copyreg.remove_extension("os", "system", 7)
-
-
 SIZE_RANGE = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRange")
 
 
@@ -234,15 +197,6 @@ SIZE_RANGE = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRan
 def test_what_no_published_file_does_is_refused(content: bytes, fault: str) -> None:
     with pytest.raises(DatasetError, match=fault):
         read_pickle(PROTO + content + b".")
-
-
-def test_what_an_object_is_given_changes_nothing() -> None:
-    state = {"__class__": 1, "__setattr__": 2, "__dict__": 3, "name": "os.system", "args": (4,)}
-    content = pickle.dumps(state, 4).removeprefix(PROTO).removesuffix(b".")
-    for made in (b")\x81", b")R", b"(K\x01tR"):
-        found = read_pickle(PROTO + SIZE_RANGE + made + content + b"b.")
-        assert type(found) is Inert
-        assert vars(found) == {}
 
 
 def array_pickle(shape: object, dtype: str, content: object) -> bytes:
@@ -282,12 +236,6 @@ def test_arrays_are_never_larger_than_their_bytes(
         read_pickle(array_pickle(shape, dtype, content))
 
 
-def test_other_things_are_no_arrays() -> None:
-    for value in (None, [], "x", {}, Inert()):
-        with pytest.raises(DatasetError, match="where an array should be"):
-            as_array(value)
-
-
 def test_no_beginning_of_a_pickle_reads_as_whole() -> None:
     content = published_data.pickled(published_data.MadeEpisode().actions(3))
     for length in range(len(content)):
@@ -306,24 +254,3 @@ def test_damage_gives_a_value_or_an_error_that_says_so(data: st.DataObject) -> N
         read_pickle(bytes(content))
     except DatasetError as error:
         assert len(str(error)) < 400
-
-
-@given(st.binary(max_size=60))
-def test_any_bytes_give_a_value_or_an_error_that_says_so(content: bytes) -> None:
-    try:
-        read_pickle(content)
-    except DatasetError as error:
-        assert len(str(error)) < 400
-
-
-def test_classes_themselves_stay_as_they_are() -> None:
-    for state in (b"}" + text("name") + b"Nsb", b"N}" + text("__new__") + b"Ns\x86b"):
-        with pytest.raises(DatasetError, match="missing 1 required positional argument"):
-            read_pickle(PROTO + SIZE_RANGE + state + b".")
-
-
-def test_an_endless_value_is_named_by_its_kind() -> None:
-    endless = read_pickle(PROTO + b"]q\x00h\x00a.")
-    with pytest.raises(DatasetError, match="it has a list where"):
-        as_array(endless)
-    assert math.isclose(len(endless), 1)

@@ -8,9 +8,7 @@ import torch
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
-from openvima.errors import ConfigError
-from openvima.policies import preset
-from openvima.policies.build import build_network, policy_size
+from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.action_head import shift_actions
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
@@ -19,9 +17,7 @@ from openvima.policies.pointer.model import Pointer
 from openvima.policies.pointer.words import Attributes
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
-from openvima.policies.variants import with_attributes
 from small_networks import (
-    check_mixed_precision,
     collate_examples,
     examples_of,
     narrow_small,
@@ -176,39 +172,6 @@ def test_hidden_views_do_not_matter():
     other = torch.where(masks[..., None], features, -features)
     assert torch.equal(attributes(features, boxes, masks), attributes(other, boxes, masks))
     torch.testing.assert_close(attributes(features, boxes, masks).norm(dim=-1), torch.ones(3, 6).double())
-
-
-def test_the_preset_has_them_and_is_small():
-    assert preset("small").attributes == AttributeConfig(exclusive=True)
-    assert policy_size(preset("small")).parameters.trainable < 10e6
-    assert with_attributes(preset("small"), False).attributes is None
-    with pytest.raises(ConfigError, match="preset small"):
-        with_attributes(preset("nano"))
-    with pytest.raises(ConfigError, match="place candidates"):
-        replace(preset("nano"), attributes=AttributeConfig())
-    with pytest.raises(ConfigError, match="width 0"):
-        AttributeConfig(width=0)
-
-
-def test_a_checkpoint_keeps_its_attributes(network, tmp_path):
-    policy = NetworkPolicy(network, tokenizer=TOKENIZER)
-    policy.save_pretrained(tmp_path / "with")
-    again = NetworkPolicy.from_pretrained(tmp_path / "with")
-    assert again.network.config.attributes == AttributeConfig(16, 8)
-
-
-def test_mixed_precision_takes_the_features_of_a_frozen_crop_encoder(network, demo):
-    network = deepcopy(network).float()
-    processor = Processor.of(network.config.inputs, TOKENIZER)
-    examples, images = examples_of([demo], processor)
-    batch = collate_examples(processor, examples)
-    features = network.encode_images(images).detach()  # in float32, as training precomputes them
-
-    def loss() -> torch.Tensor:
-        prompt = network.encode_prompt(batch.prompts, features)
-        return network.loss(prompt, batch.history, features, batch.targets)[0]
-
-    check_mixed_precision(network, loss)
 
 
 def test_the_object_of_the_prompt_itself_is_not_meant_beside_exclusive_attributes(network, demo):

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from openvima.errors import ConfigError
 from openvima.policies.nn.actions import ActionTargets, at, rotate, yaw_between
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.candidates import PlaceCandidates
@@ -309,15 +308,6 @@ def test_a_place_at_another_object_in_view_is_trained_by_appearance_too(slot, co
     torch.testing.assert_close(losses[1] - losses[0], of_pick + of_place * counts)
 
 
-def test_appearance_scores_of_places_are_part_of_the_logits(head, inputs):
-    """The prompt changes logits of objects in view by as much as it changes their appearance scores."""
-    pick, known = torch.zeros(B, T, dtype=torch.int64), inputs
-    other = with_prompt(known, appearance_BLA=known.prompt.appearance_BLA.flip(1))
-    whole = head.place(other, head.candidates(other), pick) - head.place(known, head.candidates(known), pick)
-    alone = head.place.appearance_scores(other, pick) - head.place.appearance_scores(known, pick)
-    torch.testing.assert_close(whole[..., :N], alone)
-
-
 def test_an_object_similar_to_both_attended_ones_is_picked_rather_than_one_similar_to_one(head, inputs):
     appearance = torch.zeros_like(inputs.appearance_BTNA)
     appearance[:, :, 0, 0] = appearance[:, :, 1, 1] = 1.0
@@ -390,38 +380,6 @@ def test_the_first_prompt_query_is_trained_to_attend_to_the_most_similar_object(
     assert not head.pick.grounding_nll(hidden, pick)[1].any()
 
 
-@pytest.mark.parametrize(("kind", "first"), [("first_step", FIRST_STEP), ("prompt", IN_PROMPT)])
-@pytest.mark.slow
-def test_it_learns_to_copy_the_place_of_what_is_similar_also_for_unseen_appearance(kind, first):
-    """Objects differ from step to step; that one of the set is similar to the picked one stays the same."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        head = CandidatePointerHead(CandidateHeadConfig(hidden_width=16), D).double()
-
-    def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
-        drawn = drawn_inputs(batch=32, seed=seed)
-        known = set_of(drawn, kind).appearance_BKA
-        alike = torch.randint(known.shape[1], (32,), generator=torch.Generator().manual_seed(seed))
-        appearance = drawn.appearance_BTNA.clone()
-        rows = torch.arange(32)
-        appearance[:, :, 0] = known[rows, alike][:, None]
-        prompt = known[rows, alike][:, None].expand(-1, M, -1)
-        drawn = with_prompt(replace(drawn, appearance_BTNA=appearance), appearance_BLA=prompt)
-        place = candidates_of(drawn).positions_BTC2[rows, :, first + alike]
-        return drawn, targets_at(drawn, place)
-
-    optimizer = torch.optim.Adam(head.parameters(), lr=0.01)
-    for step in range(60):
-        optimizer.zero_grad()
-        loss, _ = head.loss(*example(step))
-        loss.backward()
-        optimizer.step()
-    _, metrics = head.loss(*example(1000))
-    assert metrics["pick_accuracy"] > 0.97
-    assert metrics["place_accuracy"] > 0.9
-    assert metrics["accuracy"] > 0.9
-
-
 def previous(inputs: HeadInputs, start: int, place_BT2) -> HeadInputs:
     """The same after actions that picked there (start 0), or put there (start 6)."""
     actions = inputs.previous_BTC.clone()
@@ -445,14 +403,6 @@ def test_only_the_places_of_the_last_action_count_and_all_that_is_far_counts_ali
     assert torch.equal(head.pick(far), head.pick(farther))
 
 
-def test_at_the_first_step_nothing_of_a_previous_action_counts(head, inputs):
-    before = head.pick(inputs)
-    with torch.no_grad():
-        head.pick.geometry[0].weight[:, :7] += 1.0
-    assert torch.equal(head.pick(inputs)[:, 0], before[:, 0])
-    assert not torch.allclose(head.pick(inputs)[:, 1], before[:, 1])
-
-
 def test_the_pick_depends_on_neighbours_and_on_what_a_scene_shows_there(head, inputs):
     before = head.pick(inputs)
     scenes = inputs.prompt.objects.positions_BK2.clone()
@@ -463,29 +413,6 @@ def test_the_pick_depends_on_neighbours_and_on_what_a_scene_shows_there(head, in
     close[:, 0, 3] = close[:, 0, 1] + 0.01  # in the second episode there is no fourth object
     changed = (head.pick(replace(inputs, positions_BTN2=close)) - before)[:, 0, 1].abs()
     assert (changed > 1e-6).tolist() == [True, False, True]
-
-
-@pytest.mark.slow
-def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
-    """Tokens and appearance are drawn anew, so nothing else separates the objects."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        head = CandidatePointerHead(CandidateHeadConfig(hidden_width=16), D).double()
-
-    def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
-        drawn = drawn_inputs(batch=64, seed=seed)
-        drawn = previous(drawn, 6, drawn.positions_BTN2[:, :, 0])
-        wanted = targets_at(drawn, drawn.positions_BTN2[:, :, 1])
-        is_second = (torch.arange(T) > 0).expand(64, T)
-        return drawn, replace(wanted, steps_BT=is_second)
-
-    optimizer = torch.optim.Adam(head.parameters(), lr=0.01)
-    for step in range(80):
-        optimizer.zero_grad()
-        loss, _ = head.loss(*example(step))
-        loss.backward()
-        optimizer.step()
-    assert head.loss(*example(1000))[1]["pick_accuracy"] > 0.8  # at random a quarter
 
 
 def test_rotations_shown_in_the_prompt_are_copied(inputs):
@@ -518,12 +445,3 @@ def test_with_a_kept_place_in_the_batch_the_chosen_one_is_still_that_of_its_own_
     for b in range(B):
         for t in range(T):
             assert torch.equal(got[b, t], candidates_of(inputs).positions_BTC2[b, t, place[b, t]])
-
-
-@pytest.mark.parametrize(
-    "sizes",
-    [{"num_yaw_bins": 1}, {"hidden_width": 0}, {"num_index_embeddings": 0}, {"num_prompt_queries": 0}],
-)
-def test_sizes_that_make_no_sense_are_refused(sizes):
-    with pytest.raises(ConfigError, match="candidate head"):
-        CandidateHeadConfig(**sizes)

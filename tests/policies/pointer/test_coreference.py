@@ -1,7 +1,5 @@
 """Coreference: words and the images that followed the same word before."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -86,17 +84,3 @@ def test_a_noun_has_the_appearance_of_the_image_that_defined_it(network, prompt)
         (image,) = attention[noun].nonzero()[:, 0]
         assert torch.equal(encoded.appearance_BLA[0, noun], encoded.appearance_BLA[0, image])
         assert encoded.appearance_BLA[0, noun].norm() > 0.9
-
-
-def test_the_gate_of_coreference_is_learnt(network, prompt):
-    outputs = []
-    for weight in (-1e3, 0.0):
-        with torch.no_grad():
-            network.coreference.gate.bias.fill_(weight)
-        outputs.append(_encoded(network, prompt)[0].tokens_BLD)
-    plain = replace(network.config, coreference=False)
-    without = build_network(plain, seed=3).double().eval()
-    assert without.coreference is None
-    without.load_state_dict(network.state_dict(), strict=False)
-    torch.testing.assert_close(_encoded(without, prompt)[0].tokens_BLD, outputs[0])
-    assert (outputs[1] - outputs[0]).abs().max() > 1e-3

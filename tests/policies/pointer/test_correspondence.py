@@ -5,8 +5,6 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from openvima.errors import ConfigError
-from openvima.policies import preset
 from openvima.policies.nn.image_encoders import ConvConfig
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig
 from openvima.policies.pointer.config import CorrespondenceConfig
@@ -15,7 +13,6 @@ from openvima.policies.pointer.correspondence import (
     ObjectFeatures,
     in_earlier_image,
     in_same_kind_of_image,
-    is_another,
 )
 
 B, N, M, V, F, A, D = 2, 3, 4, 2, 6, 5, 8
@@ -105,10 +102,6 @@ def test_of_similar_images_one_head_takes_the_latest_and_one_the_earliest(corres
     assert (attention.diagonal(dim1=-2, dim2=-1) == 0).all()
 
 
-def test_all_objects_are_another_but_the_object_itself():
-    assert torch.equal(is_another(inputs(3, seed=0)), ~torch.eye(3, dtype=torch.bool))
-
-
 def test_objects_of_scenes_and_objects_alone_are_kept_apart():
     on_table = torch.tensor([[False, True, True]]).expand(B, -1)
     same = in_same_kind_of_image(inputs(3, seed=0, in_scene_N=on_table))
@@ -196,16 +189,3 @@ def test_crops_are_dropped_in_training(encoder):
     front = torch.stack(seen)[..., 6 : 6 + F]
     left_out = (front == 0).all(-1).double().mean()
     assert 0.3 < left_out < 0.7
-
-
-@pytest.mark.parametrize("sizes", [{"hidden_width": 0}, {"num_heads": 0}])
-def test_sizes_that_make_no_sense_are_refused(sizes):
-    with pytest.raises(ConfigError, match="correspondence"):
-        CorrespondenceConfig(**sizes)
-
-
-@pytest.mark.parametrize("change", [{"appearance_width": 0, "rotation_bins": 0}, {"fuse_views": False}])
-def test_a_pointer_model_needs_fused_views_and_appearance(change):
-    sizes = preset("small")
-    with pytest.raises(ConfigError, match="fuse_views"):
-        replace(sizes, images=replace(sizes.images, **change))
