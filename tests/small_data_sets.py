@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from openvima.data import Dataset, Demonstration, GenerateConfig, Shard, ShardWriter
+from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import MANIFEST_NAME, finish_folder, manifest_checksum
 from openvima.errors import DatasetError
@@ -84,30 +84,6 @@ def read_all(folder: Path) -> list[str] | None:
         return [demo.content_hash() for demo in Dataset(folder)]
     except DatasetError:
         return None
-
-
-def read_damaged_shards(whole: Path, copy: Path, seeds: range, result: Path) -> None:
-    """Read a shard after each of many accidents, without any checksum; to be run in a process of its own.
-
-    Args:
-        whole: The shard.
-        copy: Where to write it with its damage.
-        seeds: Of the accidents.
-        result: Where to write the errors that are not ours, as JSON.
-    """
-    content, odd = whole.read_bytes(), []
-    for seed in seeds:
-        copy.write_bytes(damaged(content, random.Random(seed)))
-        try:
-            shard = Shard(copy)
-            shard.table(["seed", "skipped"]).to_pylist()
-            for row in range(len(shard)):
-                shard[row].content_hash()
-        except DatasetError:
-            pass
-        except Exception as error:  # what the test looks for
-            odd.append(f"seed {seed}: {type(error).__name__}: {error}")
-    result.write_text(json.dumps(odd))
 
 
 TASKS = ("rotate", "sweep_without_exceeding")
