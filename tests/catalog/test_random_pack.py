@@ -1,10 +1,12 @@
 """Looks of no catalogue: drawn from seeds, whole, varied, and beside the catalogue's own."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from openvima.catalog import outlines
-from openvima.catalog.outlines import signed_area
+from openvima.catalog.meshes import signed_area
 from openvima.catalog.packs import load_assets
 from openvima.catalog.random_pack import (
     RandomAppearanceAssets,
@@ -113,15 +115,21 @@ def test_stretched_random_shapes_are_as_much_higher(looks):
     np.testing.assert_allclose(high, flat * (1, 1, 2))
 
 
+def kit_outline(name):
+    """Outer loop and holes of a flat object of the catalogue."""
+    loops = json.loads(Path(__file__).with_name("kit_outlines.json").read_text(encoding="utf-8"))[name]
+    return tuple(np.array(loop, np.float64) for loop in loops)
+
+
 @pytest.mark.parametrize("name", ["letter A", "letter R", "letter G", "heart", "L-shaped block"])
 def test_shapes_without_symmetry_show_their_heading(name):
-    assert has_heading(outlines.outline(name))
+    assert has_heading(kit_outline(name))
     assert has_visible_heading(name)
 
 
 @pytest.mark.parametrize("name", ["cross", "flower", "hexagon", "ring", "diamond", "star"])
 def test_symmetric_shapes_do_not_show_their_heading(name):
-    assert not has_heading(outlines.outline(name))
+    assert not has_heading(kit_outline(name))
     assert not has_visible_heading(name)
 
 
@@ -130,7 +138,7 @@ def test_vessels_count_as_shapes_without_heading():
     assert sum(has_visible_heading(f"random shape {seed}") for seed in range(40)) > 20
 
 
-def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue(monkeypatch):
+def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue():
     def refused(*arguments):
         raise AssertionError(f"{arguments} was asked for")
 
@@ -138,7 +146,6 @@ def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue(monkey
         name = "empty"
         geometry = texture = refused
 
-    monkeypatch.setattr(outlines, "_outlines", dict)
     looks = RandomAppearanceAssets(Empty())
     rng = np.random.default_rng(0)
     for kind in ("shape", "container", "grating", "eared container", "texture"):

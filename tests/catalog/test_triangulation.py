@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openvima.catalog.outlines import signed_area, triangulate
+from openvima.catalog.meshes import signed_area, triangulate
 from openvima.errors import ShapeError
 
 SQUARE = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)])

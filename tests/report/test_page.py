@@ -238,7 +238,9 @@ def test_tables_are_marked_if_all_outcomes_were_confirmed_by_replay(results, tmp
     recorded = replace(results, actions_sha256="ab")
     confirmed = Confirmation.of(recorded, "my run", confirmed=True)
     text = write_report(results, tmp_path / "a.html", confirmations=[confirmed]).read_text("utf-8")
-    assert all("confirmed by replay</a>" in section(text, name) for name in ("overview", "results", "drop"))
+    assert all(
+        "confirmed by replay</a>" in section(text, name) for name in ("overview", "results", "families")
+    )
     assert not any("confirmed by replay</a>" in section(text, name) for name in ("published", "failures"))
     said = section(text, "verification")
     assert "who acted (policies)" in said and "claim until openvima verify-results &#39;my run&#39;" in said

@@ -7,13 +7,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from openvima.catalog import Assets, Pool
+from openvima.catalog import Assets
 from openvima.catalog.textures import texture_spec
-from openvima.errors import ConfigError
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Action, ObjectImage, Placement, Pose, Problem, Scene
 from openvima.sim.world import World
-from openvima.tasks import TableSampler, sample_episode, task_spec
+from openvima.tasks import sample_episode
 from task_cases import assert_judged_at_its_limits, assert_uniform, roles, roles_with_twins
 
 TASK = "novel_adj"
@@ -160,38 +159,6 @@ def test_beyond_easy_another_shape_is_like_one_of_the_twins(difficulty: str) -> 
         like = target if difficulty == "hard" else twin
         assert extra.object != target.object and not extra.fixed
         assert (extra.texture, extra.scale) == (like.texture, like.scale)
-
-
-@pytest.mark.parametrize("meaning", [*MEANINGS, "smaller", "larger"])
-def test_the_meanings_can_be_chosen(meaning: str) -> None:
-    problems = [sample_episode(TASK, seed=seed, meanings=meaning).problem for seed in range(10)]
-    assert {read(problem).meaning for problem in problems} == {meaning}
-
-
-@pytest.mark.parametrize("meaning", ["smaller", "larger"])
-@pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
-def test_width_can_be_a_meaning_at_any_difficulty(meaning: str, difficulty: str) -> None:
-    for seed in range(10):
-        problem = sample_episode(TASK, seed=seed, meanings=meaning, difficulty=difficulty).problem
-        asked = read(problem)
-        target, _, twin, _ = roles_with_twins(problem)
-        assert difference(target, twin) in {"smaller", "larger"} - ({meaning} if asked.is_flipped else set())
-        low, high = sorted((target.scale, twin.scale))
-        assert 0.55 <= low[0] == low[1] < 0.6 and high[0] == pytest.approx(low[0] + 0.4) and low[2] == 1
-
-
-def from_own_pool(assets: Assets, own: Pool, **options: object) -> Problem:
-    table = TableSampler(np.random.default_rng(0), own, assets=assets)
-    return task_spec(TASK).sample(table, **options)
-
-
-def test_textures_without_a_dark_variant_are_refused_where_shades_matter(assets: Assets) -> None:
-    own = Pool(("ring", "star"), ("bowl",), ("red", "olive", "dark red", "granite"), ("blue",))
-    with pytest.raises(ConfigError, match=r"olive, granite have no light and dark variant"):
-        from_own_pool(assets, own)
-    with pytest.raises(ConfigError, match="olive, granite"):
-        from_own_pool(assets, own, meanings="darker")
-    assert from_own_pool(assets, own, meanings=("shorter", "taller"))
 
 
 @pytest.mark.parametrize("factor", [0.3, 2.4])

@@ -91,11 +91,7 @@ def test_the_difficulty_says_who_gets_which_textures(
         assert_frequencies(drawn, options)
 
 
-def test_words_and_number_of_distractors_can_be_chosen() -> None:
+def test_the_number_of_distractors_can_be_chosen() -> None:
     for num_distractors in (0, 2, 3):
-        problem = sample_episode(
-            TASK, seed=1, nouns=["tove", "rath"], num_distractors=num_distractors
-        ).problem
+        problem = sample_episode(TASK, seed=1, num_distractors=num_distractors).problem
         assert len(roles(problem)[2]) == num_distractors
-        _, match = matched(problem)
-        assert {match["target"], match["base"]} == {"tove", "rath"}

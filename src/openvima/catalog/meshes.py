@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
-from openvima.catalog.outlines import triangulate
+from openvima.errors import ShapeError
 
 TEXTURE_PER_M = 3.5
 """Texture widths per metre of surface, much as on the kit objects of the original pack."""
@@ -99,16 +99,6 @@ def scale_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
     return Geometry(scale_mesh(geometry.visual, scale), hulls, geometry.rest_z_m * scale[2])
 
 
-def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
-    """Raise each point by `slope` metres per metre beyond `from_x`."""
-    vertices = mesh.vertices.copy()
-    vertices[..., 2] += slope * (vertices[..., 0] - from_x)
-    normals = mesh.normals.copy()
-    normals[..., 0] -= slope * normals[..., 2]
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    return TriangleMesh(vertices, normals, mesh.uvs)
-
-
 def drape(mesh: TriangleMesh) -> TriangleMesh:
     """Drape one texture over a group of boxes from above, finer on small ones, within its borders.
 
@@ -121,42 +111,6 @@ def drape(mesh: TriangleMesh) -> TriangleMesh:
     extents = np.ptp(mesh.vertices[..., :2].reshape(-1, 2), axis=0)
     density = min(max(TEXTURE_PER_M, _MIN_TEXTURE_FRACTION / extents.max()), 0.5 / np.abs(flat).max())
     return TriangleMesh(mesh.vertices, mesh.normals, 0.5 + density * flat)
-
-
-def convex_outline(points: np.ndarray) -> np.ndarray:
-    """Return the corners of the convex hull of points in the plane, counter-clockwise.
-
-    Args:
-        points: Shape (N, 2).
-
-    Source: Andrew, "Another efficient algorithm for convex hulls in two dimensions" (1979).
-    """
-    ordered = sorted({(float(x), float(y)) for x, y in points})
-
-    def half(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
-        chain: list[tuple[float, float]] = []
-        for x, y in sequence:
-            while len(chain) > 1:
-                (ax, ay), (bx, by) = chain[-2:]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
-                    break
-                chain.pop()
-            chain.append((x, y))
-        return chain[:-1]
-
-    return np.array(half(ordered) + half(ordered[::-1]))
-
-
-def slab_hull(points: np.ndarray, z_low: float, z_high: float) -> CollisionHull:
-    """Return the hull of an outline between two heights; holes and hollows are filled.
-
-    Args:
-        points: Shape (N, 2), metres.
-        z_low: Height of the lower face.
-        z_high: Height of the upper face.
-    """
-    corners = convex_outline(points)
-    return CollisionHull(np.concatenate([_at_height(corners, z_low), _at_height(corners, z_high)]))
 
 
 def _at_height(points: np.ndarray, z: float) -> np.ndarray:
@@ -223,3 +177,120 @@ def _revolved_ring(
     if ring[1, 0] > 0:
         faces.append((corner(0, 0), corner(1, 1), corner(1, 0)))
     return combine([TriangleMesh(*(np.stack(part, axis=1) for part in zip(*f, strict=True))) for f in faces])
+
+
+Point = tuple[float, float]
+
+
+def signed_area(loop: np.ndarray) -> float:
+    """Return the area of a closed polygon, positive if it runs counter-clockwise.
+
+    Args:
+        loop: Corners, shape (N, 2); the last one joins the first.
+    """
+    x, y = loop[:, 0], loop[:, 1]
+    return float(0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+
+
+def triangulate(loops: Sequence[np.ndarray]) -> np.ndarray:
+    """Cut an outline into triangles that cover it exactly.
+
+    Args:
+        loops: The outer loop counter-clockwise, then holes clockwise; each shape (N, 2). Loops neither cross
+            nor touch.
+
+    Returns:
+        Shape (T, 3), int64: indices into all loops put one after the other, each triangle counter-clockwise.
+
+    Raises:
+        ShapeError: A loop crosses itself or another one, or runs the wrong way round.
+    """
+    points = [(float(x), float(y)) for loop in loops for x, y in loop]
+    starts = np.cumsum([0, *(len(loop) for loop in loops)])
+    rings = [list(range(starts[i], starts[i + 1])) for i in range(len(loops))]
+    areas = [signed_area(loop) for loop in loops]
+    if areas[0] <= 0 or any(area >= 0 for area in areas[1:]):
+        raise ShapeError(f"loop areas are {areas}; the first must be positive, those of holes negative.")
+    polygon = _without_holes(points, rings)
+    return np.array(_clip_ears(points, polygon), dtype=np.int64)
+
+
+def _turn(a: Point, b: Point, c: Point) -> float:
+    """Doubled area of the triangle a, b, c; positive for a left turn."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def _without_holes(points: list[Point], rings: list[list[int]]) -> list[int]:
+    """Join each hole to the outer loop by a pair of coinciding edges."""
+    polygon = rings[0]
+    holes = sorted(rings[1:], key=lambda ring: max(points[i][0] for i in ring), reverse=True)
+    for done, hole in enumerate(holes):
+        start = max(range(len(hole)), key=lambda k: points[hole[k]])
+        turned = hole[start:] + hole[: start + 1]
+        edges = [edge for ring in (polygon, *holes[done:]) for edge in _edges(ring)]
+        place = _visible_corner(points, polygon, turned[0], edges)
+        polygon = polygon[: place + 1] + turned + polygon[place:]
+    return polygon
+
+
+def _edges(ring: list[int]) -> list[tuple[int, int]]:
+    return list(zip(ring, ring[1:] + ring[:1], strict=True))
+
+
+def _visible_corner(
+    points: list[Point], polygon: list[int], hole_corner: int, edges: list[tuple[int, int]]
+) -> int:
+    """Place in `polygon` of the nearest corner that no edge hides from a corner of a hole."""
+    origin = points[hole_corner]
+
+    def distance(place: int) -> float:
+        x, y = points[polygon[place]]
+        return (x - origin[0]) ** 2 + (y - origin[1]) ** 2
+
+    for place in sorted(range(len(polygon)), key=distance):
+        target = points[polygon[place]]
+        if not any(_crosses(origin, target, points[a], points[b]) for a, b in edges):
+            return place
+    raise ShapeError("a hole lies outside its outline.")
+
+
+def _crosses(a: Point, b: Point, c: Point, d: Point) -> bool:
+    """Whether two segments meet anywhere but at a common end."""
+    if a in (c, d) or b in (c, d):
+        return False
+    return _turn(a, b, c) * _turn(a, b, d) <= 0 and _turn(c, d, a) * _turn(c, d, b) <= 0
+
+
+def _clip_ears(points: list[Point], polygon: list[int]) -> list[tuple[int, int, int]]:
+    polygon = list(polygon)
+    triangles = []
+    while len(polygon) > 3:
+        for place in range(len(polygon)):
+            before, tip, after = polygon[place - 1], polygon[place], polygon[(place + 1) % len(polygon)]
+            if _is_ear(points, polygon, (before, tip, after)):
+                triangles.append((before, tip, after))
+                del polygon[place]
+                break
+        else:
+            raise ShapeError(f"no ear among the last {len(polygon)} corners; does the outline cross itself?")
+    triangles.append((polygon[0], polygon[1], polygon[2]))
+    return triangles
+
+
+def _is_ear(points: list[Point], polygon: list[int], corners: tuple[int, int, int]) -> bool:
+    a, b, c = (points[i] for i in corners)
+    if _turn(a, b, c) <= 0:
+        return False
+    for index in polygon:
+        p = points[index]
+        if p in (a, b, c):
+            continue
+        if _turn(a, b, p) >= 0 and _turn(b, c, p) >= 0 and _turn(c, a, p) >= 0:
+            return False
+    return True
+
+
+def rectangle(centre: tuple[float, float], half_size: tuple[float, float]) -> list[Point]:
+    """Return the corners of an upright rectangle, counter-clockwise."""
+    (x, y), (dx, dy) = centre, half_size
+    return [(x - dx, y - dy), (x + dx, y - dy), (x + dx, y + dy), (x - dx, y + dy)]

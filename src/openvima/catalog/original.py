@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 
 from openvima.atomic_io import atomic_write
-from openvima.catalog.bodies import BOX_SHAPES, LONG_RODS_Z, hanoi_stand
+from openvima.catalog.bodies import BOX_SHAPES, fixed_geometry
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
 from openvima.catalog.mesh_files import ObjMesh, parse_obj
 from openvima.catalog.meshes import scale_geometry
@@ -371,7 +371,7 @@ def _geometry(files: PackFiles, spec: ObjectSpec, size: Vector3, scale: Vector3)
     if spec.kind == "kit":
         return _kit(files, spec, scale)
     if spec.name == "stand":  # which has no mesh file
-        return scale_geometry(hanoi_stand(LONG_RODS_Z), scale)
+        return scale_geometry(fixed_geometry("stand with long rods"), scale)
     return _fixed_mesh(files, spec.name, scale)
 
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from openvima.catalog import bodies
 from openvima.catalog.geometry import Geometry
-from openvima.catalog.meshes import combine, drape, prism, revolve
-from openvima.catalog.outlines import rectangle, signed_area
+from openvima.catalog.meshes import combine, drape, prism, rectangle, revolve, signed_area
 
 _WIDTHS_M = (0.07, 0.125)  # smallest and largest extent of an outline, much as of the kit objects
 _HEIGHTS_M = (0.02, 0.036)

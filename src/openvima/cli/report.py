@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from openvima.report.text import Confirmation
     from openvima.video.encoder import Clip
 
-_HTML, _MARKDOWN, _LATEX = (".html", ".htm"), (".md", ".markdown"), (".tex",)
-
 
 def main(
     results: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RESULTS")],
@@ -25,9 +23,6 @@ def main(
     out: Path | None = None,
     compare: str | None = None,
     runs: tuple[Path, ...] = (),
-    markdown: bool = False,
-    latex: bool = False,
-    tables: Literal["all", "levels"] = "all",
     published: bool = True,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -40,15 +35,11 @@ def main(
 
     Args:
         results: Folders of evaluations, or their results.json.
-        out: File to write: .html, .md or .tex; by default report.html beside the results, or in the current
-            folder if there are several.
+        out: File to write: .html, or .md or .tex for the tables of a paper; by default report.html beside
+            the results, or in the current folder if there are several.
         compare: Policies with commas in between; each is compared with the first, seed by seed.
             POLICY:ABLATION stands for its score under an ablation.
         runs: Folders of training runs, or their metrics.jsonl, whose learning curves to show.
-        markdown: Print tables in Markdown for a paper.
-        latex: Print tables in LaTeX for a paper; they need the package booktabs.
-        tables: Which tables to write in Markdown or LaTeX: all, or levels, a compact one of the means by
-            level with the best policy of each level in bold.
         published: Whether to show published numbers of the same tasks beside those measured.
         as_json: Print the comparisons as JSON.
 
@@ -56,43 +47,39 @@ def main(
         Exit status.
     """
     from openvima.atomic_io import atomic_write_file
-    from openvima.evaluation.comparison import compare_pairs, default_pairs
-    from openvima.report.table import latex as as_latex
-    from openvima.report.table import markdown as as_markdown
-    from openvima.report.tables import compact_tables, paper_tables
-    from openvima.report.text import finding
+    from openvima.evaluation.comparison import compare_pairs, default_pairs, merge
+    from openvima.evaluation.results import Results
+    from openvima.evaluation.verification import is_marked_verified
+    from openvima.report.curves import run_labels
+    from openvima.report.table import latex, markdown
+    from openvima.report.tables import paper_tables
+    from openvima.report.text import Confirmation, finding
 
     _check(results, out)
-    evaluations = _read(results)
-    merged = _merged(evaluations)
-    found = merged.results
-    pairs = _pairs(compare) if compare is not None else default_pairs(found)
-    comparisons = compare_pairs(found, pairs)
-    suffix = out.suffix.lower() if out else ""
-    confirmations = _confirmations(evaluations)
-    confirmed = all(each.confirmed for each in confirmations)
-    written = (
-        paper_tables(found, comparisons, published=published, confirmed=confirmed)
-        if tables == "all"
-        else compact_tables(found, published=published)
-    )
-    if suffix in (*_MARKDOWN, *_LATEX) and out is not None:
-        atomic_write_file(out, as_latex(written) if suffix in _LATEX else as_markdown(written))
+    evaluations = {path: Results.read(path) for path in dict.fromkeys(results)}
+    labels = run_labels([_folder(path) for path in evaluations])
+    merged = merge(dict(zip(labels, evaluations.values(), strict=True)))
+    pairs = _pairs(compare) if compare is not None else default_pairs(merged.results)
+    comparisons = compare_pairs(merged.results, pairs)
+    confirmations = [
+        # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
+        Confirmation.of(found, label if len(labels) > 1 else "DIR", confirmed=is_marked_verified(path))
+        for label, (path, found) in zip(labels, evaluations.items(), strict=True)
+    ]
+    if out is not None and (write := {".md": markdown, ".tex": latex}.get(out.suffix.lower())):
+        confirmed = all(each.confirmed for each in confirmations)
+        written = paper_tables(merged.results, comparisons, published=published, confirmed=confirmed)
+        atomic_write_file(out, write(written))
         print(f"Tables: {out}")
         return 0
-    if markdown:
-        print(as_markdown(written), end="")
-    if latex:
-        print(as_latex(written), end="")
     if as_json:
         print(json.dumps([comparison.record() for comparison in comparisons], indent=1))
-    prints = markdown or latex or as_json
-    said = sys.stderr if prints else sys.stdout  # what is printed for other programs has stdout to itself
+    said = sys.stderr if as_json else sys.stdout  # what is printed for other programs has stdout to itself
     if compare is not None:
         for comparison in comparisons:
             for difference in comparison.means:
                 print(finding(comparison, difference), file=said)
-    if out is not None or not prints:
+    if out is not None or not as_json:
         path = _page(
             evaluations,
             merged,
@@ -111,39 +98,11 @@ def _check(results: Sequence[Path], out: Path | None) -> None:
 
     if not results:
         raise ConfigError("give at least one folder of an evaluation, or a results.json.")
-    if out is not None and out.suffix.lower() not in (*_HTML, *_MARKDOWN, *_LATEX):
+    if out is not None and out.suffix.lower() not in (".html", ".md", ".tex"):
         raise ConfigError(
             f"--out is {str(out)!r}; give the name of an HTML file, such as report.html, or one that ends in "
             ".md or .tex for tables."
         )
-
-
-def _read(paths: Sequence[Path]) -> dict[Path, "Results"]:
-    from openvima.evaluation.results import Results
-
-    return {path: Results.read(path) for path in dict.fromkeys(paths)}
-
-
-def _merged(evaluations: dict[Path, "Results"]) -> "Merged":
-    from openvima.evaluation.comparison import merge
-    from openvima.report.curves import run_labels
-
-    labels = run_labels([_folder(path) for path in evaluations])
-    return merge(dict(zip(labels, evaluations.values(), strict=True)))
-
-
-def _confirmations(evaluations: dict[Path, "Results"]) -> list["Confirmation"]:
-    """Say of each evaluation whether its outcomes were confirmed by replay."""
-    from openvima.evaluation.verification import is_marked_verified
-    from openvima.report.curves import run_labels
-    from openvima.report.text import Confirmation
-
-    # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
-    labels = run_labels([_folder(path) for path in evaluations]) if len(evaluations) > 1 else ["DIR"]
-    return [
-        Confirmation.of(results, label, confirmed=is_marked_verified(path))
-        for label, (path, results) in zip(labels, evaluations.items(), strict=True)
-    ]
 
 
 def _pairs(names: str) -> list[tuple[str, str]]:

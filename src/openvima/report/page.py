@@ -14,7 +14,6 @@ from openvima.html import render_page
 from openvima.input_files import as_path, names_of
 from openvima.policies.naming import UNTRAINED, VLM
 from openvima.report import figures, published, tables, text
-from openvima.report.ablations import ablated_policies, rate_figures
 from openvima.report.curves import read_run_charts
 from openvima.report.text import Confirmation
 from openvima.video.encoder import Clip
@@ -94,11 +93,8 @@ def write_report(
         comparisons=comparisons,
         confirmations=confirmations,
         all_confirmed=bool(confirmations) and all(each.confirmed for each in confirmations),
-        ablations=ablated_policies(results),
-        rate_figures=rate_figures(results),
+        ablations=tables.ablated_policies(results),
         families=tables.family_table(results, published=with_published),
-        level_figure=tables.level_figure(results, published=with_published),
-        level_drop=tables.level_drop_table(results, published=with_published),
         published_tasks=published.published_task_table(results) if with_published else None,
         published_results=published.published_rows(results, published.published_models())
         if with_published

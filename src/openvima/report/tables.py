@@ -2,17 +2,19 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from openvima.catalog.partitions import PUBLISHED_LEVELS
 from openvima.errors import UnknownTaskError
-from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
+from openvima.evaluation.comparison import (
+    ABLATION_SEPARATOR,
+    Comparison,
+    Difference,
+    can_be_compared,
+    compare_pairs,
+)
 from openvima.evaluation.results import LevelMean, Results
-from openvima.evaluation.statistics import Interval, difference_of_means, mean_of_rates, ratio_of_means
-from openvima.policies.naming import ORACLE
-from openvima.report.ablations import rate_figures
-from openvima.report.figures import RateCurve, RateFigure, RatePanel, RatePoint, rate_table
+from openvima.evaluation.statistics import Interval, mean_of_rates
 from openvima.report.published import (
     BESIDE,
     is_comparable,
@@ -24,7 +26,7 @@ from openvima.report.published import (
     unpublished_settings,
 )
 from openvima.report.table import Estimate, Line, Table
-from openvima.report.text import ablation_name, counted
+from openvima.report.text import ablation_name, counted, points, points_span
 from openvima.tasks.registry import task_spec
 
 _MOST_TASKS = 4  # that are named for a cause of failure
@@ -78,20 +80,6 @@ def _by_task(counts: Counter[str]) -> str:
     named = ", ".join(f"{task} {count}" for task, count in ranked[:_MOST_TASKS])
     rest = len(ranked) - _MOST_TASKS
     return f"{named} and {counted(rest, 'other task')}" if rest > 0 else named
-
-
-def disagreements(results: Results, comparison: Comparison) -> list[tuple[str, str, list[int], list[int]]]:
-    """List task, level and the seeds that only one of two policies solved; none for input ablations."""
-    found = []
-    for difference in comparison.tasks:
-        rows = [results.row(name, difference.task, difference.level) for name in (comparison.a, comparison.b)]
-        solved = [{o.seed for o in row.outcomes if o.success} for row in rows if row is not None]
-        played = [{o.seed for o in row.outcomes} for row in rows if row is not None]
-        if len(solved) == 2 and (difference.only_a or difference.only_b):
-            only_a = sorted(solved[0] & played[1] - solved[1])
-            only_b = sorted(solved[1] & played[0] - solved[0])
-            found.append((difference.task, difference.level, only_a, only_b))
-    return found
 
 
 FAMILIES = (  # in the paper's order
@@ -160,87 +148,6 @@ def family_name(family: str) -> str:
     return family.replace("_", " ").replace("one shot", "one-shot")
 
 
-def compared_levels(results: Results) -> list[str]:
-    """Evaluated levels of L1 to L4, in this order."""
-    return sorted(level for level in results.levels() if level in PUBLISHED_LEVELS[1:])
-
-
-def level_drop_table(results: Results, *, published: bool = True) -> Table | None:
-    """Change of each policy from the first to the last level, then that of published models.
-
-    The tasks of two levels differ, so their means count as independent.
-
-    Args:
-        results: The evaluation.
-        published: Whether to add published models that have numbers for the same tasks.
-
-    Returns:
-        The table; None for fewer than two levels.
-    """
-    levels = compared_levels(results)
-    if len(levels) < 2:
-        return None
-    first, last = levels[0], levels[-1]
-    means = results.means()
-    lines = [
-        Line(policy, _cells(means[policy, "", first], means[policy, "", last]))
-        for policy in results.policy_names()
-        if {(policy, "", first), (policy, "", last)} <= means.keys()
-    ]
-    elsewhere = _published_lines(results, first, last) if published else []
-    caption = (
-        f"Change of the mean success rate from {first} to {last}: in percentage points, and relative to "
-        f"{first} (%), with 95 % intervals. The tasks of the two levels differ, so the means are treated as "
-        "independent. A relative change has no bounded interval where the first mean is close to 0."
-    )
-    columns = ("policy", first, last, "change (points)", "relative change (%)")
-    return Table("level-drop", caption, columns, (*lines, *elsewhere))
-
-
-def level_figure(results: Results, *, published: bool = True) -> RateFigure | None:
-    """Success rate of each policy over the levels; None for fewer than two levels."""
-    levels = compared_levels(results)
-    if len(levels) < 2:
-        return None
-    at = {level: float(index) for index, level in enumerate(levels)}
-    own: dict[str, list[RatePoint]] = {}
-    for mean in results.level_means():
-        if mean.level in at and not mean.ablation:
-            own.setdefault(mean.policy, []).append(RatePoint(at[mean.level], mean.mean, mean.interval))
-    curves = [RateCurve(name, tuple(points)) for name, points in own.items()]
-    for model in leading_models() if published else ():
-        rates = {level: published_rate(level, results.tasks(level), model) for level in levels}
-        known = tuple(RatePoint(at[level], r / 100) for level, r in rates.items() if r is not None)
-        if len(known) > 1:
-            curves.append(RateCurve(model.name, known, published=True))
-    panel = RatePanel("Mean success", tuple(curves))
-    ticks = {x: level for level, x in at.items()}
-    return RateFigure("level-means", "Success rates over the levels.", "level", (panel,), ticks)
-
-
-def _cells(first: LevelMean, last: LevelMean) -> tuple[Estimate | str, ...]:
-    a, b = (last.mean, last.interval), (first.mean, first.interval)
-    change = Estimate(*difference_of_means(a, b), signed=True)
-    ratio = ratio_of_means(a, b)
-    relative = "–" if ratio is None else Estimate(ratio[0] - 1, _less_one(ratio[1]), signed=True)
-    return Estimate(*b), Estimate(*a), change, relative
-
-
-def _less_one(interval: tuple[float, float]) -> tuple[float, float]:
-    return interval[0] - 1, interval[1] - 1
-
-
-def _published_lines(results: Results, first: str, last: str) -> list[Line]:
-    lines: list[Line] = []
-    for model in leading_models():
-        a, b = (published_rate(level, results.tasks(level), model) for level in (first, last))
-        if a and b is not None:
-            written = f"{a:.1f}", f"{b:.1f}", f"{b - a:+.1f}", f"{100 * (b / a - 1):+.1f}"
-            cells = tuple(text.replace("-", "−") for text in written)
-            lines.append(Line(f"{model.name} (published)", cells, starts_group=not lines))
-    return lines
-
-
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
 _CONFIRMED = "Measured outcomes are confirmed by replaying the recorded actions; who acted is declared."
 _UNCONFIRMED = "Outcomes are not confirmed by replay, as `openvima verify-results` does."
@@ -267,42 +174,16 @@ def paper_tables(
     by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
     chosen = [
         _mean_table(results, means, published=published),
-        level_drop_table(results, published=published),
         family_table(results, published=published),
         *by_policy,
         published_task_table(results) if published else None,
         *ablation_tables(results),
-        *map(rate_table, rate_figures(results)),
         *map(_difference_table, comparisons),
     ]
     tables = [table for table in chosen if table and table.lines]
     if confirmed:
         return [replace(table, caption=f"{table.caption} {_CONFIRMED}") for table in tables]
     return [replace(tables[0], caption=f"{tables[0].caption} {_UNCONFIRMED}"), *tables[1:]]
-
-
-def compact_tables(results: Results, *, published: bool = True) -> list[Table]:
-    """Means by level alone, the best policy of each level in bold; the oracle, an upper bound, is none."""
-    table = _mean_table(results, results.means(), published=published and is_comparable(results))
-    policies = results.policy_names()
-    rivals = [n for n in policies if results.policies.get(n, {}).get("kind") != ORACLE]
-    best = {
-        column: max((c.value for c in cells if isinstance(c, Estimate)), default=None)
-        for column, cells in enumerate(zip(*(r.cells for r in table.lines if r.name in rivals), strict=True))
-    }
-    lines = [
-        replace(
-            row,
-            cells=tuple(
-                replace(cell, is_best=row.name in rivals and cell.value == best.get(column))
-                if isinstance(cell, Estimate)
-                else cell
-                for column, cell in enumerate(row.cells)
-            ),
-        )
-        for row in table.lines
-    ]
-    return [replace(table, lines=tuple(lines))]
 
 
 def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
@@ -437,3 +318,57 @@ def _made_of(results: Results, policy: str | None = None) -> str:
     episodes = sorted({row.episodes for row in rows})
     number = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
     return f"{number} a task.{unpublished_settings(results)}"
+
+
+_BOUNDS = ("oracle", "random")  # kinds of policies that bound a score
+
+
+@dataclass(frozen=True, slots=True)
+class AblatedPolicy:
+    """A policy that was evaluated with input ablations.
+
+    Args:
+        policy: Its name.
+        ablations: Names of its ablations.
+        columns: Policy and ablation of each column: its plain score, its ablations, bounds of the score.
+        changes: By how much an ablation changes the mean of a level, in points with interval; ≈ marks noise.
+    """
+
+    policy: str
+    ablations: tuple[str, ...]
+    columns: tuple[tuple[str, str], ...]
+    changes: dict[tuple[str, str], str]
+
+
+def ablated_policies(results: Results) -> list[AblatedPolicy]:
+    """Collect the policies with ablations."""
+    ablations: dict[str, dict[str, None]] = {}
+    for row in results.rows:
+        if row.ablation:
+            ablations.setdefault(row.policy, {})[row.ablation] = None
+    return [
+        _ablated(results, policy, tuple(ablations[policy]))
+        for policy in results.policy_names()
+        if policy in ablations
+    ]
+
+
+def _ablated(results: Results, policy: str, ablations: tuple[str, ...]) -> AblatedPolicy:
+    bounds = [
+        (name, "")
+        for name in results.policy_names()
+        if name != policy and results.policies.get(name, {}).get("kind") in _BOUNDS
+    ]
+    columns = ((policy, ""), *((policy, ablation) for ablation in ablations), *bounds)
+    return AblatedPolicy(policy, ablations, columns, _changes(results, policy, ablations))
+
+
+def _changes(results: Results, policy: str, ablations: tuple[str, ...]) -> dict[tuple[str, str], str]:
+    names = {ablation: f"{policy}{ABLATION_SEPARATOR}{ablation}" for ablation in ablations}
+    pairs = {a: (name, policy) for a, name in names.items() if can_be_compared(results, name, policy)}
+    return {
+        (ablation, change.level): f"{points(change.difference, 0)} ({points_span(change.interval, 0)})"
+        + (" ≈" if change.verdict == "noise" else "")
+        for ablation, comparison in zip(pairs, compare_pairs(results, list(pairs.values())), strict=True)
+        for change in comparison.levels
+    }

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from openvima.evaluation.ablations import scenes_of
+from openvima.evaluation.ablations import ablation_parts, scenes_of
 from openvima.evaluation.results import Results
 from openvima.evaluation.statistics import (
     Interval,
@@ -16,7 +16,6 @@ from openvima.evaluation.statistics import (
 from openvima.html import render_page
 from openvima.input_files import read_json
 from openvima.report import text
-from openvima.report.ablations import rated
 from openvima.report.figures import RateCurve, RateFigure, RatePanel, RatePoint, rate_figure_html
 from openvima.report.published import RELIABILITY
 from openvima.report.text import ablation_name
@@ -107,8 +106,13 @@ def _position(study: Study, run: Run, level: str, ablation: str) -> float | str:
     if study.x_axis == "ablation":
         return ablation_name(ablation) or "as it is"
     if study.x_axis == "rate":
-        return rated(ablation)[1] or 0.0
+        return _rate(ablation)
     return run.label if run.x == "" else run.x
+
+
+def _rate(ablation: str) -> float:
+    """Return the number in the name of an ablation; 0 without one."""
+    return sum(part.rate for part in ablation_parts(ablation))
 
 
 def _difference(outcomes: Sequence[_Outcomes], others: Sequence[_Outcomes]) -> tuple[float, Interval] | None:

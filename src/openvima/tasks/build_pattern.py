@@ -45,18 +45,15 @@ _SPARE_STEPS = 2
 
 
 @register_task("build_pattern", family="visual_goal_reaching", template=TEMPLATE, oracle_max_steps=12)
-def sample(table: TableSampler, *, pattern: int | None = None, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
-        pattern: Which pattern, 0 … 9; by default drawn.
         num_distractors: Objects in the way, 0 … 2.
     """
     check_count("num_distractors", num_distractors, high=2)
-    number = int(table.rng.integers(len(PATTERNS))) if pattern is None else pattern
-    check_count("pattern", number, high=len(PATTERNS) - 1)
-    target_cells = _shifted(table, PATTERNS[number].split())
+    target_cells = _shifted(table, table.choose(PATTERNS).split())
     cells = [(row, column) for row in range(NUM_ROWS) for column in range(NUM_COLUMNS)]
     free = [cell for cell in cells if cell not in target_cells]
     free = [free[index] for index in table.rng.permutation(len(free))]

@@ -159,7 +159,7 @@ def _restore(made: Composition, n: int) -> Goals:
 
 def _define(made: Composition, n: int) -> Goals:
     defined = made.new_object(asymmetric=True)
-    (made.fills["name"],) = choose_words(made.table, "nouns", NOUNS)
+    (made.fills["name"],) = choose_words(made.table, NOUNS)
     made.fills[f"object_{n}"] = gray_image(defined)
     made.shapes.add(defined.object)
     return ()

@@ -12,11 +12,10 @@ import math
 from itertools import accumulate
 
 from openvima.scene import EveryStepCounts, ObjectImage, Placement, Pose, Problem, Prompt
-from openvima.tasks.options import check_num_distractors
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
-    checked_num_frames,
     frame_images,
     goals_between,
     with_frame_slots,
@@ -39,7 +38,6 @@ NUM_POINTS = 5  # 0.22 m from each other, 0.19 m from the centre
 def sample(
     table: TableSampler,
     *,
-    num_frames: int | None = None,
     num_distractors: int = 1,
     difficulty: str = "easy",
 ) -> Problem:
@@ -47,12 +45,12 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        num_frames: Frames of the motion, 2 … 10; by default that of the difficulty.
         num_distractors: Distractors on the table, 0 … 6: one in the middle, the others away from the circle.
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 frames.
     """
     check_num_distractors(num_distractors)
-    num_frames = checked_num_frames(num_frames, difficulty, high=10)
+    check_difficulty(difficulty)
+    num_frames = NUM_FRAMES[difficulty]
     appearances = [
         (name, texture) for name in table.pool.dragged_objects for texture in table.pool.dragged_textures
     ]

@@ -13,12 +13,11 @@ import itertools
 from collections.abc import Iterator
 
 from openvima.scene import WORKSPACE_LOW, EveryStepCounts, Placement, Pose, Problem, Prompt
-from openvima.tasks.options import check_count, check_num_distractors
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
     Frame,
-    checked_num_frames,
     frame_images,
     goals_between,
     with_frame_slots,
@@ -41,8 +40,6 @@ Stacks = tuple[tuple[int, ...], ...]
 def sample(
     table: TableSampler,
     *,
-    num_blocks: int | None = None,
-    num_frames: int | None = None,
     num_distractors: int = 1,
     difficulty: str = "easy",
 ) -> Problem:
@@ -50,14 +47,11 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        num_blocks: Objects to stack, 2 … 4; by default that of the difficulty.
-        num_frames: Frames, 2 … 5; by default that of the difficulty.
         num_distractors: Further objects, 0 … 6.
         difficulty: "easy", "medium" or "hard": 3, 4 or 4 objects in 3, 4 or 5 frames.
     """
-    num_frames = checked_num_frames(num_frames, difficulty, high=5)
-    num_blocks = NUM_BLOCKS[difficulty] if num_blocks is None else num_blocks
-    check_count("num_blocks", num_blocks, low=2, high=4)
+    check_difficulty(difficulty)
+    num_frames, num_blocks = NUM_FRAMES[difficulty], NUM_BLOCKS[difficulty]
     check_num_distractors(num_distractors)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 

@@ -7,14 +7,9 @@ Success:  the right object within 0.1 m of the base's origin, while its twin is 
 Source:   VIMA paper, task list of the appendix, "Novel adjective".
 """
 
-from collections.abc import Sequence
-
 from openvima.scene import Problem, Prompt
 from openvima.tasks.novel_words import (
-    ADJECTIVES,
-    MEANINGS,
-    NUM_COMPARISONS,
-    comparison_text,
+    COMPARISONS,
     gray_image,
     place_base_and_pair,
     sample_adjective_example,
@@ -29,16 +24,13 @@ REQUEST = "Put the {adv}{novel_adj} {dragged_obj} into the {base_obj}."
 @register_task(
     "novel_adj",
     family="novel_concept_grounding",
-    template=f"{comparison_text()} {REQUEST}",
+    template=f"{COMPARISONS} {REQUEST}",
     oracle_max_steps=3,
     distractors_allowed=True,
 )
 def sample(
     table: TableSampler,
     *,
-    adjectives: str | Sequence[str] = ADJECTIVES,
-    meanings: str | Sequence[str] = MEANINGS,
-    num_comparisons: int = NUM_COMPARISONS,
     num_distractors: int = 0,
     difficulty: str = "easy",
 ) -> Problem:
@@ -46,21 +38,16 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        adjectives: Invented adjectives.
-        meanings: Possible meanings: "shorter", "taller", "lighter", "darker", "smaller", "larger".
-        num_comparisons: Pairs of objects that illustrate the meaning, 1 … 9.
         num_distractors: Further objects of other shapes, 0 … 6.
         difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the
             twin or of the target.
     """
-    example = sample_adjective_example(
-        table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons
-    )
+    example = sample_adjective_example(table)
     base, target, others = place_base_and_pair(
         table, example, num_distractors=num_distractors, difficulty=difficulty
     )
     prompt = Prompt.parse(
-        f"{example.text} {REQUEST}",
+        f"{COMPARISONS} {REQUEST}",
         **example.fills,
         dragged_obj=gray_image(target),
         base_obj=gray_image(base),

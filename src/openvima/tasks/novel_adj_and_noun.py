@@ -8,16 +8,11 @@ Success:  the right object within 0.1 m of the base's origin, while nothing else
 Source:   VIMA paper, task list of the appendix, "Novel adjective and noun".
 """
 
-from collections.abc import Sequence
-
 from openvima.scene import Problem, Prompt
 from openvima.tasks.novel_words import (
-    ADJECTIVES,
-    MEANINGS,
+    COMPARISONS,
     NOUNS,
-    NUM_COMPARISONS,
     choose_words,
-    comparison_text,
     gray_image,
     place_base_and_pair,
     sample_adjective_example,
@@ -34,16 +29,12 @@ REQUEST = "Put the {adv}{novel_adj} {novel_name_1} into the {novel_name_2}."
 @register_task(
     "novel_adj_and_noun",
     family="novel_concept_grounding",
-    template=" ".join((*INTRODUCTIONS, comparison_text(), REQUEST)),
+    template=" ".join((*INTRODUCTIONS, COMPARISONS, REQUEST)),
     oracle_max_steps=3,
 )
 def sample(
     table: TableSampler,
     *,
-    adjectives: str | Sequence[str] = ADJECTIVES,
-    nouns: str | Sequence[str] = NOUNS,
-    meanings: str | Sequence[str] = MEANINGS,
-    num_comparisons: int = NUM_COMPARISONS,
     num_distractors: int = 2,
     difficulty: str = "easy",
 ) -> Problem:
@@ -51,24 +42,18 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        adjectives: Invented adjectives.
-        nouns: Invented nouns, at least two.
-        meanings: Possible meanings: "shorter", "taller", "lighter", "darker", "smaller", "larger".
-        num_comparisons: Pairs of objects that illustrate the meaning, 1 … 9.
         num_distractors: Further objects of other shapes, 0 … 6.
         difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the
             twin or of the target.
     """
-    example = sample_adjective_example(
-        table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons
-    )
-    noun, base_noun = choose_words(table, "nouns", nouns, count=2)
+    example = sample_adjective_example(table)
+    noun, base_noun = choose_words(table, NOUNS, 2)
     introductions = shuffle_sentences(table, INTRODUCTIONS)
     base, target, others = place_base_and_pair(
         table, example, num_distractors=num_distractors, difficulty=difficulty
     )
     prompt = Prompt.parse(
-        " ".join((*introductions, example.text, REQUEST)),
+        " ".join((*introductions, COMPARISONS, REQUEST)),
         **example.fills,
         novel_name_1=noun,
         novel_name_2=base_noun,

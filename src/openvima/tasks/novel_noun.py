@@ -7,8 +7,6 @@ Success:  object within 0.1 m of the base's origin, while no distractor is as ne
 Source:   VIMA paper, task list of the appendix, "Novel noun".
 """
 
-from collections.abc import Sequence
-
 from openvima.scene import Problem, Prompt
 from openvima.tasks.novel_words import NOUNS, choose_words, gray_image, shuffle_sentences
 from openvima.tasks.options import check_num_distractors, textures_by_difficulty
@@ -30,7 +28,6 @@ REQUEST = "Put a {novel_name_1} into a {novel_name_2}."
 def sample(
     table: TableSampler,
     *,
-    nouns: str | Sequence[str] = NOUNS,
     num_distractors: int = 1,
     difficulty: str = "easy",
 ) -> Problem:
@@ -38,12 +35,11 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        nouns: Invented nouns, at least two.
         num_distractors: Further objects, 0 … 6.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
     check_num_distractors(num_distractors)
-    noun, base_noun = choose_words(table, "nouns", nouns, count=2)
+    noun, base_noun = choose_words(table, NOUNS, 2)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     base, target = place_base_and_target(
         table, dragged_textures=dragged_textures, base_textures=base_textures

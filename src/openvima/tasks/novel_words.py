@@ -1,45 +1,24 @@
 """Invented words: nouns, and adjectives defined by comparing objects that differ in one attribute alone."""
 
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from openvima.catalog import Vector3
 from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
-from openvima.errors import ConfigError, unknown_name
+from openvima.errors import ConfigError
 from openvima.scene import ObjectImage, Placement, Pose
-from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.placing import APART_M, of_a_third_shape, place_distractors
 from openvima.tasks.table import NO_SCALE, TableSampler
 
 ADJECTIVES = ("daxer", "blicker", "modier", "kobar")
 NOUNS = ("dax", "blicket", "wug", "zup")
-_WORD = re.compile(r"[^\W\d_]+(-[^\W\d_]+)*")
 
 
-def choose_words(
-    table: TableSampler, option: str, words: str | Sequence[str], *, count: int = 1
-) -> tuple[str, ...]:
-    """Draw distinct words.
-
-    Args:
-        table: Source of the draws.
-        option: Name of the option, for errors.
-        words: A word or a list of words.
-        count: Number of words.
-
-    Raises:
-        ConfigError: The list is too short, or has duplicates or invalid words.
-    """
-    if not isinstance(words, Iterable):
-        raise ConfigError(f"{option} is {words!r}; give a word or a list of words.")
-    listed = (words,) if isinstance(words, str) else tuple(words)
-    wrong = [word for word in listed if not (isinstance(word, str) and _WORD.fullmatch(word))]
-    if wrong or len(set(listed)) < max(len(listed), count):
-        given = ", ".join(map(repr, wrong or listed)) or "nothing"
-        raise ConfigError(f"{option} holds {given}; give at least {count} different words, letters only.")
-    return tuple(listed[int(i)] for i in table.rng.permutation(len(listed))[:count])
+def choose_words(table: TableSampler, words: Sequence[str], count: int = 1) -> tuple[str, ...]:
+    """Draw distinct words."""
+    return tuple(words[int(i)] for i in table.rng.permutation(len(words))[:count])
 
 
 def shuffle_sentences(table: TableSampler, sentences: Sequence[str]) -> list[str]:
@@ -53,8 +32,6 @@ def gray_image(placement: Placement) -> ObjectImage:
 
 
 MEANINGS = ("shorter", "taller", "lighter", "darker")
-"""Meanings in published episodes."""
-ALL_MEANINGS = (*MEANINGS, "smaller", "larger")
 NUM_COMPARISONS = 3
 _NO_ID = 0  # of objects in the prompt only
 _ORIGIN = Pose((0.0, 0.0, 0.0))  # object images have a pose of their own
@@ -86,60 +63,37 @@ class AdjectiveExample:
     """Comparisons that define an adjective, and the attribute that the prompt asks for.
 
     Args:
-        text: The comparisons.
-        fills: Values of their slots and of the slots `adv` and `novel_adj` of the request.
+        fills: Values of the slots of `COMPARISONS`, and of the slots `adv` and `novel_adj` of the request.
         asked: Attribute of the target.
         other: Attribute of its twin.
     """
 
-    text: str
     fills: dict[str, ObjectImage | str]
     asked: Attribute
     other: Attribute
 
 
-def comparison_text(num_comparisons: int = NUM_COMPARISONS) -> str:
-    """Return the comparisons, with their slots."""
-    return " ".join(
-        f"{{demo_blicker_obj_{n}}} is {{novel_adj}} than {{demo_less_blicker_obj_{n}}}."
-        for n in range(1, num_comparisons + 1)
-    )
+COMPARISONS = " ".join(
+    f"{{demo_blicker_obj_{n}}} is {{novel_adj}} than {{demo_less_blicker_obj_{n}}}."
+    for n in range(1, NUM_COMPARISONS + 1)
+)
 
 
-def sample_adjective_example(
-    table: TableSampler,
-    *,
-    adjectives: str | Sequence[str],
-    meanings: str | Sequence[str],
-    num_comparisons: int,
-) -> AdjectiveExample:
-    """Draw an adjective, its meaning, and pairs of objects that illustrate it.
-
-    Word, meaning and whether the request says "less" are independent.
-
-    Args:
-        table: Source of objects and textures; nothing is placed.
-        adjectives: Invented words to choose from.
-        meanings: Possible meanings, out of `ALL_MEANINGS`.
-        num_comparisons: Number of pairs, 1 … 9.
-
-    Raises:
-        ConfigError: An option is invalid, or a texture of the pool has no light and dark variant.
-    """
-    check_count("num_comparisons", num_comparisons, low=1, high=9)
-    (adjective,) = choose_words(table, "adjectives", adjectives)
-    meaning = table.choose(_checked_meanings(table, meanings))
+def sample_adjective_example(table: TableSampler) -> AdjectiveExample:
+    """Draw an adjective, its meaning, and pairs of objects that illustrate it."""
+    (adjective,) = choose_words(table, ADJECTIVES)
+    meaning = table.choose(MEANINGS)
     more, less = _attributes(table, meaning)
     is_flipped = table.choose((False, True))
     fills: dict[str, ObjectImage | str] = {"adv": "less " if is_flipped else "", "novel_adj": adjective}
-    for n in range(1, num_comparisons + 1):
+    for n in range(1, NUM_COMPARISONS + 1):
         object_name = table.choose(table.pool.dragged_objects)
         texture = table.choose(table.pool.dragged_textures)
         size = table.sample_size(object_name)
         for slot, attribute in ((f"demo_blicker_obj_{n}", more), (f"demo_less_blicker_obj_{n}", less)):
             fills[slot] = _image(object_name, attribute.texture(texture), size, attribute.scale)
     asked, other = (less, more) if is_flipped else (more, less)
-    return AdjectiveExample(comparison_text(num_comparisons), fills, asked, other)
+    return AdjectiveExample(fills, asked, other)
 
 
 def place_base_and_pair(
@@ -186,31 +140,10 @@ def _attributes(table: TableSampler, meaning: str) -> tuple[Attribute, Attribute
     if meaning in ("shorter", "taller"):
         height = table.rng.uniform(0.3, 0.4)
         low, high = Attribute((1.0, 1.0, height)), Attribute((1.0, 1.0, height + 2.0))
-    elif meaning in ("smaller", "larger"):
-        width = table.rng.uniform(0.55, 0.6)
-        low, high = Attribute((width, width, 1.0)), Attribute((width + 0.4, width + 0.4, 1.0))
     else:
         low, high = Attribute(shade="light"), Attribute(shade="dark")
-    return (low, high) if meaning in ("shorter", "smaller", "lighter") else (high, low)
+    return (low, high) if meaning in ("shorter", "lighter") else (high, low)
 
 
 def _image(object_name: str, texture: str, size: Vector3, scale: Vector3) -> ObjectImage:
     return ObjectImage(Placement(_NO_ID, object_name, texture, size, _ORIGIN, scale=scale))
-
-
-def _checked_meanings(table: TableSampler, meanings: str | Sequence[str]) -> tuple[str, ...]:
-    if not isinstance(meanings, Iterable):
-        raise ConfigError(f"meanings is {meanings!r}; give some of {', '.join(ALL_MEANINGS)}.")
-    listed = (meanings,) if isinstance(meanings, str) else tuple(meanings)
-    for meaning in listed or ("",):
-        if meaning not in ALL_MEANINGS:
-            raise ConfigError(unknown_name("meaning", meaning, ALL_MEANINGS))
-    if {"lighter", "darker"} & set(listed):
-        specs = [texture_spec(texture) for texture in table.pool.dragged_textures]
-        plain = [spec.name for spec in specs if not (spec.is_dark or spec.dark_variant)]
-        if plain:
-            raise ConfigError(
-                f"{', '.join(plain)} have no light and dark variant, which the meanings lighter "
-                f"and darker need; give other textures."
-            )
-    return listed

@@ -44,12 +44,11 @@ def template(num_targets: int) -> str:
     oracle_max_steps=4,
     distractors_allowed=True,
 )
-def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "easy") -> Problem:
+def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
-        same_bases: Whether all bases have one shape and size and differ in texture only.
         difficulty: "easy" and "medium" ask for two bases, "hard" for three.
     """
     check_difficulty(difficulty)
@@ -57,18 +56,15 @@ def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "e
     centres = [_cell_centre(row, column) for row in range(NUM_ROWS) for column in range(NUM_COLUMNS)]
     centres = [centres[index] for index in table.rng.permutation(len(centres))]
     name, texture = table.choose(pool.dragged_objects), table.choose(pool.dragged_textures)
-    num_shapes = 1 if same_bases else len(centres)
-    shapes = [table.choose(pool.base_objects) for _ in range(num_shapes)] * (len(centres) // num_shapes)
+    shape = table.choose(pool.base_objects)
     textures = table.rng.choice(pool.base_textures, size=len(centres), replace=False).tolist()
-    size = table.sample_size(name)
-    base_sizes = {shape: table.sample_size(shape) for shape in dict.fromkeys(shapes)}
+    size, base_size = table.sample_size(name), table.sample_size(shape)
 
     def add_base(index: int) -> Placement:
-        shape = shapes[index]
-        return table.add(shape, textures[index], size=base_sizes[shape], pose=centres[index], fixed=True)
+        return table.add(shape, textures[index], size=base_size, pose=centres[index], fixed=True)
 
     if table.compat:
-        z = (2.0 if shapes[0] in _DEEP_BASES else 0.5) * size[2]
+        z = (2.0 if shape in _DEEP_BASES else 0.5) * size[2]
         dragged = table.add(name, texture, size=size, pose=centres[0], fixed=False, z=z)
         source = add_base(0)
     else:

@@ -7,7 +7,7 @@ from openvima.catalog import Pool
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.table import TableSampler, is_in_the_way
 
 TOLERANCE = Tolerance(position_m=0.1)
@@ -89,23 +89,16 @@ _TRIES = 20  # for all objects together
 _SPARE_STEPS = 2
 
 
-def object_counts(difficulty: str, num_dragged: int | None, num_distractors: int | None) -> tuple[int, int]:
-    """Return the number of objects to gather and of distractors.
-
-    Args:
-        difficulty: Default for numbers that are None.
-        num_dragged: 1 … 3.
-        num_distractors: 0 … 6.
+def object_counts(difficulty: str, num_distractors: int | None) -> tuple[int, int]:
+    """Return the number of objects to gather and of distractors, by default that of the difficulty.
 
     Raises:
         ConfigError: An option is invalid.
     """
     check_difficulty(difficulty)
-    num_dragged = NUM_DRAGGED[difficulty] if num_dragged is None else num_dragged
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
-    check_count("num_dragged", num_dragged, low=1, high=3)
     check_num_distractors(num_distractors)
-    return num_dragged, num_distractors
+    return NUM_DRAGGED[difficulty], num_distractors
 
 
 def gathering_problem(

@@ -22,7 +22,6 @@ TEMPLATE = "Put all objects with the same profile as {base_obj} into it."
 def sample(
     table: TableSampler,
     *,
-    num_dragged: int | None = None,
     num_distractors: int | None = None,
     after_bowl: bool | None = None,
     difficulty: str = "easy",
@@ -31,12 +30,11 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        num_dragged: Objects to put into the base, 1 … 3; by default that of the difficulty.
         num_distractors: Distractors, 0 … 6; by default that of the difficulty.
         after_bowl: Whether the bowl's tolerance applies to every base; see `gathering_problem`.
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
-    counts = object_counts(difficulty, num_dragged, num_distractors)
+    counts = object_counts(difficulty, num_distractors)
     pool = table.pool
     by_base = {name: _by_profile(pool, name) for name in pool.base_objects}
     texture = table.choose(pool.base_textures)

@@ -19,7 +19,6 @@ TEMPLATE = "Put all objects with the same texture as {base_obj} into it."
 def sample(
     table: TableSampler,
     *,
-    num_dragged: int | None = None,
     num_distractors: int | None = None,
     after_bowl: bool | None = None,
     difficulty: str = "easy",
@@ -28,12 +27,11 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        num_dragged: Objects to put into the base, 1 … 3; by default that of the difficulty.
         num_distractors: Distractors, 0 … 6; by default that of the difficulty.
         after_bowl: Whether the bowl's tolerance applies to every base; see `gathering_problem`.
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
-    counts = object_counts(difficulty, num_dragged, num_distractors)
+    counts = object_counts(difficulty, num_distractors)
     pool = table.pool
     texture = table.choose(pool.base_textures)
     base = table.place_one("base", lambda: (table.choose(pool.base_objects), texture))

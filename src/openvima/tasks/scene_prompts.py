@@ -17,19 +17,6 @@ Frame = Sequence[Placement]
 """The objects to imitate, in the same order in all frames, with their ids on the table."""
 
 
-def checked_num_frames(num_frames: int | None, difficulty: str, *, high: int) -> int:
-    """Return the number of frames, by default that of the difficulty.
-
-    Raises:
-        ConfigError: The difficulty is unknown, or the number is not in 2 … `high`.
-    """
-    check_difficulty(difficulty)
-    if num_frames is None:
-        return NUM_FRAMES[difficulty]
-    check_count("num_frames", num_frames, low=2, high=high)
-    return num_frames
-
-
 def with_frame_slots(template: str, num_frames: int) -> str:
     """Replace the slot {frames} of a template by {frame_0} {frame_1} …."""
     slots = " ".join(f"{{{name}}}" for name in _names(num_frames))

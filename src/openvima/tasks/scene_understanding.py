@@ -8,7 +8,7 @@ Source:   VIMA paper, task list of the appendix, "Scene understanding".
 """
 
 from openvima.scene import Placement, Problem, Prompt, SceneImage
-from openvima.tasks.options import check_count, check_num_distractors, textures_by_difficulty
+from openvima.tasks.options import check_num_distractors, textures_by_difficulty
 from openvima.tasks.placing import APART_M, into_base, place_base_and_target
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -23,7 +23,6 @@ def sample(
     table: TableSampler,
     *,
     num_distractors: int = 1,
-    num_prompt_distractors: int = 1,
     difficulty: str = "easy",
 ) -> Problem:
     """Sample one problem.
@@ -31,11 +30,9 @@ def sample(
     Args:
         table: Sampler of the scene.
         num_distractors: Distractors on the table, 0 … 6.
-        num_prompt_distractors: Distractors in the scene image, 0 … 3.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
     check_num_distractors(num_distractors)
-    check_count("num_prompt_distractors", num_prompt_distractors, high=3)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     textures = (*dragged_textures, *base_textures)
 
@@ -59,23 +56,22 @@ def sample(
     prompt = Prompt.parse(
         TEMPLATE,
         dragged_texture=target.texture,
-        scene=_prompt_scene(table, target, textures, num_prompt_distractors),
+        scene=_prompt_scene(table, target, textures),
         base_texture=base.texture,
     )
     return into_base(table, prompt, target=target, base=base, distractors=distractors)
 
 
-def _prompt_scene(
-    table: TableSampler, target: Placement, textures: tuple[str, ...], num_distractors: int
-) -> SceneImage:
-    """Sample an image of the target among objects of other textures."""
+def _prompt_scene(table: TableSampler, target: Placement, textures: tuple[str, ...]) -> SceneImage:
+    """Sample an image of the target beside an object of another texture."""
     sampler, objects = table.blank(), (*table.pool.dragged_objects, *table.pool.base_objects)
     others = [texture for texture in textures if texture != target.texture]
+
+    def draw() -> tuple[str, str]:
+        return sampler.choose(objects), sampler.choose(others)
+
     sampler.place_one("prompt object", lambda: (target.object, target.texture), size=target.size)
-    sampler.place(
-        "prompt distractor",
-        lambda: (sampler.choose(objects), sampler.choose(others)),
-        count=num_distractors,
-        tries=num_distractors + 10,
+    sampler.place_one(
+        "prompt distractor", lambda: (sampler.choose(objects), sampler.choose(others)), tries=11
     )
     return SceneImage.of(sampler.placements)

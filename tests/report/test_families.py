@@ -1,4 +1,4 @@
-"""Families, the drop over levels, rated ablations, and published rates by task."""
+"""Families, and published rates by task."""
 
 from dataclasses import replace
 
@@ -8,10 +8,9 @@ from openvima.catalog.partitions import PUBLISHED_TASKS
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.report import write_report
-from openvima.report.ablations import rate_figures
-from openvima.report.published import models_by_task, published_task_table, published_tasks
+from openvima.report.published import models_by_task, published_task_table
 from openvima.report.table import Estimate, Table
-from openvima.report.tables import FAMILIES, family_table, level_drop_table, level_figure
+from openvima.report.tables import FAMILIES, family_table
 from openvima.tasks import task_spec
 
 
@@ -45,29 +44,6 @@ def test_family_means_weight_tasks_alike_and_leave_unknown_tasks_out():
     assert family_table(results, published=False).columns == ("family", "level", "mine")
 
 
-def whole(policy: str, **solved: int) -> tuple[Row, ...]:
-    return tuple(
-        row(policy, task, level, n) for level, n in solved.items() for task in published_tasks(level)
-    )
-
-
-def test_the_drop_is_absolute_and_relative_with_intervals_and_published_ones_beside():
-    results = Results((*whole("mine", L1=16, L2=15, L4=4), *whole("bad", L1=0, L4=0)))
-    table = level_drop_table(results)
-    assert table and table.columns == ("policy", "L1", "L4", "change (points)", "relative change (%)")
-    drops = cells(table)
-    assert drops["mine"] == ["80.0", "20.0", "−60.0", "−75.0"]
-    assert drops["bad"] == ["0.0", "0.0", "+0.0", "–"]
-    assert drops["MIDAS 92M (published) 97.8"] == ["97.8", "59.1", "−38.7", "−39.6"]
-    change = table.lines[0].cells[2]
-    assert isinstance(change, Estimate) and -0.7 < change.interval[0] < -0.6 < change.interval[1] < -0.4
-    bare = level_drop_table(results, published=False)
-    assert bare and [line.name for line in bare.lines] == ["mine", "bad"]
-    figure = level_figure(results)
-    assert figure and [p.x for p in figure.curves["mine"].points] == [0, 1, 2]
-    assert [figure.tick(x) for x in (0.0, 1.0, 2.0)] == ["L1", "L2", "L4"]
-
-
 @pytest.fixture
 def ablated() -> Results:
     plain = [row("mine", task, "L1", n) for task, n in (("rotate", 20), ("twist", 10))]
@@ -78,20 +54,6 @@ def ablated() -> Results:
     full = [row("mine", "rotate", "L1", 6, "num_distractors:6")]
     other = [row("mine", "rotate", "L1", 1, name) for name in ("no_prompt", "masked_words:1+noisy_boxes:3")]
     return Results((*plain, *masked, *more, *crowded, *full, *other))
-
-
-def test_rates_become_curves_with_the_plain_score_at_zero(ablated):
-    masked, crowded = rate_figures(ablated)
-    assert masked.quantity == "masked words" and [panel.title for panel in masked.panels] == ["L1 (2 tasks)"]
-    (curve,) = masked.panels[0].curves
-    assert [(point.x, round(point.rate, 3)) for point in curve.points] == [(0, 0.75), (0.5, 0.3), (1, 0)]
-    assert curve.points[0].interval == mean_of_rates([(20, 20), (10, 20)])[1]
-
-    assert crowded.quantity == "number of distractors"
-    default, curve = crowded.panels[0].curves
-    assert crowded.panels[0].title == "L1 (1 task)"
-    assert [(crowded.tick(point.x), point.rate) for point in default.points] == [("default", 1)]
-    assert [(point.x, round(point.rate, 3)) for point in curve.points] == [(2, 0.6), (6, 0.3)]
 
 
 def test_all_published_rates_by_task_stand_beside_measured_ones():
@@ -109,9 +71,9 @@ def test_all_published_rates_by_task_stand_beside_measured_ones():
 def test_the_page_shows_all_of_them(ablated, tmp_path):
     more = replace(ablated, rows=(*ablated.rows, row("mine", "rotate", "L3", 3)))
     text = write_report(more, tmp_path / "report.html").read_text("utf-8")
-    assert all(f'<section id="{name}">' in text for name in ("families", "drop", "rates", "ablations"))
+    assert all(f'<section id="{name}">' in text for name in ("families", "published", "ablations"))
     assert "All published rates by task" in text and "reliability" in text.lower()
     assert "masked words 1 + noisy boxes 3" in text
     plain = replace(ablated, rows=ablated.rows[:2], config={"prompts": "text"})
     text = write_report(plain, tmp_path / "plain.html").read_text("utf-8")
-    assert not any(f'<section id="{name}">' in text for name in ("drop", "rates", "published"))
+    assert not any(f'<section id="{name}">' in text for name in ("published",))
