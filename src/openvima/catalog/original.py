@@ -1,24 +1,22 @@
 """The original asset pack: meshes, textures and collision shapes of VIMA-Bench, and their import.
 
-Files come from a checkout, or from the archive of an import in the cache. Every file is compared with a known
-hash, so that an incomplete or different pack is reported.
+Files come from a checkout, or from copies in the cache. Every file is compared with a known hash, so that an
+incomplete or different pack is reported.
 """
 
 import contextlib
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 
-from openvima.atomic_io import atomic_write
+from openvima.atomic_io import atomic_write, atomic_write_file
 from openvima.catalog.bodies import BOX_SHAPES, fixed_geometry
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
 from openvima.catalog.mesh_files import ObjMesh, parse_obj
@@ -30,29 +28,12 @@ from openvima.errors import AssetError
 from openvima.input_files import cache_dir
 
 PACK_FOLDER = Path("vima_bench/tasks/assets")  # inside a checkout
-ARCHIVE_NAME = "original-pack-1.zip"  # the number is that of the archive's layout
-IMPORT_COMMAND = "openvima assets import CHECKOUT"
 _TEXT_SUFFIXES = (".obj", ".urdf")
 
 
-class PackFiles(Protocol):
-    """The files of an original pack; instances with the same files are equal."""
-
-    def read(self, relative_path: str) -> bytes:
-        """Return a file's content, as in the original benchmark.
-
-        Args:
-            relative_path: One of `known_hashes`.
-
-        Raises:
-            AssetError: The file is missing, unreadable, damaged or of another version.
-        """
-        ...
-
-
 @dataclass(frozen=True, slots=True)
-class CheckoutFiles:
-    """The files of a checkout of the original benchmark.
+class PackFiles:
+    """The files of an original pack.
 
     Args:
         folder: The pack's folder, absolute.
@@ -60,8 +41,8 @@ class CheckoutFiles:
 
     folder: Path
 
-    @classmethod
-    def within(cls, checkout: str | Path) -> "CheckoutFiles":
+    @staticmethod
+    def within(checkout: str | Path) -> "PackFiles":
         """Find the pack in a checkout.
 
         Args:
@@ -77,75 +58,50 @@ class CheckoutFiles:
                 f"{checkout} holds no original asset pack ({PACK_FOLDER}/textures is missing); "
                 "give the folder of a VIMABench checkout."
             )
-        return cls(folder.resolve())
+        return PackFiles(folder.resolve())
 
-    def read(self, relative_path: str) -> bytes:
-        """Return a file's content; see `PackFiles.read`."""
-        path = self.folder / relative_path
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise AssetError(
-                f"{path} is missing or unreadable; complete the checkout of VIMABench."
-            ) from error
-        original = _as_original(content, relative_path)
-        if original is None:
-            raise AssetError(
-                f"{path} differs from the file of the original benchmark (damaged, or another version); "
-                "restore it from a fresh checkout of VIMABench."
-            )
-        return original
-
-
-@dataclass(frozen=True, slots=True)
-class ImportedFiles:
-    """The files that were imported into the cache.
-
-    Args:
-        archive: The archive.
-        stamp: Identifies the version of the archive.
-    """
-
-    archive: Path
-    stamp: tuple[int, ...]
-
-    @classmethod
-    def present(cls) -> "ImportedFiles":
+    @staticmethod
+    def imported() -> "PackFiles":
         """Find the imported pack.
 
         Raises:
             AssetError: None was imported.
         """
-        archive = cache_dir() / ARCHIVE_NAME
-        try:
-            status = archive.stat()
-        except OSError:
+        if not imported_folder().is_dir():
             raise AssetError(
-                f"the original asset pack has not been imported ({archive} is missing). Run "
-                f"`{IMPORT_COMMAND}` with the folder of a VIMABench checkout, or use the pack 'procedural'."
-            ) from None
-        return cls(archive, (status.st_mtime_ns, status.st_size, status.st_ino))
+                f"the original asset pack has not been imported ({imported_folder()} is missing). Run "
+                "`openvima assets import CHECKOUT` with the folder of a VIMABench checkout, or use the pack "
+                "'procedural'."
+            )
+        return PackFiles(imported_folder())
 
     def read(self, relative_path: str) -> bytes:
-        """Return a file's content; see `PackFiles.read`."""
+        """Return a file's content, as in the original benchmark.
+
+        Args:
+            relative_path: One of `known_hashes`.
+
+        Raises:
+            AssetError: The file is missing, unreadable, damaged or of another version.
+        """
+        path = self.folder / relative_path
+        advice = "restore it from a fresh checkout of VIMABench, or by `openvima assets import CHECKOUT`"
         try:
-            with zipfile.ZipFile(self.archive) as archive:
-                content = archive.read(relative_path)
-        except KeyError:
+            content = path.read_bytes()
+        except OSError as error:
+            raise AssetError(f"{path} is missing or unreadable; {advice}.") from error
+        original = _as_original(content, relative_path)
+        if original is None:
             raise AssetError(
-                f"the imported original pack lacks {relative_path}, which the checkout did not hold or held "
-                f"damaged; complete the checkout of VIMABench and run `{IMPORT_COMMAND}` again."
-            ) from None
-        except (OSError, zipfile.BadZipFile) as error:
-            raise AssetError(
-                f"{relative_path} cannot be read from {self.archive} ({error}); run `{IMPORT_COMMAND}` again."
-            ) from error
-        if _as_original(content, relative_path) is None:
-            raise AssetError(
-                f"{relative_path} in {self.archive} differs from the file of the original benchmark; "
-                f"run `{IMPORT_COMMAND}` again."
+                f"{path} differs from the file of the original benchmark (damaged, or another version); "
+                f"{advice}."
             )
-        return content
+        return original
+
+
+def imported_folder() -> Path:
+    """Return where an import keeps its files."""
+    return cache_dir() / "original-pack-2"
 
 
 @lru_cache(maxsize=1)
@@ -166,92 +122,34 @@ def _as_original(content: bytes, relative_path: str) -> bytes | None:
 
 Report = Callable[[int, int, str], None]
 
-_PROBLEMS_MEMBER = "problems.json"
-_DATE = (1980, 1, 1, 0, 0, 0)  # the same checkout gives the same archive
 
-
-@dataclass(frozen=True, slots=True)
-class ImportedPack:
-    """Result of an import.
-
-    Args:
-        archive: The archive in the cache.
-        files: Imported files, as paths in the pack.
-        problems: One sentence for each missing file.
-    """
-
-    archive: Path
-    files: tuple[str, ...]
-    problems: tuple[str, ...]
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether every file was imported."""
-        return not self.problems
-
-
-def import_pack(checkout: str | Path, report: Report | None = None) -> ImportedPack:
-    """Import the original asset pack for `load_assets("original")`.
-
-    Missing or damaged files are reported. An earlier import is replaced atomically.
+def import_pack(checkout: str | Path, report: Report | None = None) -> list[str]:
+    """Import the original asset pack for `load_assets("original")`: copy what has the known hash.
 
     Args:
         checkout: Folder of a checkout of the original benchmark, or its assets folder.
         report: Called with the number of files done, the total, and the last name.
 
     Returns:
-        Imported files and problems.
+        One sentence for each file that is missing or damaged.
 
     Raises:
         AssetError: The folder contains no asset pack, or only damaged files.
         OSError: The cache cannot be written to.
     """
-    source = CheckoutFiles.within(checkout)
-    contents: dict[str, bytes] = {}
-    problems = []
+    source = PackFiles.within(checkout)
+    problems: list[str] = []
     for done, relative_path in enumerate(known_hashes(), start=1):
         try:
             decode_file(source, relative_path)
-            contents[relative_path] = source.read(relative_path)
+            atomic_write_file(imported_folder() / relative_path, source.read(relative_path))
         except AssetError as error:
             problems.append(str(error))
         if report:
             report(done, len(known_hashes()), relative_path)
-    if not contents:
+    if len(problems) == len(known_hashes()):
         raise AssetError(f"none of the {len(problems)} files in {source.folder} is sound; {problems[0]}")
-    archive = cache_dir() / ARCHIVE_NAME
-    _write_archive(archive, contents, problems)
-    return ImportedPack(archive, tuple(contents), tuple(problems))
-
-
-def imported_pack() -> ImportedPack | None:
-    """Return the result of the last import, or None.
-
-    Raises:
-        AssetError: The archive is damaged.
-    """
-    try:
-        archive = ImportedFiles.present().archive
-    except AssetError:
-        return None
-    try:
-        with zipfile.ZipFile(archive) as file:
-            problems = json.loads(file.read(_PROBLEMS_MEMBER))
-            names = tuple(name for name in file.namelist() if name in known_hashes())
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise AssetError(
-            f"{archive} is damaged ({error}); delete it, or import the pack again with "
-            "`openvima assets import CHECKOUT`."
-        ) from error
-    return ImportedPack(archive, names, tuple(problems))
-
-
-def _write_archive(archive: Path, contents: dict[str, bytes], problems: list[str]) -> None:
-    archive.parent.mkdir(parents=True, exist_ok=True)
-    members = {**contents, _PROBLEMS_MEMBER: json.dumps(problems, indent=1).encode()}
-    with atomic_write(archive) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as packed:
-        for name, content in members.items():
-            packed.writestr(zipfile.ZipInfo(name, _DATE), content)
+    return problems
 
 
 # Scales of meshes of fixed size, metres per mesh unit, and the height at which their origin rests.
@@ -298,7 +196,7 @@ class OriginalAssets:
     name = "original"
 
     def __init__(self, source: "str | Path | PackFiles") -> None:
-        self.files = CheckoutFiles.within(source) if isinstance(source, str | Path) else source
+        self.files = PackFiles.within(source) if isinstance(source, str | Path) else source
 
     def __repr__(self) -> str:
         return f"OriginalAssets({self.files!r})"

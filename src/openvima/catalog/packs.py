@@ -133,9 +133,9 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
     if assets == "procedural":
         return procedural_assets()
     if assets == "original":
-        from openvima.catalog.original import ImportedFiles
+        from openvima.catalog.original import PackFiles
 
-        return _original(ImportedFiles.present())
+        return _original(PackFiles.imported())
     if is_code(str(assets)):
         return load_user_assets(str(assets))
     folder = as_path(assets)

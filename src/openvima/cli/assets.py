@@ -51,18 +51,15 @@ def import_(
     Returns:
         Exit status: 0 everything was imported, 1 files are missing.
     """
-    from openvima.catalog.original import import_pack
+    from openvima.catalog.original import import_pack, imported_folder, known_hashes
 
     with progress_bar("original assets") as report:
-        pack = import_pack(checkout, report)
-    total = len(pack.files) + len(pack.problems)
-    print(f"{len(pack.files)} of {total} files imported into {pack.archive}")
-    if pack.is_complete:
-        print("--assets original uses them.", file=sys.stderr)
-        return 0
-    _list_problems(pack.problems)
-    print("What needs no missing file works with --assets original.", file=sys.stderr)
-    return 1
+        problems = import_pack(checkout, report)
+    total = len(known_hashes())
+    print(f"{total - len(problems)} of {total} files imported into {imported_folder()}")
+    _list_problems(problems)
+    print("--assets original uses what is there.", file=sys.stderr)
+    return 1 if problems else 0
 
 
 def info() -> int:
@@ -75,29 +72,29 @@ def info() -> int:
     """
     from openvima.catalog import OBJECTS, TEXTURES
     from openvima.catalog.objects import REGISTERED_OBJECTS
-    from openvima.catalog.original import imported_pack
+    from openvima.catalog.original import OriginalAssets, imported_folder, known_hashes
     from openvima.catalog.textures import REGISTERED_TEXTURES
     from openvima.input_files import cache_dir
     from openvima.tasks import list_tasks
 
-    pack = imported_pack()
+    problems = None if not imported_folder().is_dir() else OriginalAssets(imported_folder()).problems()
     print(f"procedural  made by code: {len(OBJECTS)} objects, {len(TEXTURES)} textures")
     list_tasks()  # files of tasks may register objects and textures
     if own := [*REGISTERED_OBJECTS, *REGISTERED_TEXTURES]:
         num_objects = len(REGISTERED_OBJECTS)
         print(f"registered  {num_objects} objects, {len(own) - num_objects} textures: {', '.join(own)}")
-    if pack is None:
+    if problems is None:
         print("original    not imported; `openvima assets import CHECKOUT` reads it from a checkout")
     else:
-        total = len(pack.files) + len(pack.problems)
-        print(f"original    {len(pack.files)} of {total} files imported: {pack.archive}")
+        total = len(known_hashes())
+        print(f"original    {total - len(problems)} of {total} files imported: {imported_folder()}")
     size_mb = sum(file.stat().st_size for file in cache_dir().rglob("*") if file.is_file()) / 1e6
     print(f"cache       {size_mb:.0f} MB in {cache_dir()}; all but the import is made anew when needed")
-    _list_problems(pack.problems if pack else ())
+    _list_problems(problems or [])
     return 0
 
 
-def _list_problems(problems: tuple[str, ...]) -> None:
+def _list_problems(problems: list[str]) -> None:
     if problems:
         print(f"{len(problems)} not imported:", file=sys.stderr)
     for problem in problems:

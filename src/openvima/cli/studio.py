@@ -1,7 +1,6 @@
 """`openvima studio`: episodes, policies and data in a browser."""
 
 import logging
-import os
 import sys
 import threading
 import webbrowser
@@ -27,8 +26,6 @@ def main(
     task_options: str = "",
     device: str = "cpu",
     trust_code: bool = False,
-    host: str = "127.0.0.1",
-    token: str | None = None,
 ) -> int:
     """Open the studio until Ctrl-C: step through episodes, ask policies why, compose, act, browse.
 
@@ -51,15 +48,11 @@ def main(
         device: Where networks compute: cpu, in float64, or cuda, in float32.
         trust_code: Run the code that run folders name, as those of learners of your own do, and
             that which results name as their detector.
-        host: Interface to listen on. Any but the loopback interface needs a token.
-        token: Word that the page asks for; by default that of the environment variable OPENVIMA_SERVE_TOKEN.
-            Who knows it can run code on this machine.
 
     Returns:
         Exit status.
     """
     from openvima.imports import import_extra
-    from openvima.serving.protocol import TOKEN_VARIABLE
 
     for module in ("viser", "trimesh"):
         import_extra(module, f"the studio needs {module}; install it with: pip install 'openvima[studio]'")
@@ -74,9 +67,7 @@ def main(
         EnvConfig(assets, compat, prompts, task_options),
         device,
         trust_code,
-        host,
         port,
-        token or os.environ.get(TOKEN_VARIABLE) or None,
     )
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     with closing(Studio(config)) as studio:

@@ -1,11 +1,9 @@
-"""Episodes as arguments of `compose`: to change one thing at a time, to repeat as Python or a command."""
+"""Episodes as arguments of `compose`: to change one thing at a time."""
 
 import itertools
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pprint import pformat
 from typing import Any  # arguments of `compose`
 
 import numpy as np
@@ -15,11 +13,8 @@ from openvima.catalog import OBJECTS, object_spec
 from openvima.catalog.geometry import Assets
 from openvima.env.composed_objects import FIELDS, FIXED_OBJECTS, SCALES, SceneObject, scene_objects
 from openvima.env.composing import compose
-from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.env.episode_file import episode_values, yaml_text
-from openvima.errors import OpenVimaError, SceneError, brief_repr
+from openvima.errors import SceneError, brief_repr
 from openvima.scene import (
-    COMPOSED,
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
     AtPose,
@@ -32,10 +27,8 @@ from openvima.scene import (
     PromptFill,
 )
 
-POLICY = "openvima-small"
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _DECIMALS = 6  # of positions and angles that `compose` was given, which come back exactly
-_JOIN = ",\n    "
 
 
 def compose_values(episode: Episode) -> dict[str, Any]:
@@ -72,95 +65,6 @@ def compose_values(episode: Episode) -> dict[str, Any]:
         "max_steps": episode.max_steps,
         "end_effector": problem.scene.end_effector,
     }
-
-
-def python_code(episode: Episode, *, policy: str = POLICY, env_config: EnvConfig = DEFAULT_ENV_CONFIG) -> str:
-    """Return a Python program that plays an episode.
-
-    Args:
-        episode: A sampled or composed episode.
-        policy: Name of the policy.
-        env_config: Settings that it was sampled with.
-    """
-    assets = "" if env_config.assets == "procedural" else f", assets={env_config.assets!r}"
-    if _is_sampled(episode, env_config):
-        config = {"assets": env_config.assets, "compat": env_config.compat, "prompts": env_config.prompts}
-        published = {"assets": "procedural", "compat": False, "prompts": "multimodal"}
-        options = {"level": episode.level, "seed": episode.seed, "domain": episode.domain}
-        options |= {name: value for name, value in config.items() if value != published[name]}
-        options |= env_config.options(episode.task)
-        arguments = ", ".join([repr(episode.task), *(f"{name}={value!r}" for name, value in options.items())])
-        head = "import openvima\nfrom openvima.tasks import sample_episode\n"
-        made = f"sample_episode({arguments})"
-    elif values := _repeatable(episode, env_config):
-        given = {name: value for name, value in values.items() if name not in ("objects", "prompt") and value}
-        lines = [_formatted(values["objects"]), repr(values["prompt"])]
-        lines += [f"{name}={_formatted(value)}" for name, value in given.items()]
-        lines += [assets[2:]] if assets else []
-        head, made = "import openvima\n", f"openvima.compose(\n    {_JOIN.join(lines)},\n)"
-    else:
-        head = "import openvima\nfrom openvima.env.episode_file import episode_from_values\n"
-        made = f"episode_from_values(\n    {_formatted(episode_values(episode))}\n)"
-    compat = ", compat=True" if env_config.compat else ""
-    played = f"result = openvima.play(episode, {policy!r}{assets}{compat})\nprint(result.outcome)\n"
-    return f"{head}\nepisode = {made}\n{played}"
-
-
-def shell_command(
-    episode: Episode, *, policy: str = POLICY, env_config: EnvConfig = DEFAULT_ENV_CONFIG
-) -> str:
-    """Return a shell command that records a video of an episode, and writes the episode to a file if need be.
-
-    Args:
-        episode: A sampled or composed episode.
-        policy: Name of the policy.
-        env_config: Settings that it was sampled with.
-    """
-    options = ["--policy", policy]
-    if env_config.assets != "procedural":
-        options += ["--assets", env_config.assets]
-    options += ["--compat"] if env_config.compat else []
-    if episode.domain == "user" and _is_sampled(episode, env_config):
-        options += [] if env_config.prompts == "multimodal" else ["--prompts", env_config.prompts]
-        options += ["--task-options", env_config.task_options] if env_config.task_options else []
-        start = [episode.task, "--level", episode.level, "--seed", str(episode.seed)]
-        return shlex.join(["openvima", "demo", *start, *options, "--out", f"{episode.task}.mp4"]) + "\n"
-    values = _repeatable(episode, env_config)
-    text = yaml_text(episode_values(episode) if values is None else _plain(values))
-    command = ["openvima", "demo", "--episode", "episode.yaml", *options, "--out", "episode.mp4"]
-    return f"cat > episode.yaml <<'END'\n{text}END\n{shlex.join(command)}\n"
-
-
-def _is_sampled(episode: Episode, env_config: EnvConfig) -> bool:
-    """Whether the task samples the episode for its seed."""
-    if episode.task == COMPOSED:
-        return False
-    try:
-        return episode == env_config.sample(episode.task, episode.level, episode.seed, domain=episode.domain)
-    except OpenVimaError:
-        return False
-
-
-def _repeatable(episode: Episode, env_config: EnvConfig) -> dict[str, Any] | None:
-    """Return arguments of `compose` that give this very episode, if any in plain values do."""
-    try:
-        values = compose_values(episode)
-        is_same = compose(**values, assets=env_config.assets) == episode
-    except OpenVimaError:
-        return None
-    has_photo = any(isinstance(image, PhotoImage) for image in values["images"].values())
-    return values if is_same and not has_photo else None
-
-
-def _plain(value: Any) -> Any:
-    """Return arguments of `compose` as a file holds them, without empty ones."""
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items() if entry not in ({}, [])}
-    return [_plain(entry) for entry in value] if isinstance(value, tuple | list) else value
-
-
-def _formatted(value: Any) -> str:
-    return pformat(value, width=100, sort_dicts=False).replace("\n", "\n    ")
 
 
 def _handles(placements: Sequence[Placement], fills: Sequence[tuple[str, PromptFill]]) -> dict[int, str]:
@@ -376,15 +280,6 @@ class Composition:
         shown = f"{{{slot}}}"
         prompt = self.prompt if shown in self.prompt else f"{self.prompt} {shown}"
         return replace(self, prompt=prompt, images={**self.images, slot: image})
-
-    def alone(self, handle: str, assets: Assets) -> Placement:
-        """Return an object where it would be, also if it overlaps others.
-
-        Raises:
-            SceneError: It is outside the workspace.
-        """
-        single = Composition((self[handle],), "-", end_effector=self.end_effector)
-        return single.episode(assets).problem.scene.placements[0]
 
     def scene_image(self) -> list[tuple[str, str, tuple[float, float], float]]:
         """Return the present arrangement in the form of a prompt image of a whole scene."""

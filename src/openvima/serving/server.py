@@ -111,19 +111,17 @@ class ServerConfig:
         check_prompts(self.prompts)
 
 
-def is_own_page(headers: Mapping[str, str], *, any_host: bool) -> bool:
-    """Whether a browser opens a WebSocket from a page of the same server.
+def is_own_page(headers: Mapping[str, str]) -> bool:
+    """Whether a browser opens a WebSocket from a page of the same server, under a name of this machine alone.
 
-    Pages of other sites could open one to the loopback interface, or give a name of theirs its address.
+    Other sites could give a name of theirs the address of this machine, and use what they cannot reach.
 
     Args:
         headers: Of the request.
-        any_host: Whether the server may have names that do not mean this machine alone.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc != host:
-        return False
-    return any_host or is_loopback(urlsplit(f"//{host}").hostname or "")
+    is_same = origin is None or urlsplit(origin).netloc == host
+    return is_same and is_loopback(urlsplit(f"//{host}").hostname or "")
 
 
 def check_can_listen(host: str, port: int) -> None:
@@ -136,7 +134,7 @@ def check_can_listen(host: str, port: int) -> None:
     try:
         with socket.create_server((host, port), family=family):
             pass
-    except OSError as error:
+    except (OSError, OverflowError) as error:
         raise ConfigError(f"cannot listen on {host}, port {port}: {error}; choose another one.") from error
 
 

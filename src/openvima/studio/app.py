@@ -1,7 +1,5 @@
 """The studio's server: every browser gets a session of its own, with its own episodes and scene."""
 
-import hmac
-
 import rich
 import viser
 from viser.infra import ClientId
@@ -13,6 +11,7 @@ from openvima.studio.browser_session import BrowserSession, StudioConfig
 from openvima.studio.compose_panel import ComposePanel
 from openvima.studio.play_panel import PlayPanel, UserPanel, WhyPanel
 
+HOST = "127.0.0.1"  # who reaches the studio can run code: another machine needs a tunnel
 PANELS = (PlayPanel, WhyPanel, ComposePanel, UserPanel, BrowsePanel)  # in the order of their tabs
 
 
@@ -29,9 +28,9 @@ class Studio:
     def __init__(self, config: StudioConfig) -> None:
         self.config = config
         load_assets(config.env_config.assets)  # fails now rather than in a browser
-        check_can_listen(config.host, config.port)
+        check_can_listen(HOST, config.port)
         rich.get_console().quiet = True  # viser prints addresses of its own
-        self._server = _Server(config.host, config.port, label="openvima studio", verbose=False)
+        self._server = _Server(HOST, config.port, label="openvima studio", verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.sessions: dict[int, BrowserSession] = {}
         self._server.on_client_connect(self._connected)
@@ -40,8 +39,7 @@ class Studio:
     @property
     def url(self) -> str:
         """The address to open in a browser."""
-        host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
-        return f"http://{host}:{self._server.get_port()}"
+        return f"http://{HOST}:{self._server.get_port()}"
 
     def close(self) -> None:
         """End all sessions and the server."""
@@ -51,22 +49,10 @@ class Studio:
         self._server.stop()
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        if not self._server.serves(client.client_id, any_host=self.config.token is not None):
-            client.add_notification("No entry", "Open the address that openvima studio printed.", color="red")
-        elif self.config.token is None:
+        if self._server.serves(client.client_id):
             self._begin(client)
         else:
-            self._ask_token(client, self.config.token)
-
-    def _ask_token(self, client: viser.ClientHandle, token: str) -> None:
-        """Show nothing but a field for the token until it is right: viser's pages do not send the address."""
-        entry = client.gui.add_text("token", "", hint="the word given to openvima studio --token")
-
-        @entry.on_update
-        def _(_: viser.GuiEvent) -> None:
-            if hmac.compare_digest(entry.value.encode(), token.encode()):
-                entry.remove()
-                self._begin(client)
+            client.add_notification("No entry", "Open the address that openvima studio printed.", color="red")
 
     def _begin(self, client: viser.ClientHandle) -> None:
         session = self.sessions[client.client_id] = BrowserSession(client, self.config)
@@ -87,8 +73,8 @@ class _Server(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> None:
         """Refuse: the studio stays on this machine."""
 
-    def serves(self, client_id: int, *, any_host: bool) -> bool:
+    def serves(self, client_id: int) -> bool:
         """Whether a browser has opened a page of this server; others see no scene and no panels."""
         connection = self._websock_server._live_connections.get(ClientId(client_id))
         request = None if connection is None else connection.request
-        return request is not None and is_own_page(request.headers, any_host=any_host)
+        return request is not None and is_own_page(request.headers)

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any  # of coroutines
@@ -25,7 +25,6 @@ from openvima.render.gltf import Shape, coloured_glb, object_glb
 from openvima.render.rasteriser import SHEET_RGB, SHEET_SIZE
 from openvima.render.raycast import TABLE, Hit, first_hit
 from openvima.scene import Action, EndEffector, Episode, Placement, Pose, RenderedPrompt, Scene
-from openvima.serving.server import ServerConfig
 from openvima.sim.arm_view import arm_parts
 from openvima.sim.ur5 import link_frames
 from openvima.tasks.pushes import Push
@@ -226,12 +225,7 @@ class StudioConfig:
         env_config: Settings of the environments.
         device: Where networks compute.
         trust_code: Run the code that run folders name, and results as their detector.
-        host: Interface to listen on. Any but the loopback interface needs a token.
         port: TCP port; 0 takes a free one.
-        token: Word that browsers are asked for.
-
-    Raises:
-        ConfigError: The port is none, or the host is open to other machines and there is no token.
     """
 
     path: Path | None = None
@@ -240,12 +234,7 @@ class StudioConfig:
     env_config: EnvConfig = DEFAULT_ENV_CONFIG
     device: str = DEFAULT_DEVICE
     trust_code: bool = False
-    host: str = "127.0.0.1"
     port: int = 0
-    token: str | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        ServerConfig(self.host, self.port, self.token)  # checks them
 
 
 class BrowserSession:

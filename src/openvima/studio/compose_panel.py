@@ -1,8 +1,7 @@
 """*Compose*: a scene and a sentence of one's own, changed one thing at a time."""
 
-import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,17 +10,13 @@ import viser
 
 from openvima.catalog import OBJECTS, TEXTURES
 from openvima.env.composing import photo_from_bytes
-from openvima.env.composition import Composition, python_code, shelf, shell_command
+from openvima.env.composition import Composition, shelf
 from openvima.env.episode_file import load_episode, save_episode
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
-from openvima.scene.scene import quaternion_yaw
 from openvima.studio.browser_session import BrowserSession, hit_of, move
 
-_GIZMO, _REFUSED = "/compose/gizmo", "refused"
-_GIZMO_M = 0.12
-_REFUSED_RGB = (220, 30, 30)
 _FIRST = Composition((), "Put the {a} into the {b}.", goals=(("in", "a", "b"),))
 _FIRST_OBJECTS = (("block", "red"), ("bowl", "green"))
 _NONE = "none"
@@ -34,7 +29,6 @@ class ComposePanel:
         self.session = session
         self._scene: Composition | None = None
         self._episode: EpisodeSession | None = None  # of the composition
-        self._gizmo: viser.TransformControlsHandle | None = None
         self._shelf: list[viser.GlbHandle] = []
         gui = session.gui
         with session.tabs.add_tab("Compose", viser.Icon.CUBE_PLUS):
@@ -52,9 +46,6 @@ class ComposePanel:
             with gui.add_folder("File", expand_by_default=False):
                 self._path = gui.add_text("file", "scene.yaml")
                 session.add_buttons("", {"save": self._save, "load": self._load})
-                written = {"Python": python_code, "command": shell_command}
-                works = {kind: partial(self._copy, code) for kind, code in written.items()}
-                session.add_buttons("copy as", works)
         session.client.scene.on_click()(self._clicked)
         session.on_drag(self._object_dragged)
         session.on_change(self._follow)
@@ -144,17 +135,9 @@ class ComposePanel:
         self._use(self._present().changed(self._selected.value, **fields))
 
     def _move(self, pose: Sequence[float]) -> None:
-        """Move the selected object, or show in red where it cannot be."""
+        """Move the selected object."""
         x, y, yaw_deg = pose
-        name = self._selected.value
-        new = self._present().moved(name, (x, y), yaw_deg)
-        try:
-            self._use(new)
-        except SceneError:
-            with contextlib.suppress(SceneError):  # it is outside, which one sees
-                refused = new.alone(name, self.session.assets)
-                self.session.table.add_ghost(_REFUSED, refused, colour=_REFUSED_RGB, opacity=0.6, grow=1.02)
-            raise
+        self._use(self._present().moved(self._selected.value, (x, y), yaw_deg))
 
     def _rewrite(self) -> None:
         prompt, goals = self._prompt.value, self._goals.value
@@ -177,16 +160,6 @@ class ComposePanel:
 
     def _load(self) -> None:
         self._use(Composition.of(load_episode(self._path.value, assets=self.session.assets)))
-
-    def _copy(self, written: Callable[..., str]) -> None:
-        """Show the episode in view as text."""
-        current = self.session.current
-        if current is None:
-            return
-        text = written(current.episode, env_config=self.session.env_config)
-        with self.session.gui.add_modal("Copy") as modal:
-            self.session.gui.add_markdown(f"```\n{text}```")
-            self.session.gui.add_button("close").on_click(lambda _: modal.close())
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if self.session.editing:
@@ -211,7 +184,7 @@ class ComposePanel:
         self.session.editing = is_at_start and self._edits.value
         if self.session.editing and not self._shelf:
             self._show_shelf()
-        for node in (*self._shelf, *([self._gizmo] if self._gizmo else ())):
+        for node in self._shelf:
             node.visible = self.session.editing
 
     def _show_shelf(self) -> None:
@@ -255,32 +228,10 @@ class ComposePanel:
         self._show_selected()
 
     def _show_selected(self) -> None:
-        """Show the selected object's fields, and the gizmo at it."""
-        self.session.client.scene.remove_by_name(f"{self.session.table.root}/{_REFUSED}")
-        if self._gizmo is not None:
-            self._gizmo.remove()
-            self._gizmo = None
-        if self._selected.value == _NONE or self._scene is None:
-            return
-        chosen = self._scene[self._selected.value]
-        (x, y), half_rad = chosen.position, math.radians(chosen.yaw_deg) / 2
-        self._pose.value, self._scale.value = (x, y, chosen.yaw_deg), chosen.scale
-        self._gizmo = self.session.client.scene.add_transform_controls(
-            _GIZMO,
-            scale=_GIZMO_M,
-            active_axes=(True, True, False),
-            position=(x, y, 0.05),
-            wxyz=(math.cos(half_rad), 0.0, 0.0, math.sin(half_rad)),
-            depth_test=False,
-        )
-        self._gizmo.on_update(self._dragged)
-
-    def _dragged(self, event: viser.TransformControlsEvent) -> None:
-        """Move the object with the gizmo, and compose the scene when it is let go."""
-        w, *xyz = event.target.wxyz.tolist()
-        x, y, _ = event.target.position.tolist()
-        pose = x, y, math.degrees(quaternion_yaw((*xyz, w)))
-        self._drag_to(pose, is_end=event.phase == "end")
+        """Show the selected object's fields."""
+        if self._selected.value != _NONE and self._scene is not None:
+            chosen = self._scene[self._selected.value]
+            self._pose.value, self._scale.value = (*chosen.position, chosen.yaw_deg), chosen.scale
 
     def _drag_to(self, pose: tuple[float, float, float], *, is_end: bool) -> None:
         if is_end:
