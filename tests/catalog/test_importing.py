@@ -13,7 +13,6 @@ from PIL import Image
 from openvima.catalog import OBJECTS, TEXTURES, CollisionHull, load_assets, original
 from openvima.catalog.original import OriginalAssets, import_pack, imported_folder
 from openvima.errors import AssetError
-from openvima.input_files import cache_dir
 
 REFERENCE = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
 SIZE = OBJECTS["cross"].size_max
