@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from openvima.catalog import OBJECTS, TEXTURES, CollisionHull, load_assets, original
-from openvima.catalog.original import OriginalAssets, import_pack, imported_folder
+from openvima.catalog.original import OriginalAssets, PackFiles, import_pack, imported_folder
 from openvima.errors import AssetError
 
 REFERENCE = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
@@ -94,7 +94,7 @@ def test_missing_and_damaged_files_are_named_and_the_rest_is_imported(checkout):
         assets.geometry("cross", SIZE)
     with pytest.raises(AssetError, match=rf"texture 'granite'.*textures/granite\.png is missing.*{command}"):
         assets.texture("granite")
-    assert len(OriginalAssets(imported_folder()).problems()) == 2
+    assert len(OriginalAssets(PackFiles.imported()).problems()) == 2
 
 
 def test_importing_again_replaces_the_import_and_what_was_loaded_of_it(checkout):
@@ -116,7 +116,7 @@ def test_an_import_that_fails_leaves_the_last_one(checkout, tmp_path, monkeypatc
         in_pack(checkout, path).write_bytes(b"damaged")
     with pytest.raises(AssetError, match="none of the 5 files"):
         import_pack(checkout)
-    assert OriginalAssets(imported_folder()).problems() == []
+    assert OriginalAssets(PackFiles.imported()).problems() == []
 
 
 def test_a_changed_byte_of_an_import_is_noticed(checkout):

@@ -374,13 +374,6 @@ def test_of_very_many_episodes_failures_alone_are_listed(results, tmp_path, monk
     assert "41 failures of 90 episodes" in listed and ">solved<" not in listed
 
 
-def test_episodes_that_only_one_policy_solved_are_named(text):
-    tables = Page(section(text, "comparison")).tables
-    apart = next(table for table in tables if table[0][0].strip() == "task" and "level" in table[0][1])
-    stack = next(row for row in apart if "stack<b>" in row[0])
-    assert [" ".join(cell.split()) for cell in stack[1:]] == ["L1", "1, 2, 3, 4, 5", "–"]
-
-
 @pytest.mark.parametrize(
     ("reason", "plain"),
     [

@@ -72,12 +72,12 @@ def info() -> int:
     """
     from openvima.catalog import OBJECTS, TEXTURES
     from openvima.catalog.objects import REGISTERED_OBJECTS
-    from openvima.catalog.original import OriginalAssets, imported_folder, known_hashes
+    from openvima.catalog.original import OriginalAssets, PackFiles, imported_folder, known_hashes
     from openvima.catalog.textures import REGISTERED_TEXTURES
     from openvima.input_files import cache_dir
     from openvima.tasks import list_tasks
 
-    problems = None if not imported_folder().is_dir() else OriginalAssets(imported_folder()).problems()
+    problems = None if not imported_folder().is_dir() else OriginalAssets(PackFiles.imported()).problems()
     print(f"procedural  made by code: {len(OBJECTS)} objects, {len(TEXTURES)} textures")
     list_tasks()  # files of tasks may register objects and textures
     if own := [*REGISTERED_OBJECTS, *REGISTERED_TEXTURES]:
