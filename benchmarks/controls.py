@@ -1,6 +1,7 @@
-"""What guesses solve at a level: controls that read no prompt, or no words of it.
+r"""What guesses solve at a level: controls that read no prompt, or no words of it.
 
-    python benchmarks/controls.py [--levels L5,L8] [--tasks T,…] [--episodes N] [--seed S] [--json FILE]
+    openvima evaluate --policy guess=benchmarks/controls.py:guess,first=benchmarks/controls.py:first,\
+        similar=benchmarks/controls.py:similar --levels L5,L6,L7,L8 --episodes 100 --out guesses
 
 guess    Any object that can be moved goes to any that cannot, without rotation; where there is none, to any
          place on the table. Reads no prompt.
@@ -9,73 +10,59 @@ similar  The objects that look most like the images of the prompt, in their orde
          look most like its images; of a scene image, to their places in the last one. Reads no words, and
          compares true shapes and textures, so it mistakes none.
 
-Each goes on until the episode ends. Intervals are Wilson's at 95 %.
+Each goes on until the episode ends. They read the environments, which no policy may.
 """
 
-import argparse
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from openvima.catalog.textures import NEUTRAL_TEXTURE
 from openvima.env import TabletopEnv
-from openvima.env.config import EnvConfig
 from openvima.errors import OracleError
-from openvima.evaluation.rollout import play
-from openvima.evaluation.statistics import wilson_interval
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, ObjectImage, Placement, SceneImage
 from openvima.tasks.oracle import visible_point
-from openvima.tasks.registry import tasks_of
-from sim import circumstances
 
-WAYS = ("guess", "first", "similar")
 Point = tuple[float, float]
 
 
 class Guess:
-    """Moves objects in one of `WAYS`.
+    """Moves objects in one way; what is not decided is drawn from the number of the episode."""
 
-    Args:
-        way: Which one.
-        rng: Draws what is not decided.
-    """
+    modalities = ("joints",)  # nothing is rendered
 
-    modalities = ("segm",)
-
-    def __init__(self, way: str, rng: np.random.Generator) -> None:
-        self._way, self._rng = way, rng
-        self._envs: Sequence[TabletopEnv] = ()
+    def __init__(self, way: Literal["guess", "first", "similar"]) -> None:
+        self._way = way
+        self._envs: list[tuple[TabletopEnv, np.random.Generator]] = []
         self._step = -1
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start a batch of episodes."""
-        self._envs, self._step = envs, -1
+        self._envs, self._step = [(env, np.random.default_rng(env.episode.seed)) for env in envs], -1
 
     def decide(self, observations: Sequence[Mapping | None]) -> list[Action | None]:
         """Move one object in each environment that runs."""
         self._step += 1
         pairs = zip(self._envs, observations, strict=True)
-        return [None if seen is None else self._move(env) for env, seen in pairs]
+        return [None if seen is None else self._move(*episode) for episode, seen in pairs]
 
     def near_ties(self) -> Sequence[bool]:
         """Return nothing: there are no scores."""
         return ()
 
-    def _move(self, env: TabletopEnv) -> Action:
+    def _move(self, env: TabletopEnv, rng: np.random.Generator) -> Action:
         loose = [p for p in env.scene.placements if not p.fixed]
         fixed = [p for p in env.scene.placements if p.fixed]
-        x, y = self._rng.uniform(WORKSPACE_LOW, WORKSPACE_HIGH).tolist()
+        x, y = rng.uniform(WORKSPACE_LOW, WORKSPACE_HIGH).tolist()
         if self._way == "similar":
             picked, place = self._by_images(env, loose, fixed) or (loose[0], (x, y))
         elif self._way == "first":
             picked = loose[self._step % len(loose)]
             place = (fixed[0].pose.x, fixed[0].pose.y) if fixed else (x, y)
         else:
-            picked = loose[int(self._rng.integers(len(loose)))]
-            base = fixed[int(self._rng.integers(len(fixed)))] if fixed else None
+            picked = loose[int(rng.integers(len(loose)))]
+            base = fixed[int(rng.integers(len(fixed)))] if fixed else None
             place = (base.pose.x, base.pose.y) if base else (x, y)
         try:
             point = visible_point(env.scene, picked.id, assets=env.assets)
@@ -109,38 +96,16 @@ def likeness(placement: Placement, image: Placement) -> int:
     return (placement.object == image.object) + same_texture
 
 
-def main() -> None:
-    """Play and print the rows."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--levels", default="L5,L8")
-    parser.add_argument("--tasks", default="all")
-    parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0, help="first episode, of domain eval")
-    parser.add_argument("--json", type=Path, help="file to write")
-    options = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    seeds = range(options.seed, options.seed + options.episodes)
-    for level in options.levels.split(","):
-        tasks = tasks_of(level) if options.tasks == "all" else options.tasks.split(",")
-        for task in tasks:
-            for way in WAYS:
-                policy, env = (
-                    Guess(way, np.random.default_rng(options.seed)),
-                    EnvConfig().make(task, level, domain="eval"),
-                )
-                solved = sum(play([env], [seed], policy)[0].success for seed in seeds)
-                interval = list(wilson_interval(solved, len(seeds)))
-                row = {"task": task, "level": level, "way": way, "episodes": len(seeds), "solved": solved}
-                rows.append({**row, "interval": interval})
-                print(f"{level} {task:<27}{way:<9}{100 * solved / len(seeds):5.1f}", flush=True)
-        for way in WAYS:
-            rates = [r["solved"] / r["episodes"] for r in rows if (r["level"], r["way"]) == (level, way)]
-            print(f"{level} {'mean':<27}{way:<9}{100 * np.mean(rates):5.1f}", flush=True)
-        if options.json:
-            record = {**circumstances(), "episodes": options.episodes, "seed": options.seed, "rows": rows}
-            options.json.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+def guess() -> Guess:
+    """Make the control that draws objects and places."""
+    return Guess("guess")
 
 
-if __name__ == "__main__":
-    main()
+def first() -> Guess:
+    """Make the control that takes objects by their ids."""
+    return Guess("first")
+
+
+def similar() -> Guess:
+    """Make the control that goes by looks."""
+    return Guess("similar")

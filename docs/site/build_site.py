@@ -29,6 +29,7 @@ NAMED = {
 }
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+OPTION = re.compile(r"`(--[\w.-]+( [\w.-]+)?)`")
 NO_RUN = re.compile(r"^(```\w+) .*$", re.MULTILINE)  # a mark for the tests
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".toml": "toml", ".json": "json"}
 
@@ -92,7 +93,7 @@ class Pages:
 
         parts = FENCE.split(text)
         fences = [NO_RUN.sub(r"\1", block[0]) for block in FENCE.finditer(text)]
-        linked = [LINK.sub(replace, part) for part in parts]
+        linked = [OPTION.sub(r"`\1`{ .option }", LINK.sub(replace, part)) for part in parts]
         return "".join(part + fence for part, fence in zip(linked, [*fences, ""], strict=True))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from openvima import user_code
 from openvima.cli.main import main
+from openvima.env import EnvConfig
 from openvima.errors import ConfigError, PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.evaluation.config import Batch
@@ -67,6 +69,21 @@ def test_a_function_of_a_file_is_scored_from_the_command_line(file, capsys):
     file.write_text(CODE + "\n")
     assert main(["evaluate", "--policy", "my policies.py:make", *words]) == 2
     assert "holds another evaluation" in capsys.readouterr().err
+
+
+def test_controls_read_environments_and_say_so(tmp_path):
+    folder = Path(__file__).parents[2] / "benchmarks"
+    named = (f"reader={folder}/reader.py:reader", f"similar={folder}/controls.py:similar")
+    tasks, levels = ("visual_manipulation", "put_then_restore", "refer_by_number"), ("L5", "L6", "L7")
+    asked = EvaluationConfig(
+        named, tasks, levels, episodes=1, out=tmp_path, env_config=EnvConfig(prompts="text")
+    )
+    results = Results.read(evaluate(asked))
+    assert {what["reads"] for what in results.policies.values()} == {"environment"}
+    assert [row.successes for row in results.rows if row.policy == "reader"] == [1, 1, 1]
+    assert verify_results(tmp_path).is_verified
+    with pytest.raises(PolicyError, match="reader reads environments, which 'no_prompt' does not change"):
+        evaluate(replace(asked, out=tmp_path / "ablated", ablations=("no_prompt",)))
 
 
 def test_invalid_actions_are_counted_and_the_first_is_shown(file, capsys):

@@ -25,7 +25,7 @@ from openvima.evaluation.chat import Said, said_in, shot_turns
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.sources import PolicySource
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, require_torch, torch_threads
-from openvima.policies.loading import checked_policy
+from openvima.policies.loading import checked_policy, reads_environments
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene import Action
 from openvima.scene.action import END_EFFECTOR, PRIMITIVES, ToolCommand
@@ -278,7 +278,11 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = Fals
     return _rollout_policy(policy, batch.ablation, batch.policy)
 
 
-def _rollout_policy(policy: Any, ablation: str, name: str) -> PromptedRolloutPolicy:
+def _rollout_policy(policy: Any, ablation: str, name: str) -> RolloutPolicy:
+    if reads_environments(policy):
+        if ablation:
+            raise PolicyError(f"{name} reads environments, which {ablation!r} does not change; leave it out.")
+        return policy
     if isinstance(policy, VlmPolicy):
         return VlmRolloutPolicy(policy.new_session(), ablation, name=name)
     return PromptedRolloutPolicy(policy, ablation, name=name)

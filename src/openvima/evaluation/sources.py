@@ -18,6 +18,7 @@ from openvima.policies.loading import (
     learner_code,
     parameters_hash,
     policy_of_code,
+    reads_environments,
     tasks_left_out,
 )
 from openvima.policies.naming import (
@@ -202,13 +203,16 @@ def weights_hash(source: str | Path) -> str:
 def object_record(policy: Policy) -> dict[str, Any]:
     """What is known of a policy object: "modalities" of its observations, and "weights_sha256" if it has any.
 
+    "reads" is "environment" for a control, which is no policy.
+
     Raises:
         PolicyError: Its `weights_hash` is or returns no text.
     """
     weights = parameters_hash(policy)
     asked = getattr(policy, "modalities", DEFAULT_MODALITIES)
     modalities = [asked] if isinstance(asked, str) else list(asked)
-    return {"modalities": modalities} | ({} if weights is None else {"weights_sha256": weights})
+    control = {"reads": "environment"} if reads_environments(policy) else {}
+    return {"modalities": modalities, **control} | ({} if weights is None else {"weights_sha256": weights})
 
 
 def _default_name(source: str) -> str:

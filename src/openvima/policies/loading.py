@@ -86,17 +86,23 @@ def _run_setting(folder: str | Path, name: str, *, section: str = "training") ->
     return path, None
 
 
-def policy_of_code(source: str) -> Policy:
-    """Call a function that makes a policy.
+def reads_environments(policy: Any) -> bool:
+    """Whether an object is a control, which reads environments: it has the methods of a `RolloutPolicy`."""
+    return callable(getattr(policy, "begin", None)) and callable(getattr(policy, "decide", None))
+
+
+def policy_of_code(source: str) -> Any:
+    """Call a function that makes a policy, or a control.
 
     Args:
         source: MODULE:FUNCTION or FILE.py:FUNCTION; the function needs no arguments.
 
     Raises:
         ConfigError: There is no such function, or it raises.
-        PolicyError: It returns something else than a policy.
+        PolicyError: It returns something else.
     """
-    return checked_policy(call_function(source, what="policy"), f"{source} returned")
+    made = call_function(source, what="policy")
+    return made if reads_environments(made) else checked_policy(made, f"{source} returned")
 
 
 def policy_of_run(folder: str | Path, code: LearnerCode, *, device: str = "cpu") -> Policy:
