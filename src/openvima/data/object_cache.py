@@ -189,12 +189,6 @@ class CacheFile:
         """Return the length of a list in each row, shape (N,), int64."""
         return np.diff(self._lists[column][0])
 
-    def largest(self, column: str, field_name: str) -> np.ndarray:
-        """Return the largest number of a field in each row, 0 where there is none, shape (N,), int64."""
-        ends, fields = self._lists[column]
-        flat = fields[field_name]
-        return np.array([flat[start:end].max(initial=0) for start, end in pairwise(ends)], np.int64)
-
     def texts(self, name: str) -> set[str]:
         """Return the different texts of a column."""
         values = self._scalars[name]
@@ -368,16 +362,6 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the visible objects of all of them, shape (N, 2), int64."""
         return self._gather(lambda file: np.stack([file.counts("steps"), file.counts("objects")], axis=1))
-
-    def widths(self) -> np.ndarray:
-        """Return the most objects in a prompt image and in an observation, shape (N, 2), int64."""
-
-        def most(file: CacheFile) -> np.ndarray:
-            in_prompt = file.largest("prompt_images", "prompt.objects_per_image")
-            in_view = np.maximum(file.largest("steps", "objects_per_step"), file.counts("final"))
-            return np.stack([in_prompt, in_view], axis=1)
-
-        return self._gather(most)
 
     def image_counts(self) -> np.ndarray:
         """Return the number of images of each episode, shape (N,), int64."""

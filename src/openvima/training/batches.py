@@ -170,25 +170,12 @@ class BatchOrder:
     num_ranks: int = 1
 
     def __post_init__(self) -> None:
-        problems = []
-        if self.batch_size < 1:
-            problems.append(f"batch_size is {self.batch_size}; it must be at least 1.")
-        if self.bucket < 1:
-            problems.append(f"bucket is {self.bucket}; it must be at least 1.")
-        if not 0 <= self.seed < 2**63:
-            problems.append(f"seed is {self.seed}; it must lie within 0 … 2^63 - 1.")
-        if self.num_ranks < 1 or not 0 <= self.rank < self.num_ranks:
-            problems.append(f"rank is {self.rank} of {self.num_ranks}; count ranks from 0.")
-        elif self.batch_size % self.num_ranks:
-            problems.append(
+        if self.batch_size % self.num_ranks:
+            raise ConfigError(
                 f"batch_size is {self.batch_size}; {self.num_ranks} ranks cannot share that equally."
             )
-        if self.lengths is not None and len(self.lengths) != self.num_episodes:
-            problems.append(f"there are {len(self.lengths)} lengths for {self.num_episodes} episodes.")
-        if not problems and self.batches_per_epoch < 1:
-            problems.append(f"batch_size is {self.batch_size}; there are {self.num_episodes} episodes.")
-        if problems:
-            raise ConfigError(" ".join(problems))
+        if not 1 <= self.batch_size <= self.num_episodes:
+            raise ConfigError(f"batch_size is {self.batch_size}; there are {self.num_episodes} episodes.")
 
     @property
     def batches_per_epoch(self) -> int:

@@ -42,7 +42,6 @@ from openvima.training.recipes import command_going_on
 from openvima.training.run_folder import held_out_demonstrations, run_lock
 from openvima.training.source import (
     alternative_source,
-    check_lengths,
     check_scenes,
     check_words,
     open_demonstrations,
@@ -198,19 +197,9 @@ class _Stages:
         self.trainer.report(f"reading {len(self.dataset)} demonstrations")
         caches, config, learner = [cache for cache, _ in self._caches], self.config, self.learner
         if isinstance(learner, PolicyLearner):
-            prob = config.augmentation.inverse_dynamics_prob
-            describes = config.augmentation.describes_objects
-            check_words(caches[0], learner.processor, describes=describes)
-            if prob:
+            check_words(caches[0], learner.processor, describes=config.augmentation.describes_objects)
+            if config.augmentation.inverse_dynamics_prob:
                 learner.processor.tokenizer.encode(MOTION_TEXT.format(frames=""))
-            for cache in caches:
-                check_lengths(
-                    cache,
-                    learner.network,
-                    learner.processor,
-                    inverse_dynamics_prob=prob,
-                    describes=describes,
-                )
             if not (config.init_from or self.trainer.progress.step):
                 learner.network.fit_prior(read_actions(self._examples[0]))
             if freezes_crops(learner.network, config):
