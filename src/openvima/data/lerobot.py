@@ -10,12 +10,10 @@ import pyarrow.parquet as pq
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
 from openvima.data.lerobot_files import (
-    DATA_FILE_MB,
     INFO_PATH,
     PIXEL_FORMATS,
     SOURCE_EPISODES_PATH,
     SOURCE_PATH,
-    VIDEO_FILE_MB,
     LerobotWriter,
     PixelFormat,
     write_json,
@@ -30,8 +28,6 @@ from openvima.video.encoder import import_av
 
 __all__ = ["LerobotConfig", "export_lerobot", "frame_layout"]
 
-RATES = (1, 2, 4, 8, 16, 32, 64)
-
 
 @dataclass(frozen=True, slots=True)
 class LerobotConfig:
@@ -41,13 +37,8 @@ class LerobotConfig:
         data: Folder of demonstrations.
         out: Folder of the export.
         tasks: Keep the episodes of these tasks only; None keeps all.
-        fps: Frames a second, a power of two: LeRobot finds frames by float32 seconds, and only then are all
-            exact, however long a video is. A frame is a step, which has no duration of its own. None is 1.
-            Demonstrations of low-level control take None alone: they have 10, a frame for each command.
         pixels: "yuv444p" keeps colours within 2 of 255 levels; "yuv420p" is what browsers and graphics cards
             play, at half the resolution of colours.
-        data_file_mb: Limit of the Parquet files.
-        video_file_mb: Limit of the videos.
         force: Replace the export that is at `out`.
 
     Raises:
@@ -57,22 +48,14 @@ class LerobotConfig:
     data: Path
     out: Path
     tasks: tuple[str, ...] | None = None
-    fps: int | None = None
     pixels: PixelFormat = "yuv444p"
-    data_file_mb: int = DATA_FILE_MB
-    video_file_mb: int = VIDEO_FILE_MB
     force: bool = False
 
     def __post_init__(self) -> None:
         settle(self, paths=("data", "out"), names=("tasks",))
         problems = []
-        if self.fps is not None and self.fps not in RATES:
-            problems.append(f"fps is {self.fps}; allowed are {', '.join(map(str, RATES))}.")
         if self.pixels not in PIXEL_FORMATS:
             problems.append(f"pixels is {self.pixels!r}; allowed are {', '.join(PIXEL_FORMATS)}.")
-        for name in ("data_file_mb", "video_file_mb"):
-            if getattr(self, name) < 1:
-                problems.append(f"{name} is {getattr(self, name)}; it must be at least 1.")
         if self.data.resolve().is_relative_to(self.out.resolve()):
             problems.append(f"{self.out} holds the demonstrations themselves; give another folder.")
         if problems:
@@ -103,17 +86,13 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
         raise DatasetError(f"{config.data} has no episodes to export.")
     _check_out(config)
     settings = dense_settings(dataset)
-    if settings and config.fps is not None:
-        raise ConfigError(f"fps is {config.fps}, but a step of low-level control lasts 0.1 s; leave it out.")
-    fps = CONTROL_HZ if settings else config.fps or 1
+    fps = CONTROL_HZ if settings else 1  # a whole number of float32 seconds, by which LeRobot finds frames
     with folder_lock(config.out), atomic_folder(config.out) as folder:
         with LerobotWriter(
             folder,
             find_layout(dataset, END_EFFECTOR if settings else PRIMITIVES),
             fps=fps,
             pixels=config.pixels,
-            data_file_mb=config.data_file_mb,
-            video_file_mb=config.video_file_mb,
         ) as writer:
             for number, demo in enumerate(dataset, 1):
                 writer.write(dense_trajectory(demo, settings[demo.task, demo.level]) if settings else demo)

@@ -6,7 +6,6 @@ Source: the format's documentation (huggingface.co/docs/lerobot/lerobot-dataset-
 import contextlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, get_args
@@ -23,9 +22,8 @@ from openvima.video.encoder import import_av, open_video
 
 CODEBASE_VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
-DATA_FILE_MB = 100
+EPISODES_PER_FILE = 1000  # of both tables: tens of MB
 VIDEO_FILE_MB = 200
-BYTES_PER_MB = 1024**2
 
 INFO_PATH = "meta/info.json"
 STATISTICS_PATH = "meta/stats.json"
@@ -39,30 +37,25 @@ SOURCE_PATH = "meta/openvima.json"
 SOURCE_EPISODES_PATH = "meta/openvima.parquet"
 
 
-@dataclass(frozen=True, slots=True)
-class FileNumber:
-    """The place of one of the numbered files, `chunk-000/file-000` and so on."""
+def numbered_path(folder: Path, pattern: str, number: int, **names: str) -> Path:
+    """Return the path of a file by its number in the data set; its folder is made.
 
-    chunk: int = 0
-    file: int = 0
+    Args:
+        folder: The data set.
+        pattern: One of the patterns above.
+        number: From 0; chunks of `FILES_PER_CHUNK` files share a folder.
+        **names: What else the pattern asks for.
+    """
+    chunk, file = divmod(number, FILES_PER_CHUNK)
+    path = folder / pattern.format(chunk_index=chunk, file_index=file, **names)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
-    def next(self) -> "FileNumber":
-        """Return the place of the file after this one."""
-        if self.file + 1 == FILES_PER_CHUNK:
-            return FileNumber(self.chunk + 1, 0)
-        return FileNumber(self.chunk, self.file + 1)
 
-    def path(self, folder: Path, pattern: str, **names: str) -> Path:
-        """Return the file's path; its folder is made.
-
-        Args:
-            folder: The data set.
-            pattern: One of the patterns above.
-            **names: What else the pattern asks for.
-        """
-        path = folder / pattern.format(chunk_index=self.chunk, file_index=self.file, **names)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path
+def _place(prefix: str, number: int) -> dict[str, int]:
+    """Return the entries of an episode that say in which file it is."""
+    chunk, file = divmod(number, FILES_PER_CHUNK)
+    return {f"{prefix}/chunk_index": chunk, f"{prefix}/file_index": file}
 
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -139,91 +132,6 @@ def _rank(share: float, count: int) -> int:
 
 
 _COMPRESSION = "snappy"  # as LeRobot writes
-_FOOTER_BYTES = 400  # what a file's end holds for each column of a row group, generously
-
-_MAX_PIECES = 16  # a row of 300 columns takes a megabyte as a table of its own, 20 kB among others
-
-
-class NumberedTable:
-    """A table over numbered Parquet files, each smaller than a limit; a context manager.
-
-    Rows of one call to `write` stay together. LeRobot gives each of them a row group of its own; for episodes
-    of a few frames that would make files of little but row groups, so here several share one.
-
-    Args:
-        folder: The data set.
-        pattern: Where the files lie.
-        limit_bytes: A file is closed before it becomes as large.
-        group_bytes: Size of a row group before compression.
-    """
-
-    def __init__(self, folder: Path, pattern: str, *, limit_bytes: int, group_bytes: int = 2**22) -> None:
-        self._folder, self._pattern = folder, pattern
-        self._limit_bytes, self._group_bytes = limit_bytes, group_bytes
-        self._number: FileNumber | None = None
-        self._writer: pq.ParquetWriter | None = None
-        self._file: pa.NativeFile | None = None
-        self._waiting: list[pa.Table] = []
-        self._waiting_bytes = self._footer_bytes = 0
-
-    def place(self, num_bytes: int) -> FileNumber:
-        """Return the number of the file that takes the next rows, if they have `num_bytes`."""
-        if self._number is None:
-            return FileNumber()
-        written = (self._file.tell() if self._file else 0) + self._footer_bytes
-        is_full = written + self._waiting_bytes + num_bytes >= self._limit_bytes
-        return self._number.next() if is_full else self._number
-
-    def write(self, rows: pa.Table, number: FileNumber | None = None) -> FileNumber:
-        """Append rows.
-
-        Args:
-            rows: Always of the same schema.
-            number: The file, as `place` gave it; None asks for it.
-
-        Returns:
-            The number of the file that they are in.
-        """
-        number = number or self.place(rows.nbytes)
-        if number != self._number:
-            self.close()
-            self._number = number
-        if not self._waiting:
-            self._footer_bytes += _FOOTER_BYTES * rows.num_columns
-        self._waiting.append(rows)
-        self._waiting_bytes += rows.nbytes
-        if self._waiting_bytes >= self._group_bytes:
-            self._flush()
-        elif len(self._waiting) >= _MAX_PIECES:
-            self._waiting = [pa.concat_tables(self._waiting).combine_chunks()]
-        return number
-
-    def close(self) -> None:
-        """Finish the present file."""
-        self._flush()
-        if self._writer and self._file:
-            self._writer.close()
-            self._file.close()
-            self._writer = self._file = None
-            self._footer_bytes = 0
-
-    def __enter__(self) -> "NumberedTable":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self.close()
-
-    def _flush(self) -> None:
-        if not self._waiting or self._number is None:
-            return
-        table = pa.concat_tables(self._waiting)
-        if self._writer is None:
-            path = self._number.path(self._folder, self._pattern)
-            self._file = pa.OSFile(str(path), "wb")
-            self._writer = pq.ParquetWriter(self._file, table.schema, compression=_COMPRESSION)
-        self._writer.write_table(table, row_group_size=len(table))
-        self._waiting, self._waiting_bytes = [], 0
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
@@ -257,7 +165,6 @@ PixelFormat = Literal["yuv444p", "yuv420p"]
 PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
 
 _QUALITY = {"yuv444p": {"qp": "0"}, "yuv420p": {"crf": "12"}}
-_BYTES_PER_FRAME = 64  # generous share of the file's tables
 MAX_FRAMES = 100_000  # in a file: of each one about 70 bytes stay in memory until it is closed
 
 
@@ -272,22 +179,30 @@ class NumberedVideo:
         key: Name of the feature.
         fps: Frames a second.
         pixels: Pixel format.
-        limit_bytes: A file is closed before it becomes as large.
+        limit_bytes: An episode begins a new file if the last one has so many bytes.
 
     Raises:
         MissingExtraError: PyAV is not installed.
     """
 
-    def __init__(self, folder: Path, key: str, *, fps: int, pixels: PixelFormat, limit_bytes: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        key: str,
+        *,
+        fps: int,
+        pixels: PixelFormat,
+        limit_bytes: int = VIDEO_FILE_MB * 2**20,
+    ) -> None:
         self._av = import_av()
         self._folder, self._key = folder, key
         self._fps, self._pixels, self._limit_bytes = fps, pixels, limit_bytes
-        self._number: FileNumber | None = None
         self._container: Any = None
         self._stream: Any = None
-        self._num_frames = self._num_bytes = self._largest_frame = 0
+        self._number = -1
+        self._num_frames = self._num_bytes = 0
 
-    def write(self, pictures: np.ndarray, *, num_frames: int) -> tuple[FileNumber, int]:
+    def write(self, pictures: np.ndarray, *, num_frames: int) -> tuple[int, int]:
         """Append an episode.
 
         Args:
@@ -297,11 +212,9 @@ class NumberedVideo:
         Returns:
             The number of the file, and the place of the first frame in it.
         """
-        expected = num_frames * max(self._largest_frame, _BYTES_PER_FRAME)
-        is_full = self._num_bytes + expected >= self._limit_bytes or self._num_frames >= MAX_FRAMES
-        if self._number is None or is_full:
+        is_full = self._num_bytes >= self._limit_bytes or self._num_frames >= MAX_FRAMES
+        if self._container is None or is_full:
             self._begin()
-        assert self._number is not None  # `_begin` has set it
         place = self._number, self._num_frames
         kinds = self._av.video.frame.PictureType
         frame: Any = None
@@ -335,9 +248,9 @@ class NumberedVideo:
 
     def _begin(self) -> None:
         self.close()
-        self._number = self._number.next() if self._number else FileNumber()
+        self._number += 1
         self._num_frames = self._num_bytes = 0
-        path = self._number.path(self._folder, VIDEO_PATH, video_key=self._key)
+        path = numbered_path(self._folder, VIDEO_PATH, self._number, video_key=self._key)
         self._container, self._stream = open_video(path, self._fps)
         self._stream.height, self._stream.width = IMAGE_SHAPE
         self._stream.pix_fmt = self._pixels
@@ -352,9 +265,7 @@ class NumberedVideo:
         }
 
     def _mux(self, packets: list[Any]) -> None:
-        for packet in packets:
-            self._largest_frame = max(self._largest_frame, packet.size + _BYTES_PER_FRAME)
-            self._num_bytes += packet.size + _BYTES_PER_FRAME
+        self._num_bytes += sum(packet.size for packet in packets)
         self._container.mux(packets)
 
 
@@ -364,45 +275,28 @@ ROBOT_TYPE = "ur5"
 class LerobotWriter:
     """Writes a data set into an empty folder; a context manager.
 
-    The folder is a data set when the block has ended well. One episode is in memory at a time.
+    The folder is a data set when the block has ended well. Numbers of up to `EPISODES_PER_FILE` episodes are
+    in memory, and the pictures of one.
 
     Args:
         folder: The folder.
         frames: What a frame holds.
         fps: Frames a second.
         pixels: Pixel format of the videos.
-        data_file_mb: Limit of the Parquet files.
-        video_file_mb: Limit of the videos.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        frames: FrameLayout,
-        *,
-        fps: int,
-        pixels: PixelFormat,
-        data_file_mb: int = DATA_FILE_MB,
-        video_file_mb: int = VIDEO_FILE_MB,
-    ) -> None:
+    def __init__(self, folder: Path, frames: FrameLayout, *, fps: int, pixels: PixelFormat) -> None:
         self._folder, self._frames, self._fps, self._pixels = folder, frames, fps, pixels
-        self._limits = {"data_files_size_in_mb": data_file_mb, "video_files_size_in_mb": video_file_mb}
         self._schema = _schema(frames)
         self._tasks: dict[str, int] = {}
         self._num_episodes = self._num_frames = 0
         self._row_schema: pa.Schema | None = None  # of the list of episodes; its first row gives it
-        self._row_bytes = 0
+        self._tables: list[pa.Table] = []  # frames of each episode of the present file
+        self._rows: list[dict[str, Any]] = []  # and its entry in the list of episodes
         self._pixel_counts = {key: np.zeros((3, 256), np.int64) for key in frames.video_keys}
         self._closing = contextlib.ExitStack()
-        data_bytes, video_bytes = (limit * BYTES_PER_MB for limit in self._limits.values())
-        self._data, self._episodes = (
-            self._closing.enter_context(NumberedTable(folder, pattern, limit_bytes=data_bytes))
-            for pattern in (DATA_PATH, EPISODES_PATH)
-        )
         self._videos = {
-            key: self._closing.enter_context(
-                NumberedVideo(folder, key, fps=fps, pixels=pixels, limit_bytes=video_bytes)
-            )
+            key: self._closing.enter_context(NumberedVideo(folder, key, fps=fps, pixels=pixels))
             for key in frames.video_keys
         }
 
@@ -413,15 +307,15 @@ class LerobotWriter:
             demo: At least one step, with no more prompt images than the layout has.
         """
         values = {**self._frames.values(demo), **self._counters(demo)}  # type: ignore[arg-type]  # of the layout
-        number = self._data.write(_table(values, self._schema))
+        self._tables.append(_table(values, self._schema))
+        number = self._num_episodes // EPISODES_PER_FILE
         places, statistics = self._write_pictures(demo)
         statistics |= {name: value_statistics(column) for name, column in values.items()}
         row = {
             "episode_index": self._num_episodes,
             "tasks": [demo.prompt.text],
             "length": demo.num_steps,
-            "data/chunk_index": number.chunk,
-            "data/file_index": number.file,
+            **_place("data", number),
             "dataset_from_index": self._num_frames,
             "dataset_to_index": self._num_frames + demo.num_steps,
             **places,
@@ -430,10 +324,13 @@ class LerobotWriter:
                 for name, entry in statistics.items()
                 for kind, value in entry.items()
             },
+            **_place("meta/episodes", number),
         }
-        self._write_episode(row)
+        self._rows.append(row)
         self._num_episodes += 1
         self._num_frames += demo.num_steps
+        if self._num_episodes % EPISODES_PER_FILE == 0:
+            self._write_tables()
 
     def __enter__(self) -> "LerobotWriter":
         return self
@@ -443,6 +340,7 @@ class LerobotWriter:
     ) -> None:
         self._closing.__exit__(kind, error, trace)
         if kind is None:
+            self._write_tables()
             self._write_metadata()
 
     def _counters(self, demo: Demonstration | DenseTrajectory) -> dict[str, np.ndarray]:
@@ -467,20 +365,23 @@ class LerobotWriter:
             self._pixel_counts[key] += counts
             statistics[key] = pixel_statistics(counts, demo.num_steps)
             places |= {
-                f"videos/{key}/chunk_index": number.chunk,
-                f"videos/{key}/file_index": number.file,
+                **_place(f"videos/{key}", number),
                 f"videos/{key}/from_timestamp": first_frame / self._fps,
                 f"videos/{key}/to_timestamp": (first_frame + demo.num_steps) / self._fps,
             }
         return places, statistics
 
-    def _write_episode(self, row: dict[str, Any]) -> None:
-        """Append a row to the list of episodes, which says itself in which file it is."""
-        number = self._episodes.place(self._row_bytes)
-        own_place = {"meta/episodes/chunk_index": number.chunk, "meta/episodes/file_index": number.file}
-        table = pa.Table.from_pylist([row | own_place], schema=self._row_schema)
-        self._episodes.write(table, number)
-        self._row_schema, self._row_bytes = table.schema, max(self._row_bytes, table.nbytes)
+    def _write_tables(self) -> None:
+        """Write the files of the episodes that wait for it."""
+        if not self._rows:
+            return
+        number = (self._num_episodes - 1) // EPISODES_PER_FILE
+        rows = pa.Table.from_pylist(self._rows, schema=self._row_schema)
+        self._row_schema = rows.schema
+        for pattern, table in ((DATA_PATH, pa.concat_tables(self._tables)), (EPISODES_PATH, rows)):
+            path = numbered_path(self._folder, pattern, number)
+            pq.write_table(table, path, compression=_COMPRESSION)
+        self._tables, self._rows = [], []
 
     def _write_metadata(self) -> None:
         info = {
@@ -490,7 +391,8 @@ class LerobotWriter:
             "total_frames": self._num_frames,
             "total_tasks": len(self._tasks),
             "chunks_size": FILES_PER_CHUNK,
-            **self._limits,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": VIDEO_FILE_MB,
             "fps": self._fps,
             "splits": {"train": f"0:{self._num_episodes}"},
             "data_path": DATA_PATH,

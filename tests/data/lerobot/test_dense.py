@@ -12,7 +12,7 @@ from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.lerobot_frames import DenseLayout, dense_trajectory
 from openvima.data.replay import find_difference
 from openvima.env import EnvConfig
-from openvima.errors import ConfigError, DatasetError
+from openvima.errors import DatasetError
 
 CONTROL = EnvConfig(control="end_effector")
 
@@ -54,9 +54,7 @@ def test_a_replay_gives_the_same_bytes_and_another_path_is_noticed(data) -> None
         dense_trajectory(demo, CONTROL)
 
 
-def test_the_manifest_names_the_control_and_the_rate_is_not_a_choice(data, tmp_path) -> None:
+def test_the_manifest_names_the_control(data) -> None:
     assert Dataset(data).manifest["config"]["control"] == "end_effector"
-    with pytest.raises(ConfigError, match=r"fps is 4, but a step of low-level control lasts 0\.1 s"):
-        export_lerobot(LerobotConfig(data, tmp_path / "out", fps=4))
     with pytest.raises(DatasetError, match="control is end_effector, asked for is primitives"):
         generate(GenerateConfig(data, ("rotate",), 1))

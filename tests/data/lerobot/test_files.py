@@ -4,19 +4,16 @@ from pathlib import Path
 
 import av
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from openvima.data import Demonstration
 from openvima.data.lerobot_files import (
     DATA_PATH,
     QUANTILES,
-    FileNumber,
-    NumberedTable,
     NumberedVideo,
     PixelFormat,
     count_pixels,
+    numbered_path,
     pixel_statistics,
     value_statistics,
 )
@@ -85,24 +82,9 @@ def test_a_row_of_commands_is_one_for_the_environment() -> None:
     assert frame_layout("primitives", 0, False).state_names == ("end_effector",)
 
 
-def test_a_chunk_is_full_after_a_thousand_files() -> None:
-    assert FileNumber(0, 998).next() == FileNumber(0, 999)
-    assert FileNumber(0, 999).next() == FileNumber(1, 0)
-
-
-@pytest.mark.parametrize("group_bytes", [1000, 10**6])
-def test_files_stay_below_their_limit_and_hold_all_rows_in_order(tmp_path: Path, group_bytes: int) -> None:
-    limit, numbers = 20_000, []
-    with NumberedTable(tmp_path, DATA_PATH, limit_bytes=limit, group_bytes=group_bytes) as table:
-        for start in range(0, 10_000, 50):
-            numbers.append(table.write(pa.table({"x": pa.array(range(start, start + 50))})))
-    files = sorted(tmp_path.rglob("*.parquet"))
-    assert len(files) > 2
-    assert numbers == sorted(numbers, key=lambda n: n.file)
-    assert pq.read_table(files[0])["x"].to_pylist()[-1] == 50 * numbers.count(FileNumber(0, 0)) - 1
-    joined = pa.concat_tables([pq.read_table(file) for file in files])
-    assert joined["x"].to_pylist() == list(range(10_000))
-    assert all(file.stat().st_size < limit for file in files)
+def test_a_chunk_is_full_after_a_thousand_files(tmp_path: Path) -> None:
+    shown = [numbered_path(tmp_path, DATA_PATH, number).relative_to(tmp_path) for number in (999, 1000)]
+    assert [*map(str, shown)] == ["data/chunk-000/file-999.parquet", "data/chunk-001/file-000.parquet"]
 
 
 def smallest_not_exceeded_by(values: np.ndarray, share: float) -> float:
@@ -188,18 +170,18 @@ def test_one_picture_is_shown_for_the_whole_episode(tmp_path: Path) -> None:
     assert all((frame == frames[0]).all() for frame in frames)
 
 
-def test_files_stay_below_their_limit(tmp_path: Path) -> None:
+def test_a_file_that_has_reached_its_limit_is_followed_by_another(tmp_path: Path) -> None:
     limit, places = 400_000, []
     with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=limit) as video:
         for seed in range(9):
             places.append(video.write(pictures(2, seed), num_frames=2))
     files = sorted(tmp_path.rglob("*.mp4"))
     assert len(files) > 2
-    assert all(file.stat().st_size < limit for file in files)
+    assert all(file.stat().st_size > limit for file in files[:-1])
     numbers = [number for number, _ in places]
-    assert numbers == sorted(numbers, key=lambda n: n.file)
+    assert numbers == sorted(numbers)
     for file_index, file in enumerate(files):
-        firsts = [first for number, first in places if number == FileNumber(0, file_index)]
+        firsts = [first for number, first in places if number == file_index]
         with av.open(str(file)) as container:
             assert container.streams.video[0].frames == 2 * len(firsts)
         assert firsts == list(range(0, 2 * len(firsts), 2))
