@@ -1,7 +1,5 @@
 """Presets: their sizes, configs in files, and errors that name a wrong field."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 import yaml
@@ -49,13 +47,16 @@ def test_an_unknown_preset_gets_a_suggestion() -> None:
         preset("nanno")
 
 
-def test_a_pointer_model_needs_fused_views_and_an_appearance_embedding() -> None:
-    sizes = preset("nano")
-    without = replace(sizes.images, appearance_width=0)
-    with pytest.raises(ConfigError, match="images needs fuse_views and an appearance_width above 0"):
-        replace(sizes, images=without)
-    with pytest.raises(ConfigError, match="fuse_views"):
-        replace(sizes.images, fuse_views=False)
+@pytest.mark.parametrize("name", config_to_dict(PRESETS["nano"]()))
+def test_a_file_that_lacks_a_part_or_has_a_scalar_for_it_is_refused(name: str) -> None:
+    values = config_to_dict(preset("nano"))
+    if isinstance(values[name], dict):
+        with pytest.raises(OpenVimaError, match=rf"policy\.{name} is 3"):
+            config_from_dict({**values, name: 3})
+    if name not in ("action_width", "correspondence", "coreference", "attributes"):  # these have defaults
+        del values[name]
+        with pytest.raises(OpenVimaError, match=name):
+            config_from_dict(values)
 
 
 def test_a_file_with_a_field_too_many_names_it_and_those_allowed() -> None:

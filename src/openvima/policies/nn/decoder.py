@@ -47,8 +47,8 @@ class DecoderConfig:
     initial_std: float = 0.02
 
     def __post_init__(self) -> None:
-        _check_sizes("decoder", self.width, self.num_self_heads, self.dropout)
-        _check_sizes("decoder", self.width, self.num_cross_heads, self.dropout)
+        _check_heads(self.width, self.num_self_heads)
+        _check_heads(self.width, self.num_cross_heads)
 
     @property
     def num_heads(self) -> int:
@@ -75,7 +75,7 @@ class PrefixDecoderConfig:
     initial_std: float = 0.02
 
     def __post_init__(self) -> None:
-        _check_sizes("prefix decoder", self.width, self.num_heads, self.dropout)
+        _check_heads(self.width, self.num_heads)
 
 
 AnyDecoderConfig = DecoderConfig | PrefixDecoderConfig
@@ -416,8 +416,6 @@ def check_length(length: int, limit: int, what: str) -> None:
         )
 
 
-def _check_sizes(what: str, width: int, heads: int, dropout: float) -> None:
+def _check_heads(width: int, heads: int) -> None:
     if heads < 1 or width % heads:
-        raise ConfigError(f"{what}: width {width} must be a multiple of its {heads} heads.")
-    if not 0 <= dropout < 1:
-        raise ConfigError(f"{what}: dropout is {dropout}; it must lie in [0, 1).")
+        raise ConfigError(f"decoder: width {width} must be a multiple of its {heads} heads.")

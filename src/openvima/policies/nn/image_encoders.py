@@ -49,17 +49,6 @@ class VitConfig:
     image_width: int = 32
     class_token: bool = True
 
-    def __post_init__(self) -> None:
-        if self.width % self.num_heads:
-            raise ConfigError(
-                f"image encoder: width {self.width} must be a multiple of {self.num_heads} heads."
-            )
-        height, width = self.image_height, self.image_width
-        if height % self.patch_size or width % self.patch_size:
-            raise ConfigError(
-                f"image encoder: {self.patch_size} px patches do not tile {height} × {width} px."
-            )
-
     @property
     def num_patches(self) -> int:
         """Number of patches of an image."""
@@ -168,10 +157,6 @@ class ConvConfig:
     def __post_init__(self) -> None:
         if self.width < _GROUPS or self.width % _GROUPS:
             raise ConfigError(f"crop encoder: width is {self.width}; it must be a multiple of {_GROUPS}.")
-        if self.place_channels < 0:
-            raise ConfigError(
-                f"crop encoder: place_channels is {self.place_channels}; it must be at least 0."
-            )
 
 
 class ConvEncoder(nn.Module):
@@ -242,13 +227,6 @@ class ResamplerConfig:
     num_heads: int = 8
     dropout: float = 0.1
     initial_std: float = 0.02
-
-    def __post_init__(self) -> None:
-        if self.num_latents < 1 or self.num_heads < 1 or not 0 <= self.dropout < 1:
-            raise ConfigError(
-                f"resampler: num_latents is {self.num_latents}, num_heads {self.num_heads} and dropout "
-                f"{self.dropout}; they must be at least 1, at least 1 and in [0, 1)."
-            )
 
 
 class Resampler(nn.Module):

@@ -113,20 +113,6 @@ class ObjectEncoderConfig:
     crop_dropout: float = 0.0
     rotation_bins: int = 0
 
-    def __post_init__(self) -> None:
-        if self.appearance_width and not self.fuse_views:
-            raise ConfigError(
-                "object encoder: an appearance embedding needs fuse_views, one token per object."
-            )
-        if not 0 <= self.crop_dropout < 1:
-            raise ConfigError(f"object encoder: crop_dropout is {self.crop_dropout}; it must lie in [0, 1).")
-        if self.rotation_bins < 0 or self.rotation_bins == 1:
-            raise ConfigError(
-                f"object encoder: rotation_bins is {self.rotation_bins}; it must be 0, or at least 2."
-            )
-        if self.rotation_bins and not self.appearance_width:
-            raise ConfigError("object encoder: rotation_bins needs an appearance width above 0.")
-
 
 class ObjectEncoder(nn.Module):
     """Crops -> features (`encode_images`), then features and boxes -> tokens (`forward`).

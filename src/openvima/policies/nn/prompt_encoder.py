@@ -14,7 +14,6 @@ from typing import Literal
 import torch
 from torch import nn
 
-from openvima.errors import ConfigError
 from openvima.policies.batch import PromptBatch
 from openvima.policies.nn.layers import TrainingLinear, Unpadder, mlp
 
@@ -162,15 +161,6 @@ class PromptEncoderConfig:
     train_words: bool = True
     trained_layers: int | None = None
     visual_residual: bool = False
-
-    def __post_init__(self) -> None:
-        if self.tokenizer not in ("words", "t5"):
-            raise ConfigError(f"prompt encoder: tokenizer is {self.tokenizer!r}; allowed: 'words', 't5'.")
-        layers = self.text.num_layers
-        if self.trained_layers is not None and not 0 <= self.trained_layers <= layers:
-            raise ConfigError(
-                f"prompt encoder: trained_layers is {self.trained_layers}; it must be between 0 and {layers}."
-            )
 
 
 class PromptEncoder(nn.Module):

@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from openvima.errors import ConfigError
 from openvima.policies.batch import InputLayout
 from openvima.policies.nn.decoder import AnyDecoderConfig, DecoderConfig
 from openvima.policies.nn.image_encoders import ConvConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
 from openvima.policies.sizes import VOCABULARY_SIZE, size
 
@@ -31,10 +30,6 @@ class ObjectHeadConfig:
     offset_weight: float = 2.0
     yaw_weight: float = 0.5
 
-    def __post_init__(self) -> None:
-        if self.num_yaw_bins < 2 or self.hidden_width < 1:
-            raise ConfigError("object head: it needs at least 2 yaw bins and a hidden width of at least 1.")
-
 
 @dataclass(frozen=True, slots=True)
 class CandidateHeadConfig(ObjectHeadConfig):
@@ -57,15 +52,6 @@ class CandidateHeadConfig(ObjectHeadConfig):
     num_prompt_queries: int = 2
     num_index_embeddings: int = 16
 
-    def __post_init__(self) -> None:
-        least = min(self.hidden_width, self.num_prompt_queries, self.num_index_embeddings)
-        if self.num_yaw_bins < 2 or least < 1:
-            raise ConfigError(
-                f"candidate head: num_yaw_bins is {self.num_yaw_bins}, hidden_width {self.hidden_width}, "
-                f"num_prompt_queries {self.num_prompt_queries} and num_index_embeddings "
-                f"{self.num_index_embeddings}; they must be at least 2, 1, 1 and 1."
-            )
-
 
 @dataclass(frozen=True, slots=True)
 class CorrespondenceConfig:
@@ -80,13 +66,6 @@ class CorrespondenceConfig:
     hidden_width: int = 192
     num_heads: int = 2
     within_view: bool = True
-
-    def __post_init__(self) -> None:
-        if self.hidden_width < 1 or self.num_heads < 1:
-            raise ConfigError(
-                f"correspondence: hidden_width is {self.hidden_width} and num_heads {self.num_heads}; both "
-                "must be at least 1."
-            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +82,6 @@ class AttributeConfig:
     hidden_width: int = 128
     width: int = 32
     exclusive: bool = False
-
-    def __post_init__(self) -> None:
-        if self.hidden_width < 1 or self.width < 1:
-            raise ConfigError(
-                f"attributes: hidden_width is {self.hidden_width} and width {self.width}; both must be at "
-                "least 1."
-            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,13 +110,6 @@ class PointerConfig:
     correspondence: CorrespondenceConfig | None = None
     coreference: bool = False
     attributes: AttributeConfig | None = None
-
-    def __post_init__(self) -> None:
-        if self.attributes and not isinstance(self.head, CandidateHeadConfig):
-            raise ConfigError("pointer: attributes need a head of place candidates.")
-        check_widths(self.images.width, self.decoder.width)
-        if not self.images.fuse_views or not self.images.appearance_width:
-            raise ConfigError("pointer: images needs fuse_views and an appearance_width above 0.")
 
     @property
     def inputs(self) -> InputLayout:
