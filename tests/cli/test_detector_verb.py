@@ -92,16 +92,15 @@ def test_invalid_options_of_evaluate_give_a_one_line_error(detector, data, capsy
     assert re.search(message, told)
 
 
-def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):
-    from openvima.detector import checkpoint
+def test_scores_do_not_depend_on_the_number_of_threads(detector, data, capsys):
+    def scored(threads: int) -> str:
+        with torch_threads(threads):
+            words = [str(detector), "--data", str(data), "--frames", "4", "--json"]
+            assert main(["detector", "evaluate", *words]) == 0
+            assert torch.get_num_threads() == threads
+        return capsys.readouterr().out
 
-    monkeypatch.setattr(checkpoint, "load_detectron2", lambda file: MaskRCNN(tiny))
-    words = ["detector", "convert", "weights.pth", str(tmp_path / "converted")]
-    assert main(words) == 0
-    assert load_network(tmp_path / "converted").config == tiny
-    assert main(words) == 2
-    assert "exists" in capsys.readouterr().err
-    assert main([*words, "--force"]) == 0
+    assert scored(1) == scored(2)
 
 
 def test_a_missing_detector_gives_a_one_line_error(tmp_path, capsys):
