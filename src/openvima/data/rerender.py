@@ -37,6 +37,7 @@ from openvima.errors import (
     DatasetError,
     OpenVimaError,
     UnknownNameError,
+    UnknownTaskError,
 )
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
@@ -72,15 +73,15 @@ def rerender(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonst
     Raises:
         DatasetError: It is not the same any more: the packages that render are others than those that wrote.
         AssetError: The asset pack is not there, or is a function that was not loaded before.
-        UnknownNameError, UnknownNameError: An object or texture of a user is not registered.
+        UnknownNameError: An object or texture of a user is not registered.
     """
     try:
         rasteriser = _rasteriser(info.assets)
         rgb, segm = render_observations(rasteriser, demo.scenes)
         prompt = rasteriser.prompt(sample_prompt(demo, info, rasteriser.assets))
-    except (AssetError, UnknownNameError):
-        raise
     except OpenVimaError as error:  # the task samples no episode for this seed, or is gone
+        if isinstance(error, AssetError | UnknownNameError) and not isinstance(error, UnknownTaskError):
+            raise
         raise _explain_change(demo, info, f" ({error})") from error
     result = dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=prompt)
     if result.content_hash() != content_hash:
