@@ -1,7 +1,5 @@
 """Writing a data set that is made of others: where it may lie, its shards, what its manifest says."""
 
-import shlex
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +15,6 @@ from openvima.data.manifest import (
     FAILED_FOLDER,
     INDEX_NAME,
     MANIFEST_NAME,
-    fingerprint,
 )
 from openvima.data.reader import Dataset
 from openvima.data.shard import ShardWriter
@@ -76,13 +73,11 @@ class ShardPart:
         info: What all its rows have in common; its number is not used.
         dataset: The data set that holds the rows.
         episodes: Numbers of the rows in the data set, in order.
-        original: Name of the shard whose file is copied, as it has just these rows; empty to write a new one.
     """
 
     info: ShardInfo
     dataset: Dataset
     episodes: Sequence[int]
-    original: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +90,6 @@ class ShardCopy:
         source: Folder of the data set that holds the rows.
         checksum: Of that data set's manifest.
         episodes: As in `ShardPart`.
-        original: As in `ShardPart`.
     """
 
     path: Path
@@ -103,7 +97,6 @@ class ShardCopy:
     source: Path
     checksum: str
     episodes: tuple[int, ...]
-    original: str
 
 
 def number_shards(folder: Path, parts: Iterable[ShardPart]) -> list[ShardCopy]:
@@ -115,7 +108,7 @@ def number_shards(folder: Path, parts: Iterable[ShardPart]) -> list[ShardCopy]:
         numbers[key] += 1
         source, checksum = part.dataset.path, part.dataset.manifest["checksum"]
         path, episodes = folder / info.file_name, tuple(part.episodes)
-        shards.append(ShardCopy(path, info, source, checksum, episodes, part.original))
+        shards.append(ShardCopy(path, info, source, checksum, episodes))
     return shards
 
 
@@ -147,20 +140,10 @@ def write_shard(shard: ShardCopy, count: Callable[[int], None]) -> None:
         DatasetError: What is read is damaged.
     """
     dataset = _open_unchanged(shard.source, shard.checksum)
-    if not shard.original:
-        with ShardWriter(shard.path, shard.info) as writer:
-            for number, episode_index in enumerate(shard.episodes, start=1):
-                writer.copy(dataset.batch(episode_index))
-                count(number)
-        return
-    original = shard.source / shard.original
-    shutil.copyfile(original, shard.path)
-    if fingerprint(shard.path)["sha256"] != dataset.manifest["shards"][shard.original]["sha256"]:
-        raise DatasetError(
-            f"{original} is damaged: its checksum is not that of the manifest. "
-            f"`openvima data verify {shlex.quote(str(shard.source))}` says more."
-        )
-    count(len(shard.episodes))
+    with ShardWriter(shard.path, shard.info) as writer:
+        for number, episode_index in enumerate(shard.episodes, start=1):
+            writer.copy(dataset.batch(episode_index))
+            count(number)
 
 
 @lru_cache(maxsize=2)

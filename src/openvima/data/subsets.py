@@ -96,7 +96,6 @@ class SubsetConfig:
         out: The folder to write.
         tasks: Take the episodes of these tasks only; None takes all.
         seed: Another one gives another choice.
-        compression: Codec of the new shards, "lz4" or "zstd"; None keeps that of the source.
         workers: Number of processes.
         force: Replace a data set that is in the folder.
     """
@@ -105,7 +104,6 @@ class SubsetConfig:
     out: Path
     tasks: tuple[str, ...] | None = None
     seed: int = 0
-    compression: str | None = None
     workers: int = 1
     force: bool = False
 
@@ -118,7 +116,6 @@ class SubsetConfig:
             "source": identify_source(dataset.manifest),
             "tasks": None if self.tasks is None else sorted(self.tasks),
             "seed": self.seed,
-            "compression": self.compression,
         }
 
 
@@ -281,7 +278,7 @@ def _write(subsets: Sequence[_Subset], dataset: Dataset, config: SubsetConfig, r
     plans = []
     for subset in subsets:
         subset.folder.mkdir(exist_ok=True)
-        parts = _group(dataset, np.flatnonzero(subset.mask).tolist(), config.compression)
+        parts = _group(dataset, np.flatnonzero(subset.mask).tolist())
         plans.append(number_shards(subset.folder, parts))
     write_shards([shard for plan in plans for shard in plan], config.workers, report)
     for subset, plan in zip(subsets, plans, strict=True):
@@ -295,7 +292,7 @@ def _write(subsets: Sequence[_Subset], dataset: Dataset, config: SubsetConfig, r
         )
 
 
-def _group(dataset: Dataset, episodes: Sequence[int], compression: str | None) -> list[ShardPart]:
+def _group(dataset: Dataset, episodes: Sequence[int]) -> list[ShardPart]:
     """Divide chosen episodes, ascending, into shards of equal settings."""
     commons: dict[str, tuple[tuple[str | bytes, ...], ShardInfo]] = {}  # of each source shard
     groups: dict[tuple[str | bytes, ...], tuple[ShardInfo, list[int]]] = {}
@@ -303,8 +300,7 @@ def _group(dataset: Dataset, episodes: Sequence[int], compression: str | None) -
         name, _ = dataset.locate(episode_index)
         if name not in commons:
             info = dataset.shard(name).info
-            codec = compression or info.compression
-            common = replace(info, number=0, shard_size=0, first_seed=0, compression=codec)
+            common = replace(info, number=0, shard_size=0, first_seed=0)
             commons[name] = (info.task, info.level, *common.to_metadata().values()), common
         key, common = commons[name]
         groups.setdefault(key, (common, []))[1].append(episode_index)
@@ -324,7 +320,6 @@ class MergeConfig:
         out: The folder to write.
         tasks: Take the episodes of these tasks only; None takes all.
         duplicates: What to do with episodes that several sources hold: "refuse", or "skip" all but one.
-        compression: Codec of the new shards, "lz4" or "zstd"; None keeps those of the sources.
         workers: Number of processes.
         force: Replace a data set that is in the folder.
     """
@@ -333,7 +328,6 @@ class MergeConfig:
     out: Path
     tasks: tuple[str, ...] | None = None
     duplicates: Duplicates = "refuse"
-    compression: str | None = None
     workers: int = 1
     force: bool = False
 
@@ -345,8 +339,7 @@ class MergeConfig:
 def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
     """Put data sets together, of whatever tasks, levels, settings and versions.
 
-    Each shard says what its rows have in common, so it is copied byte for byte under a new number. Only
-    where another compression is asked for or episodes are skipped are shards written anew.
+    Each shard says what its rows have in common, and stays one under a new number.
 
     Args:
         config: What to read and write.
@@ -374,12 +367,11 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
         "sources": [identify_source(dataset.manifest) for dataset in datasets],
         "tasks": None if config.tasks is None else sorted(config.tasks),
         "duplicates": config.duplicates,
-        "compression": config.compression,
     }
     manifests = [dataset.manifest for dataset in datasets]
     packages = sorted({name for manifest in manifests for name in manifest["versions"]})
     with folder_lock(config.out), atomic_folder(config.out) as folder:
-        shards = number_shards(folder, [_choose_copy(part, config.compression) for part in parts])
+        shards = number_shards(folder, parts)
         write_shards(shards, config.workers, report)
         finish_folder(
             folder,
@@ -416,7 +408,7 @@ def _find_shards(datasets: Sequence[Dataset], tasks: Sequence[str] | None) -> li
                 # Of duplicates the first is kept: rather one with images than one without.
                 first_seed = int(seeds[episodes[0]])
                 order = (info.task, info.level, info.domain, first_seed, not info.images, sha256)
-                found.append((order, ShardPart(info, dataset, episodes.tolist(), name)))
+                found.append((order, ShardPart(info, dataset, episodes.tolist())))
     return [part for _, part in sorted(found, key=lambda entry: entry[0])]
 
 
@@ -456,15 +448,6 @@ def _skip_duplicates(parts: Sequence[ShardPart], *, refuse: bool) -> list[ShardP
             "Leave a source out, or keep one of each with --duplicates skip."
         )
     return kept
-
-
-def _choose_copy(part: ShardPart, compression: str | None) -> ShardPart:
-    """Copy a shard's file if all its episodes are wanted as they are; else a new one is written."""
-    num_episodes = part.dataset.manifest["shards"][part.original]["episodes"]
-    if len(part.episodes) == num_episodes and compression in (None, part.info.compression):
-        return part
-    info = replace(part.info, compression=compression or part.info.compression)
-    return replace(part, info=info, original="")
 
 
 def _join(words: Sequence[str | None], between: str) -> str:

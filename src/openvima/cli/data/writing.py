@@ -10,8 +10,6 @@ import tyro
 from openvima.cli.terminal import parse_list, parse_tasks, print_files, progress_bar
 from openvima.data.chat_settings import DEFAULT_ENLARGE, ChatView, Points
 
-Compression = Literal["lz4", "zstd"]
-
 
 def sample(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
@@ -21,7 +19,6 @@ def sample(
     episodes: int | None = None,
     tasks: str = "all",
     seed: int = 0,
-    compression: Compression | None = None,
     workers: int = 1,
     force: bool = False,
 ) -> int:
@@ -39,7 +36,6 @@ def sample(
         episodes: Instead of a fraction: so many episodes of each task, or all that it has.
         tasks: Comma-separated names of tasks, or "all".
         seed: Seed of the sample.
-        compression: Codec of the new files; by default that of the source.
         workers: Number of processes.
         force: Replace a data set in the folder.
 
@@ -49,7 +45,7 @@ def sample(
     from openvima.data.subsets import SubsetConfig
     from openvima.data.subsets import sample as write_sample
 
-    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
+    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, workers, force)
     with progress_bar("demonstrations") as report:
         print(write_sample(config, fraction, episodes=episodes, report=report))
     return 0
@@ -62,7 +58,6 @@ def split(
     splits: str,
     tasks: str = "all",
     seed: int = 0,
-    compression: Compression | None = None,
     workers: int = 1,
     force: bool = False,
 ) -> int:
@@ -79,7 +74,6 @@ def split(
         splits: Comma-separated NAME=FRACTION pairs; the fractions add up to 1.
         tasks: Comma-separated names of tasks, or "all".
         seed: Seed of the assignment.
-        compression: Codec of the new files; by default that of the source.
         workers: Number of processes.
         force: Replace data sets in the folder.
 
@@ -89,7 +83,7 @@ def split(
     from openvima.data.subsets import SubsetConfig, parse_splits
     from openvima.data.subsets import split as write_split
 
-    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
+    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, workers, force)
     fractions = parse_splits(splits)
     with progress_bar("demonstrations") as report:
         written = write_split(config, fractions, report=report)
@@ -103,13 +97,10 @@ def merge(
     *,
     tasks: str = "all",
     duplicates: Literal["refuse", "skip"] = "refuse",
-    compression: Compression | None = None,
     workers: int = 1,
     force: bool = False,
 ) -> int:
     """Merge data sets, whatever their tasks, levels, settings and versions.
-
-    Files are copied byte for byte unless another compression is asked for or episodes are skipped.
 
     Example: openvima data merge rotations stacks all-demos
 
@@ -117,7 +108,6 @@ def merge(
         folders: The sources, and last the folder to write to.
         tasks: Comma-separated names of tasks, or "all".
         duplicates: Refuse episodes that several sources contain, or skip all but one.
-        compression: Codec of the new files; by default those of the sources.
         workers: Number of processes.
         force: Replace a data set in the folder.
 
@@ -130,9 +120,7 @@ def merge(
 
     if len(folders) < 2:
         raise ConfigError("give at least two folders: what to merge, and last where to write it.")
-    config = MergeConfig(
-        folders[:-1], folders[-1], parse_tasks(tasks), duplicates, compression, workers, force
-    )
+    config = MergeConfig(folders[:-1], folders[-1], parse_tasks(tasks), duplicates, workers, force)
     with progress_bar("demonstrations") as report:
         print(write_merged(config, report=report))
     return 0
