@@ -127,22 +127,20 @@ class UnknownWordWarning(UserWarning):
 
     Args:
         words: The words, each with a known one to suggest, or an empty text.
-        are_all: Whether further unknown words would be named.
     """
 
-    def __init__(self, words: Mapping[str, str], are_all: bool = True) -> None:
+    def __init__(self, words: Mapping[str, str]) -> None:
         shown = echo(", ".join(map(repr, words)), _MAX_WORDS)
         known = ", ".join(repr(word) for word in list(filter(None, words.values()))[:_MAX_SUGGESTIONS])
         hint = f" Did you mean {known}?" if known else ""
-        last = "" if are_all else " Further unknown words are not named."
         super().__init__(
             f"prompts have words that the policy never saw in training: {shown}.{hint} Use other words, or "
-            f"train it on prompts with these.{last}"
+            f"train it on prompts with these."
         )
-        self.words, self.are_all = dict(words), are_all
+        self.words = dict(words)
 
-    def __reduce__(self) -> tuple[type, tuple[dict[str, str], bool]]:
-        return type(self), (self.words, self.are_all)
+    def __reduce__(self) -> tuple[type, tuple[dict[str, str]]]:
+        return type(self), (self.words,)
 
 
 @contextmanager
@@ -173,7 +171,7 @@ def one_word_warning() -> Iterator[None]:
     finally:
         if found:
             words = {word: near for warning in found for word, near in warning.words.items()}
-            warnings.warn(UnknownWordWarning(words, all(w.are_all for w in found)), stacklevel=3)
+            warnings.warn(UnknownWordWarning(words), stacklevel=3)
 
 
 _MAX_WORDS = 1000  # characters of unknown words in a warning

@@ -223,18 +223,8 @@ class WordTokenizer:
         if not new:
             return
         self._warned.update(new)
-        near = [word for word in difflib.get_close_matches(new[0], self._ids) if _is_one_edit(new[0], word)]
-        words = dict.fromkeys(new, "") | {new[0]: near[0] if near else ""}
-        warnings.warn(UnknownWordWarning(words, len(self._warned) < _MAX_WARNED), stacklevel=2)
-
-
-def _is_one_edit(one: str, other: str) -> bool:
-    """Whether words differ by a letter that is inserted, deleted or replaced."""
-    alike = next(
-        (n for n, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other))
-    )
-    rest, other_rest = one[alike:], other[alike:]
-    return rest[1:] in (other_rest, other_rest[1:]) or rest == other_rest[1:]
+        near = difflib.get_close_matches(new[0], self._ids, n=1, cutoff=0.8)
+        warnings.warn(UnknownWordWarning({**dict.fromkeys(new, ""), new[0]: "".join(near)}), stacklevel=2)
 
 
 def _is_number(piece: str) -> bool:
