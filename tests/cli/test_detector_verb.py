@@ -92,17 +92,6 @@ def test_invalid_options_of_evaluate_give_a_one_line_error(detector, data, capsy
     assert re.search(message, told)
 
 
-def test_scores_do_not_depend_on_the_number_of_threads(detector, data, capsys):
-    def scored(threads: int) -> str:
-        with torch_threads(threads):
-            words = [str(detector), "--data", str(data), "--frames", "4", "--json"]
-            assert main(["detector", "evaluate", *words]) == 0
-            assert torch.get_num_threads() == threads
-        return capsys.readouterr().out
-
-    assert scored(1) == scored(2)
-
-
 def test_a_missing_detector_gives_a_one_line_error(tmp_path, capsys):
     assert main(["detector", "show", str(tmp_path / "none")]) == 2
     assert "there is no folder" in capsys.readouterr().err

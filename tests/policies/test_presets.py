@@ -47,18 +47,6 @@ def test_an_unknown_preset_gets_a_suggestion() -> None:
         preset("nanno")
 
 
-@pytest.mark.parametrize("name", config_to_dict(PRESETS["nano"]()))
-def test_a_file_that_lacks_a_part_or_has_a_scalar_for_it_is_refused(name: str) -> None:
-    values = config_to_dict(preset("nano"))
-    if isinstance(values[name], dict):
-        with pytest.raises(OpenVimaError, match=rf"policy\.{name} is 3"):
-            config_from_dict({**values, name: 3})
-    if name not in ("action_width", "correspondence", "coreference", "attributes"):  # these have defaults
-        del values[name]
-        with pytest.raises(OpenVimaError, match=name):
-            config_from_dict(values)
-
-
 def test_a_file_with_a_field_too_many_names_it_and_those_allowed() -> None:
     with pytest.raises(ConfigError, match=r"policy has unknown fields depth; allowed: images, prompt"):
         config_from_dict({**config_to_dict(preset("nano")), "depth": 3})
