@@ -1,4 +1,4 @@
-"""Choosing an asset pack, what it remembers, and the cache on disk."""
+"""Packs by name, and what each level draws from."""
 
 import subprocess
 import sys
@@ -6,9 +6,20 @@ import sys
 import pytest
 
 from openvima.catalog.geometry import CollisionHull
+from openvima.catalog.objects import OBJECTS
 from openvima.catalog.packs import load_assets
+from openvima.catalog.partitions import (
+    LEVEL_TITLES,
+    OBJECT_SETS,
+    PUBLISHED_LEVELS,
+    TEXTURE_SETS,
+    levels_of,
+    pool,
+    tasks_at,
+)
 from openvima.catalog.procedural import ProceduralAssets
-from openvima.errors import AssetError
+from openvima.catalog.textures import TEXTURES
+from openvima.errors import AssetError, ConfigError, UnknownTaskError
 
 SIZE = (0.16, 0.16, 0.05)
 
@@ -73,3 +84,75 @@ def test_shapes_and_textures_are_equal_in_another_process():
         subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout for _ in "ab"
     }
     assert len(runs) == 1
+
+
+def test_levels_hold_13_13_13_12_and_4_tasks_and_clutter_the_trained_ones():
+    assert [len(tasks_at(level)) for level in PUBLISHED_LEVELS] == [13, 13, 13, 12, 4]
+    assert tasks_at("L5") == tasks_at("train")
+    assert all(pool(task, "L5") == pool(task, "L3") for task in tasks_at("L3"))
+    assert len({task for level in PUBLISHED_LEVELS for task in tasks_at(level)}) == 17
+
+
+def test_sets_hold_known_names_once():
+    for names in OBJECT_SETS.values():
+        assert len(set(names)) == len(names) and set(names) <= set(OBJECTS)
+    for names in TEXTURE_SETS.values():
+        assert len(set(names)) == len(names) and set(names) <= set(TEXTURES)
+
+
+def test_objects_of_the_third_level_were_never_trained_with_except_the_shorter_block():
+    train = {name for task in tasks_at("train") for name in pool(task, "train").dragged_objects}
+    novel = {name for task in tasks_at("L3") for name in pool(task, "L3").dragged_objects}
+    assert train & novel == {"shorter block"}
+    train_bases = {name for task in tasks_at("train") for name in pool(task, "train").base_objects}
+    assert train_bases.isdisjoint(OBJECT_SETS["B_novel"])
+
+
+def test_training_textures_of_the_two_roles_are_disjoint():
+    assert set(TEXTURE_SETS["C1"]).isdisjoint(TEXTURE_SETS["C2"])
+
+
+def test_the_second_level_exchanges_the_textures_of_the_roles():
+    train, swapped = pool("visual_manipulation", "train"), pool("visual_manipulation", "L2")
+    assert swapped.dragged_textures == train.base_textures
+    assert swapped.base_textures == train.dragged_textures
+    assert swapped.dragged_objects == train.dragged_objects
+
+
+def test_a_task_absent_from_a_level_is_refused_with_its_levels():
+    with pytest.raises(
+        ConfigError, match=r"sweep_without_exceeding is not defined at level L3; .* train, L1, L2"
+    ):
+        pool("sweep_without_exceeding", "L3")
+    assert levels_of("same_texture") == ("L4",)
+
+
+def test_unknown_tasks_and_levels_are_refused():
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        pool("rotat", "train")
+    with pytest.raises(ConfigError, match="Allowed: train, L1, L2, L3, L4"):
+        tasks_at("L9")
+
+
+def test_sets_and_levels_equal_the_machine_readable_catalogue(catalogue):
+    assert catalogue["levels"] == LEVEL_TITLES
+    for name, members in catalogue["object_sets"].items():
+        assert list(OBJECT_SETS[name]) == members, name
+    for name, members in catalogue["texture_sets"].items():
+        assert list(TEXTURE_SETS[name]) == members, name
+
+
+@pytest.mark.parametrize("level", PUBLISHED_LEVELS)
+def test_pools_equal_the_machine_readable_catalogue(catalogue, level):
+    assert list(tasks_at(level)) == list(catalogue["partitions"][level])
+    for task, record in catalogue["partitions"][level].items():
+        ours = pool(task, level)
+        for field, sets in (
+            ("dragged_objects", OBJECT_SETS),
+            ("base_objects", OBJECT_SETS),
+            ("dragged_textures", TEXTURE_SETS),
+            ("base_textures", TEXTURE_SETS),
+        ):
+            members = record.get(field, [])
+            expected = sets[members] if isinstance(members, str) else tuple(members)
+            assert getattr(ours, field) == expected, (task, field)

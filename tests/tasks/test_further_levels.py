@@ -1,0 +1,240 @@
+"""Tasks of the levels beyond the published ones."""
+
+import itertools
+import re
+
+import pytest
+
+from openvima.catalog import object_spec, tasks_at
+from openvima.catalog.textures import NEUTRAL_TEXTURE
+from openvima.scene import AtPose, ObjectImage, Placement, Pose, Problem, SceneImage
+from openvima.tasks import sample_episode
+from openvima.tasks.clutter import LEAST, MOST
+from openvima.tasks.compositions import COMPOSITIONS, offset, template
+from task_cases import judge_step, judged, played
+
+SEEDS = range(5)
+
+
+def sampled(task: str, seed: int, **options: object) -> Problem:
+    return sample_episode(task, seed=seed, domain="eval", **options).problem
+
+
+def moves(problem: Problem) -> list[dict[int, Pose]]:
+    """One step for each goal, in order."""
+    return [{goal.object_id: goal.target} for goal in problem.goals if isinstance(goal, AtPose)]
+
+
+def fits(placement: Placement, named: str | Placement) -> bool:
+    """Whether an object is of a texture, or of the shape of a gray image."""
+    return named == placement.texture if isinstance(named, str) else named.object == placement.object
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", ["texture", "shape"])
+def test_sorting_is_solved_by_the_containers_of_the_prompt_alone(kind: str, seed: int) -> None:
+    problem = sampled(f"sort_by_{kind}", seed)
+    images = {name: fill.placement for name, fill in problem.prompt.images if isinstance(fill, ObjectImage)}
+    bases = [images[f"base_{n}"] for n in (1, 2, 3)]
+    text = problem.prompt.text
+    if kind == "texture":
+        named: list = [text.split("all ")[n].split(" objects")[0] for n in (1, 2, 3)]
+    else:
+        named = [images[f"shape_{n}"] for n in (1, 2, 3)]
+        assert {image.texture for image in named} == {NEUTRAL_TEXTURE}
+    loose = [p for p in problem.scene.placements if not p.fixed]
+    right = {p.id: base for p in loose for name, base in zip(named, bases, strict=True) if fits(p, name)}
+    assert 6 <= len(right) <= 8 and len(loose) == len(right) + 1
+
+    steps = [{object_id: base.pose} for object_id, base in right.items()]
+    assert judged(problem, *steps)[1].success
+    assert not judged(problem, *steps[:-1])[1].is_over
+    first, base = next(iter(right.items()))
+    for wrong in bases:
+        assert judged(problem, {first: wrong.pose})[1].failure == (wrong is not base)
+    distractor = next(p.id for p in loose if p.id not in right)
+    assert judged(problem, {distractor: base.pose})[1].failure
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_pattern_is_built_from_the_image_with_cleared_targets(seed: int) -> None:
+    problem = sampled("build_pattern", seed, num_distractors=2)
+    ((_, image),) = problem.prompt.images
+    assert isinstance(image, SceneImage)
+    shown = {(p.object, p.texture): p.pose for p in image.scene.placements}
+    objects = [p for p in problem.scene.placements if (p.object, p.texture) in shown]
+    assert 6 <= len(objects) <= 8
+    clear = [{goal.object_id: goal.target} for goal in problem.prerequisites]
+    steps = [{p.id: shown[p.object, p.texture]} for p in objects]
+    assert judged(problem, *clear, *steps)[1].success
+    assert not clear or judged(problem, *steps)[1].failure
+
+
+@pytest.mark.parametrize("num_objects", [4, 5, 6])
+def test_an_order_is_reversed_whatever_the_way(num_objects: int) -> None:
+    problem = sampled("reverse_order", 1, num_objects=num_objects)
+    row = [fill.placement for _, fill in problem.prompt.images if isinstance(fill, ObjectImage)]
+    assert [p.pose.y for p in row] == sorted(p.pose.y for p in row)
+    reached = {p.id: other.pose for p, other in zip(row, row[::-1], strict=True) if p is not other}
+    assert {goal.object_id: goal.target for goal in problem.goals if isinstance(goal, AtPose)} == reached
+    aside = [{goal.object_id: goal.target} for goal in problem.prerequisites]
+    steps = [*aside, *({object_id: pose} for object_id, pose in reached.items())]
+    assert len(steps) == 3 * (num_objects // 2)
+    outcomes = played(problem, *steps)
+    assert outcomes[-1].success and not any(outcome.is_over for outcome in outcomes[:-1])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_video_is_imitated_in_order_and_undone(seed: int) -> None:
+    problem = sampled("imitate_then_undo", seed)
+    frames = [fill.scene.placements for _, fill in problem.prompt.images if isinstance(fill, SceneImage)]
+    ids = {(p.object, p.texture): p.id for p in problem.scene.placements}
+    shown = [{ids[p.object, p.texture]: p.pose for p in frame} for frame in frames]
+    assert len(shown) == 6 and len(problem.scene.placements) == 4
+    assert all(problem.scene[object_id].pose == pose for object_id, pose in shown[0].items())
+    there_and_back = [*shown[1:], *shown[-2::-1]]
+    for before, after in itertools.pairwise(shown):
+        assert sum(before[object_id] != after[object_id] for object_id in before) == 1
+    assert [outcome.success for outcome in played(problem, *there_and_back)] == [False] * 9 + [True]
+    assert not judged(problem, *shown[1:], shown[0])[1].success  # not step by step
+    assert len(moves(problem)) == 10
+
+
+SEEDS_COMPOSITIONS = range(3)
+CASES = [(name, seed) for name in COMPOSITIONS for seed in SEEDS_COMPOSITIONS]
+
+
+def sampled_of_compositions(name: str, seed: int, **options: object) -> Problem:
+    return sample_episode(name, seed=seed, domain="eval", **options).problem
+
+
+def steps_of(problem: Problem) -> list[dict[int, Pose]]:
+    return [{goal.object_id: goal.target} for goal in problem.goals if isinstance(goal, AtPose)]
+
+
+def test_there_are_pairs_and_triples_of_instructions() -> None:
+    numbers = [sum(kind != "define" for kind in kinds) for kinds in COMPOSITIONS.values()]
+    assert numbers.count(2) >= 12 and numbers.count(3) >= 4 and set(numbers) == {2, 3}
+    assert len(set(COMPOSITIONS.values())) == len({template(kinds) for kinds in COMPOSITIONS.values()}) == 18
+
+
+@pytest.mark.parametrize(("name", "seed"), CASES)
+def test_instructions_are_fulfilled_in_order_alone(name: str, seed: int) -> None:
+    problem = sampled_of_compositions(name, seed)
+    steps = steps_of(problem)
+    outcomes = played(problem, *steps)
+    assert outcomes[-1].success and not any(outcome.is_over for outcome in outcomes[:-1])
+    last = steps[-2] if COMPOSITIONS[name][-1] == "restore" else steps[-1]
+    assert judged(problem, last)[1].failure == (last is not steps[0])
+
+
+@pytest.mark.parametrize(("name", "seed"), CASES)
+def test_a_prompt_means_one_object_and_a_distractor_in_a_base_is_a_failure(name: str, seed: int) -> None:
+    problem = sampled_of_compositions(name, seed)
+    placements, goals = problem.scene.placements, problem.goals
+    for slot, fill in problem.prompt.images:
+        if isinstance(fill, ObjectImage):
+            shown = fill.placement
+            fitting = [
+                p
+                for p in placements
+                if p.object == shown.object and shown.texture in (p.texture, NEUTRAL_TEXTURE)
+            ]
+            assert len(fitting) == 1, slot
+    if name.startswith("gather"):
+        base = problem.scene[goals[0].relative_to]  # type: ignore[union-attr]
+        alike = {p.id for p in placements if p.texture == base.texture}
+        assert alike == {base.id, *(goal.object_id for goal in goals[:2])}  # type: ignore[union-attr]
+    distractor = problem.constraints[-1].object_ids[0]  # type: ignore[union-attr]
+    bases = [goal.target for goal in goals if goal.relative_to not in (None, goal.object_id)]  # type: ignore[union-attr]
+    assert not bases or judged(problem, {distractor: bases[0]})[1].failure
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_neighbor_is_the_nearest_object_in_its_direction(seed: int) -> None:
+    problem = sampled_of_compositions("put_then_neighbor", seed)
+    dragged, neighbor = (problem.scene[goal.object_id] for goal in problem.goals)  # type: ignore[union-attr]
+    word = problem.prompt.text.split(" at its ")[1].split()[0]
+    step = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}[word]
+    there = [p for p in problem.scene.placements if offset(p, dragged, step)[0] > offset(p, dragged, step)[1]]
+    assert min(there, key=lambda p: p.pose.planar_distance(dragged.pose)) == neighbor
+
+
+CASES_CLUTTER = [(task, seed) for task in tasks_at("L5") for seed in range(4)]
+NUM_TWINS = {"novel_adj": {"dragged_obj": 2}}  # of one shape; the adjective tells them apart
+
+
+def added(problem: Problem) -> list[Placement]:
+    """Objects of the clutter: those of the last constraint."""
+    return [problem.scene[i] for i in problem.constraints[-1].object_ids]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("task", "seed"), CASES_CLUTTER)
+def test_clutter_is_large_distinct_and_decides_nothing_at_the_start(task: str, seed: int) -> None:
+    problem = sample_episode(task, level="L5", seed=seed, domain="eval").problem
+    looks = [(p.object, p.texture) for p in added(problem)]
+    assert LEAST <= len(looks) <= MOST and len(set(looks)) == len(looks)
+    if task != "follow_order":  # there a step has to fulfil a goal
+        assert not judge_step(problem, {}).is_over
+
+
+@pytest.mark.parametrize(("task", "seed"), CASES_CLUTTER)
+def test_an_image_fits_one_object_on_the_table(task: str, seed: int) -> None:
+    problem = sample_episode(task, level="L5", seed=seed, domain="eval").problem
+    on_table = [p for p in problem.scene.placements if p.object != "small block"]
+    for name, fill in problem.prompt.images:
+        if isinstance(fill, ObjectImage) and not name.startswith(("demo_", "swept")):
+            shown = fill.placement
+            fitting = [
+                p
+                for p in on_table
+                if p.object == shown.object and shown.texture in (p.texture, NEUTRAL_TEXTURE)
+            ]
+            assert len(fitting) == NUM_TWINS.get(task, {}).get(name, 1), name
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_words_and_relations_fit_the_objects_of_the_goals_alone(seed: int) -> None:
+    twist, same_shape, understanding, neighbour = (
+        sample_episode(task, level="L5", seed=seed).problem
+        for task in ("twist", "same_shape", "scene_understanding", "manipulate_old_neighbor")
+    )
+    texture = re.findall(r"twist all (.*) objects", twist.prompt.text)[0]
+    alike = {p.id for p in twist.scene.placements if p.texture == texture}
+    assert alike == {goal.object_id for goal in twist.goals}  # type: ignore[union-attr]
+
+    base = same_shape.prompt.images[0][1].placement  # type: ignore[union-attr]
+    profile = object_spec(base.object).profile
+    alike = {p.id for p in same_shape.scene.placements if object_spec(p.object).profile == profile}
+    assert alike == {base.id, *(goal.object_id for goal in same_shape.goals)}  # type: ignore[union-attr]
+
+    texture = re.findall(r"into the (.*) object\.", understanding.prompt.text)[0]
+    (goal,) = understanding.goals
+    assert [p.id for p in understanding.scene.placements if p.texture == texture] == [goal.relative_to]  # type: ignore[union-attr]
+
+    dragged, meant = (neighbour.scene[goal.object_id] for goal in neighbour.goals)  # type: ignore[union-attr]
+    direction = re.findall(r"its (\w+)", neighbour.prompt.text)[0]
+    along = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}[direction]
+
+    def offset(placement: Placement) -> tuple[float, float]:
+        dx, dy = placement.pose.x - dragged.pose.x, placement.pose.y - dragged.pose.y
+        return dx * along[0] + dy * along[1], abs(dx * along[1] - dy * along[0])
+
+    there = [p for p in neighbour.scene.placements if offset(p)[0] > offset(p)[1]]
+    assert min(there, key=lambda p: sum(offset(p))) == meant
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_target_has_to_be_cleared_before_objects_are_rearranged(seed: int) -> None:
+    problem = sample_episode("rearrange", level="L5", seed=seed, domain="eval").problem
+    (clearing,) = problem.prerequisites
+    (target,) = {
+        goal.object_id: goal.target
+        for goal in problem.goals
+        if isinstance(goal, AtPose)
+        and goal.target.planar_distance(problem.scene[clearing.object_id].pose) < 0.01
+    }.values()
+    moves = {goal.object_id: goal.target for goal in problem.goals if isinstance(goal, AtPose)}
+    assert judged(problem, moves)[1].failure
+    assert judged(problem, {clearing.object_id: clearing.target}, moves)[1].success
+    assert clearing.target.planar_distance(target) > 0.1
