@@ -1,12 +1,22 @@
 """Procedural shapes: sound meshes, the benchmark's measures, and hulls that rest where they should."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from openvima.catalog import OBJECTS, Assets, load_assets
 from openvima.catalog.bodies import build_geometry
 from openvima.catalog.geometry import CollisionBox, CollisionHull
-from openvima.catalog.objects import OBJECTS, object_spec
-from openvima.errors import AssetError, UnknownNameError
+from openvima.catalog.meshes import signed_area, triangulate
+from openvima.catalog.objects import object_spec
+from openvima.errors import AssetError, ShapeError, UnknownNameError
+from openvima.scene import Placement, Pose, Scene
+from openvima.sim.bodies import Bodies
+from openvima.sim.primitive_state import Settling
 
 ALL = list(OBJECTS)
 KIT = [name for name in ALL if OBJECTS[name].kind == "kit"]
@@ -162,3 +172,109 @@ def test_top_areas_are_those_of_the_benchmark_within_5_percent(catalogue, name):
     top = (mesh.vertices[..., 2] > mesh.vertices[..., 2].max() - 1e-6).all(axis=1) & (normals[:, 2] > 0)
     area = normals[top, 2].sum() / 2
     assert area == pytest.approx(records(catalogue)[name]["top_area"], rel=0.05)
+
+
+SQUARE = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)])
+
+
+def areas(loops, triangles):
+    points = np.concatenate(loops)
+    return [signed_area(points[triangle]) for triangle in triangles]
+
+
+def test_a_square_becomes_two_triangles():
+    assert len(triangulate([SQUARE])) == 2
+
+
+def test_triangles_of_an_outline_with_two_holes_cover_the_rest():
+    holes = [SQUARE[::-1] / 8 + offset for offset in (1.0, 2.5)]
+    covered = areas([SQUARE, *holes], triangulate([SQUARE, *holes]))
+    assert min(covered) > 0
+    assert sum(covered) == pytest.approx(16 - 2 * 0.25)
+
+
+@given(st.lists(st.floats(0.2, 3.0), min_size=3, max_size=24))
+def test_triangles_of_any_star_shaped_outline_cover_it(radii):
+    angles = 2 * np.pi * np.arange(len(radii)) / len(radii)
+    loop = np.array(radii)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    covered = areas([loop], triangulate([loop]))
+    assert len(covered) == len(radii) - 2
+    assert min(covered) >= 0
+    assert sum(covered) == pytest.approx(signed_area(loop))
+
+
+def test_a_loop_that_runs_the_wrong_way_round_is_refused():
+    with pytest.raises(ShapeError, match="the first must be positive"):
+        triangulate([SQUARE[::-1]])
+
+
+def test_a_hole_outside_its_outline_is_refused():
+    surrounding = np.array([(-1.0, -1.0), (-1.0, 5.0), (5.0, 5.0), (5.0, -1.0)])
+    with pytest.raises(ShapeError):
+        triangulate([SQUARE, surrounding])
+
+
+PACK = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
+X, Y = 0.5, 0.05
+
+
+@pytest.fixture(params=["procedural", "golden original"])
+def assets(request) -> Assets:
+    if request.param == "procedural":
+        return load_assets()
+    if not PACK.is_dir():
+        pytest.skip(f"{PACK} is absent; OPENVIMA_REFERENCE_ASSETS names another folder")
+    return load_assets(PACK)
+
+
+def dropped(assets: Assets, name: str, onto: str, offset: tuple[float, float], height_m: float) -> Pose:
+    """Where an object comes to rest, relative to the fixed one above which it was let go."""
+    base_z = assets.geometry(onto, OBJECTS[onto].size_max).rest_z_m
+    base = Placement(5, onto, "red", OBJECTS[onto].size_max, Pose.planar(X, Y, 0.0, z=base_z), fixed=True)
+    start = Pose.planar(X + offset[0], Y + offset[1], 0.3, z=base_z + height_m)
+    bodies = Bodies(Scene((base, Placement(6, name, "blue", OBJECTS[name].size_max, start))), assets)
+    settling = Settling(bodies)
+    while not settling.is_over:
+        settling.run()
+    assert settling.is_at_rest
+    pose = bodies.pose(1)
+    return Pose.planar(pose.x - X, pose.y - Y, 0.0, z=pose.z - base_z)
+
+
+def middle(assets: Assets, name: str) -> tuple[float, float]:
+    """Middle of what a body collides with; the original bowl stands beside its origin."""
+    if name != "bowl" or assets.name == "procedural":
+        return (0.0, 0.0)
+    return (-0.0435, 0.0144)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.035, 0.0), (-0.03, 0.03)])
+@pytest.mark.parametrize(("name", "reach_m", "floor_z"), [("bowl", 0.075, 0.0), ("container", 0.09, -0.024)])
+def test_a_small_block_dropped_into_a_hollow_stays_in_it(assets, name, reach_m, floor_z, offset) -> None:
+    x, y = middle(assets, name)
+    pose = dropped(assets, "small block", name, (x + offset[0], y + offset[1]), 0.09)
+    assert max(abs(pose.x - x), abs(pose.y - y)) < reach_m
+    assert floor_z + 0.013 < pose.z < floor_z + 0.035  # on its floor, or leaning on a wall
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.04, 0.02), (-0.05, 0.0)])
+def test_a_small_block_dropped_onto_a_pan_stays_on_its_lid(assets, offset) -> None:
+    pose = dropped(assets, "small block", "pan", offset, 0.06)
+    assert max(abs(pose.x), abs(pose.y)) < 0.085
+    assert 0.025 < pose.z < 0.045
+
+
+def test_a_block_dropped_onto_a_ring_does_not_fall_through(assets) -> None:
+    assert dropped(assets, "small block", "ring", (0.0, 0.0), 0.06).z > 0.04
+
+
+@pytest.mark.parametrize("rod_y", [-0.18, 0.0, 0.18])
+def test_a_disk_dropped_over_a_rod_slides_down_to_the_plate(rod_y) -> None:
+    pose = dropped(load_assets(), "disk", "stand", (0.003, rod_y), 0.13)
+    assert pose.z == pytest.approx(0.005 + 0.015, abs=0.002)
+    assert abs(pose.y - rod_y) < 0.02
+
+
+def test_a_disk_dropped_between_two_rods_stays_between_them() -> None:
+    pose = dropped(load_assets(), "disk", "stand", (0.0, 0.09), 0.06)
+    assert pose.z == pytest.approx(0.005 + 0.015, abs=0.002)
