@@ -5,7 +5,12 @@ import json
 import av
 import pytest
 
+from openvima.catalog import original
 from openvima.cli.main import main
+from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.verification import verify_results
+from openvima.render import gallery
 
 
 def test_tasks_lists_prompt_tool_levels_and_steps(capsys):
@@ -156,3 +161,140 @@ def test_jobs_of_an_array_share_an_evaluation(tmp_path, capsys):
     assert "rotate" in capsys.readouterr().out and (tmp_path / "scores" / "results.json").exists()
     assert main([*words, "--shard-range", "0:1"]) == 0
     assert "is finished" in capsys.readouterr().err
+
+
+def evaluation(solved: int) -> Results:
+    """A policy `mine` that solves so many of 20 episodes, beside the oracle."""
+    rows = tuple(
+        Row(name, "rotate", "L1", 3, tuple(EpisodeOutcome(i, i < number, 1, "", "") for i in range(20)))
+        for name, number in (("mine", solved), ("oracle", 20))
+    )
+    policies = {"mine": {"kind": "run", "sha256": f"{solved:064}"}, "oracle": {"kind": "oracle"}}
+    return Results(rows, {"tasks": ["rotate"], "episodes": 20}, {"openvima": "1"}, policies)
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, solved in (("first", 5), ("second", 15)):
+        evaluation(solved).write(tmp_path / name / "results.json")
+    return tmp_path
+
+
+def test_several_evaluations_make_one_page_and_leave_theirs_alone(folders, capsys):
+    assert main(["report", "first", "second/results.json", "--compare", "mine@second,mine@first,oracle"]) == 0
+    said = capsys.readouterr().out
+    assert "On L1, mine@second is better than mine@first: +50.0 points" in said
+    assert "On L1, oracle is better than mine@second" in said
+    page = (folders / "report.html").read_text(encoding="utf-8")
+    assert "mine@second against mine@first" in page
+    assert page.count("openvima evaluate --policy mine=RUN,oracle") == 2
+    assert not (folders / "first" / "report.html").exists()
+
+
+@pytest.mark.parametrize(("name", "sign"), [("table.md", "| policy | L1 |"), ("table.tex", "\\toprule")])
+def test_the_ending_of_the_file_decides_what_is_written(folders, name, sign):
+    assert main(["report", "first", "--out", f"paper/{name}"]) == 0
+    assert sign in (folders / "paper" / name).read_text(encoding="utf-8")
+
+
+def test_another_file_of_a_confirmed_folder_is_not_called_confirmed(tmp_path):
+    evaluate(EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=1, out=tmp_path))
+    verify_results(tmp_path)
+    text = (tmp_path / "results.json").read_text()
+    (tmp_path / "best.json").write_text(text.replace('"steps": 1', '"steps": 2'))
+    shown = {}
+    for name in ("results.json", "best.json"):
+        assert main(["report", str(tmp_path / name), "--out", str(tmp_path / "table.md")]) == 0
+        shown[name] = "outcomes are confirmed by replay" in (tmp_path / "table.md").read_text()
+    assert shown == {"results.json": True, "best.json": False}
+
+
+def test_comparisons_are_printed_as_json(folders, capsys):
+    assert main(["report", "first", "second", "--json", "--compare", "mine@first,mine@second"]) == 0
+    comparison = json.loads(capsys.readouterr().out)[0]
+    assert (comparison["a"], comparison["b"]) == ("mine@first", "mine@second")
+    assert comparison["overall"]["verdict"] == "b"
+
+
+def test_learning_curves_of_runs_are_shown(folders):
+    (folders / "run").mkdir()
+    (folders / "run" / "metrics.jsonl").write_text('{"step": 1, "loss": 2.0}\n{"step": 2, "loss": 1.0}\n')
+    assert main(["report", "first", "--runs", "run", "--out", "page.html"]) == 0
+    assert '<section id="training">' in (folders / "page.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "at least one folder"),
+        (["first", "--out", "page.pdf"], ".md or .tex"),
+        (["first", "--compare", "mine"], "two or more policies"),
+        (["first", "--compare", "mine,oracel"], "Did you mean 'oracle'?"),
+        (["first", "--runs", "first"], "give the folder of a training run"),
+        (["third"], "there is no third"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2_of_report_verb(folders, words, message, capsys):
+    assert main(["report", *words]) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error.splitlines()[-1]
+    assert not list(folders.glob("**/*.html"))
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("OPENVIMA_CACHE", str(tmp_path / "cache"))
+
+
+def import_small_pack(tmp_path, monkeypatch, *, damaged: bool = False) -> int:
+    """Import a checkout in which every file is a body description without content."""
+    names = ("kitting/object-template.urdf", "pallet/pallet.urdf")
+    hashes = dict.fromkeys(names, "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855")
+    monkeypatch.setattr(original, "known_hashes", lambda: hashes)
+    folder = tmp_path / "checkout/vima_bench/tasks/assets"
+    (folder / "textures").mkdir(parents=True)
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"")
+    if damaged:
+        (folder / "pallet/pallet.urdf").write_bytes(b"another")
+    return main(["assets", "import", str(tmp_path / "checkout")])
+
+
+@pytest.mark.slow
+def test_a_gallery_prints_its_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(gallery, "_pictures", lambda *_: ("", []))
+    assert main(["assets", "gallery", "--out", str(tmp_path / "gallery")]) == 0
+    page = tmp_path / "gallery" / "index.html"
+    assert capsys.readouterr().out.strip() == str(page)
+    assert "31 objects, 82 textures" in page.read_text(encoding="utf-8")
+
+
+def test_an_import_says_how_many_files_it_took(tmp_path, monkeypatch, capsys):
+    assert import_small_pack(tmp_path, monkeypatch) == 0
+    assert "2 of 2 files imported" in capsys.readouterr().out
+    assert main(["assets", "info"]) == 0
+    assert "2 of 2 files imported" in capsys.readouterr().out
+
+
+def test_an_incomplete_import_lists_what_it_lacks_and_ends_with_1(tmp_path, monkeypatch, capsys):
+    assert import_small_pack(tmp_path, monkeypatch, damaged=True) == 1
+    printed = capsys.readouterr()
+    assert "1 of 2 files imported" in printed.out
+    assert "1 not imported" in printed.err and "pallet/pallet.urdf differs" in printed.err
+    assert len([path for path in original.imported_folder().rglob("*") if path.is_file()]) == 1
+
+
+def test_info_without_an_import_names_the_command(capsys):
+    assert main(["assets", "info"]) == 0
+    assert "`openvima assets import CHECKOUT`" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["demo", "rotate", "--out", "x.mp4"], ["generate", "--out", "demos"]])
+def test_original_assets_without_an_import_are_refused_with_the_command(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([*words, "--assets", "original"]) == 2
+    message = capsys.readouterr().err
+    assert "not been imported" in message and "`openvima assets import CHECKOUT`" in message
+    assert not list(tmp_path.glob("*.mp4")) and not (tmp_path / "demos").exists()

@@ -2,17 +2,25 @@
 
 import json
 import shutil
+import subprocess
+import threading
 
 import pytest
 import torch
 
-from openvima.errors import AssetError, ConfigError, DatasetError, InputFileError
+from openvima.data import Dataset
+from openvima.errors import AssetError, ConfigError, DatasetError, FolderLockedError, InputFileError
 from openvima.policies import load_policy
 from openvima.training import TrainingConfig, train
 from openvima.training.config import ScheduleConfig
 from openvima.training.loop import learning_rate_at, step_generator, step_seed
-from openvima.training.run_folder import RunFolder
+from openvima.training.run_folder import (
+    RunFolder,
+    git_state,
+    provenance,
+)
 from small_networks import train_until
+from worker_jobs import holding
 
 
 @pytest.mark.slow
@@ -210,3 +218,57 @@ def test_generators_are_independent_of_the_global_one() -> None:
     second = torch.rand(3, generator=step_generator(4, "test", 2))
     assert torch.equal(first, second)
     assert not torch.equal(first, torch.rand(3, generator=step_generator(4, "test", 3)))
+
+
+def test_a_second_run_in_a_folder_is_refused_at_once_and_writes_nothing(settings) -> None:
+    config = TrainingConfig.of(settings)
+    with holding(config.out) as process:
+        before = sorted(path.name for path in config.out.iterdir())
+        with pytest.raises(FolderLockedError, match=rf"by process {process.pid}\b"):
+            train(config)
+        assert sorted(path.name for path in config.out.iterdir()) == before
+
+
+def test_a_run_holds_the_lock_until_it_ends(settings) -> None:
+    config = TrainingConfig.of({**settings, "pretraining.steps": 0, "schedule.steps": 2})
+    refused = threading.Event()
+
+    def second(done: int, total: int, note: str) -> None:
+        with pytest.raises(FolderLockedError, match="another thread of this process"):
+            train(config)
+        refused.set()
+
+    train(config, second)
+    assert refused.is_set()
+    assert not list(config.out.glob(".lock*"))
+
+
+@pytest.mark.slow
+def test_every_session_of_a_run_is_logged(settings, data):
+    config = TrainingConfig.of({**settings, "schedule.checkpoint_every": 3})
+    train(config)
+    train(config)
+    lines = [json.loads(line) for line in (config.out / "sessions_log.jsonl").read_text().splitlines()]
+    assert [(line["stage"], line["step"]) for line in lines] == [(0, 0), (1, 6)]
+    assert all(line["data"]["content_hash"] == Dataset(data).manifest["content_hash"] for line in lines)
+    assert {"openvima", "torch", "numpy"} <= set(lines[0]["versions"])
+
+
+def test_data_are_named_by_their_content(data):
+    known = provenance(Dataset(data))["data"]
+    assert known["counts"]["episodes"] == 24
+    assert len(known["manifest_sha256"]) == 64
+
+
+def test_the_commit_of_a_checkout_is_known_and_elsewhere_nothing(tmp_path):
+    assert git_state(tmp_path) is None
+    run = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    (tmp_path / "file").write_text("one")
+    for words in (["init", "-q"], ["add", "file"], ["commit", "-qm", "One"]):
+        subprocess.run([*run, *words], check=True)
+    state = git_state(tmp_path)
+    assert state is not None
+    assert len(state["commit"]) == 40
+    assert not state["changed"]
+    (tmp_path / "file").write_text("two")
+    assert git_state(tmp_path) == {**state, "changed": True}
