@@ -230,7 +230,6 @@ def measure_reading(dataset: Dataset, num_rounds: int) -> Numbers:
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(len(dataset)).tolist()
     lengths = dataset.index.column("steps").to_numpy()
-    drawn = [(n, int(rng.integers(lengths[n]))) for n in shuffled]
     ways: dict[str, tuple[Callable[[], object], int]] = {
         "columns": (
             lambda: [dataset.read(n, TRAINING_COLUMNS)["prompt"] for n in range(len(dataset))],
@@ -241,11 +240,6 @@ def measure_reading(dataset: Dataset, num_rounds: int) -> Numbers:
             lengths.sum(),
         ),
         "demonstrations": (lambda: [dataset[n].num_steps for n in range(len(dataset))], lengths.sum()),
-        "single_steps": (lambda: [dataset.step(n, step).action for n, step in drawn], len(drawn)),
-        "single_steps_top_rgb": (
-            lambda: [dataset.step(n, step, views=["top"], segm=False).action for n, step in drawn],
-            len(drawn),
-        ),
     }
     times: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(num_rounds + 1):
@@ -300,13 +294,13 @@ def line(task: str, entry: Numbers) -> str:
     sizes = " ".join(f"{entry['formats'][name]['bytes'] / 1000:>9.1f}" for name in FORMATS)
     return (
         f"{task:<28}{made['bare_episodes_per_s']:>8.1f}{made['share_of_bare']:>7.1%} {sizes} "
-        f"{read['columns']:>9,}{read['columns_shuffled']:>9,}{read['demonstrations']:>9,}{read['single_steps']:>9,}"
+        f"{read['columns']:>9,}{read['columns_shuffled']:>9,}{read['demonstrations']:>9,}"
     )
 
 
 HEAD = (
     f"{'task':<28}{'bare/s':>8}{'share':>7} " + " ".join(f"{name:>9}" for name in FORMATS) + " "
-    f"{'steps/s':>9}{'shuffled':>9}{'demos':>9}{'single':>9}   (sizes in kB an episode)"
+    f"{'steps/s':>9}{'shuffled':>9}{'demos':>9}   (sizes in kB an episode)"
 )
 
 
@@ -349,8 +343,8 @@ def summary(results: Numbers) -> Numbers:
 
 
 def mean_rate(entries: Sequence[Numbers], way: str) -> float:
-    """Return steps a second where every task has equally many episodes; single steps are episodes too."""
-    lengths = [1 if way.startswith("single") else e["generation"]["steps_per_episode"] for e in entries]
+    """Return steps a second where every task has equally many episodes."""
+    lengths = [e["generation"]["steps_per_episode"] for e in entries]
     times = [n / e["training_steps_per_s"][way] for n, e in zip(lengths, entries, strict=True)]
     return sum(lengths) / sum(times)
 

@@ -250,8 +250,8 @@ def brief_repr(self: Any) -> str:
     """Represent a dataclass briefly; for `__repr__ = brief_repr` in its body.
 
     Example:
-        >>> Step({"rgb": {"top": np.zeros((3, 128, 256), np.uint8)}}, action)
-        Step(observation={'rgb': {'top': <uint8 (3, 128, 256)>}}, action=Action(...))
+        >>> Frame(np.zeros((3, 128, 256), np.uint8), boxes, masks)  # doctest: +SKIP
+        Frame(rgb=<uint8 (3, 128, 256)>, boxes=<float32 (2, 4)>, masks=<bool (2, 128, 256)>)
     """
     parts = (f"{each.name}={_BRIEF.repr(getattr(self, each.name))}" for each in fields(self) if each.repr)
     return cut(f"{type(self).__name__}({', '.join(parts)})", MAX_CHARACTERS)

@@ -16,7 +16,7 @@ from openvima.data import Dataset, Demonstration, Shard, ShardWriter
 from openvima.data.encoding import ShardInfo, encode
 from openvima.data.manifest import INDEX_SCHEMA, finish_folder
 from openvima.data.records import pixels, planes
-from openvima.data.schema import ARRAYS, COLUMNS, SCHEMA_VERSION, VIEWS
+from openvima.data.schema import ARRAYS, COLUMNS, SCHEMA_VERSION
 from openvima.errors import DatasetError
 from small_data_sets import write_folder
 
@@ -70,24 +70,6 @@ def test_arrays_have_their_shapes(shard: Shard, demo: Demonstration) -> None:
     ]
 
 
-def test_a_step_is_what_the_oracle_saw_and_did(shard: Shard, demo: Demonstration) -> None:
-    for number in range(demo.num_steps):
-        step = shard.step(1, number)
-        assert step.action == demo.actions[number]
-        seen = demo.observation(number)
-        assert step.observation["ee"] == seen["ee"]
-        for kind in ("rgb", "segm"):
-            assert list(step.observation[kind]) == list(VIEWS)
-            for view in VIEWS:
-                assert np.array_equal(step.observation[kind][view], seen[kind][view])
-
-
-def test_a_step_of_one_view_has_no_other(shard: Shard) -> None:
-    observation = shard.step(1, 0, views=["front"], segm=False).observation
-    assert sorted(observation) == ["ee", "rgb"]
-    assert list(observation["rgb"]) == ["front"]
-
-
 def test_columns_not_asked_for_are_not_decompressed(shard: Shard) -> None:
     def most_bytes(columns: list[str]) -> int:
         usual = pa.default_memory_pool()
@@ -106,26 +88,19 @@ def test_columns_not_asked_for_are_not_decompressed(shard: Shard) -> None:
     assert 3 * frames <= most_bytes(["rgb_top", "seed"]) < 3 * frames + some
 
 
-def test_unknown_columns_views_and_steps_are_refused(shard: Shard) -> None:
+def test_unknown_columns_are_refused(shard: Shard) -> None:
     with pytest.raises(DatasetError, match=r"no column 'rgb_tip'\. Did you mean 'rgb_top'"):
         shard.read(0, ["rgb_tip"])
-    with pytest.raises(DatasetError, match="no view 'side'"):
-        shard.step(0, 0, views=["side"])
-    with pytest.raises(IndexError, match="step 3 of 3; count from 0 to 2"):
-        shard.step(1, 3)
 
 
-def test_a_data_set_reads_columns_and_steps_by_episode(
-    tmp_path: Path, made_up: MadeUp, info: ShardInfo
-) -> None:
+def test_a_data_set_reads_columns_by_episode(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
     demos = [made_up(seed) for seed in range(3)]
     path = write(tmp_path / "stack-train-00000.arrow", info, demos).path
     finish_folder(tmp_path, [path], command="test", config={}, versions={})
     dataset = pickle.loads(pickle.dumps(Dataset(tmp_path)))
     assert [dataset.read(number, ["seed"])["seed"] for number in (2, 0, -2)] == [2, 0, 1]
-    assert dataset.step(2, 1).action == demos[2].actions[1]
     with pytest.raises(IndexError, match="episode 3 of 3"):
-        dataset.step(3, 0)
+        dataset.read(3, ["seed"])
 
 
 def test_a_data_set_notices_damage_in_any_column(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:

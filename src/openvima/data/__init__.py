@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from openvima.data.generation import generate
     from openvima.data.planning import GenerateConfig, plan
     from openvima.data.reader import Dataset
-    from openvima.data.records import Demonstration, Step, rollout_oracle
+    from openvima.data.records import Demonstration, rollout_oracle
     from openvima.data.shard import Shard, ShardWriter
     from openvima.data.user_demonstrations import record_demonstration
     from openvima.data.verification import VerifyConfig, verify
@@ -20,7 +20,6 @@ _HOMES = {
     "GenerateConfig": "planning",
     "Shard": "shard",
     "ShardWriter": "shard",
-    "Step": "records",
     "VerifyConfig": "verification",
     "generate": "generation",
     "plan": "planning",
@@ -35,7 +34,6 @@ __all__ = [
     "GenerateConfig",
     "Shard",
     "ShardWriter",
-    "Step",
     "VerifyConfig",
     "generate",
     "plan",

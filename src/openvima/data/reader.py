@@ -17,8 +17,7 @@ from openvima.data.manifest import (
     parse_index,
     parse_manifest,
 )
-from openvima.data.records import Demonstration, Step
-from openvima.data.schema import VIEWS
+from openvima.data.records import Demonstration
 from openvima.data.shard import Envelope, Shard, Span, remedy
 from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
 from openvima.html import notebook_html
@@ -96,11 +95,6 @@ class Dataset:
         """
         shard, row = self._checked(episode_index)
         return shard.read(row, columns)
-
-    def step(self, episode_index: int, step: int, *, views: Sequence[str] = VIEWS, segm: bool = True) -> Step:
-        """Read one step of one episode, as `Shard.step` does."""
-        shard, row = self._checked(episode_index)
-        return shard.step(row, step, views=views, segm=segm)
 
     def batch(self, episode_index: int) -> pa.RecordBatch:
         """Read one episode as it is stored: a row with the columns of `schema.COLUMNS`."""

@@ -116,21 +116,6 @@ class Demonstration:
         return make_columns(self).content_hash
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Step:
-    """An observation and the action of the oracle.
-
-    Args:
-        observation: As the environment gives it: "rgb" and "segm" of each view, and "ee".
-        action: The action.
-    """
-
-    observation: dict[str, Any]
-    action: Action
-
-    __repr__ = brief_repr
-
-
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
     """Roll out the oracle for one episode.
 

@@ -18,11 +18,10 @@ from typing import Any, BinaryIO
 import pyarrow as pa
 
 from openvima.atomic_io import NO_SPACE, atomic_write
-from openvima.data.encoding import ShardInfo, Skipped, decode, decode_actions, decode_columns, encode
-from openvima.data.records import Demonstration, Step, make_columns, planes
-from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION, VIEWS
+from openvima.data.encoding import ShardInfo, Skipped, decode, decode_columns, encode
+from openvima.data.records import Demonstration, make_columns
+from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION
 from openvima.errors import DatasetError, unknown_name
-from openvima.scene import ACTION_SHAPES, END_EFFECTORS
 
 # What Arrow raises when it is given damaged bytes.
 DAMAGE_ERRORS = (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
@@ -205,37 +204,6 @@ class Shard:
         if images and not any(len(values[name]) for name in images) and not self.info.images:
             values |= make_columns(self[row]).images
         return {name: values[name] for name in columns}
-
-    def step(self, row: int, step: int, *, views: Sequence[str] = VIEWS, segm: bool = True) -> Step:
-        """Read one step of one row.
-
-        Args:
-            row: The row.
-            step: Which one, from 0.
-            views: What of "front" and "top" to read.
-            segm: Whether to read segmentation too.
-
-        Raises:
-            IndexError: The episode has fewer steps.
-            DatasetError: There is no such view.
-            DatasetError: The row is damaged.
-        """
-        for view in views:
-            if view not in VIEWS:
-                raise DatasetError(unknown_name("view", view, VIEWS))
-        kinds = ("rgb", "segm") if segm else ("rgb",)
-        images = [f"{kind}_{view}" for kind in kinds for view in views]
-        values = self.read(row, [*images, *ACTION_SHAPES, "end_effector"])
-        actions = decode_actions(values)
-        if not 0 <= step < len(actions):
-            raise IndexError(f"step {step} of {len(actions)}; count from 0 to {len(actions) - 1}.")
-        observation: dict[str, Any] = {
-            "rgb": {view: planes(values[f"rgb_{view}"][step : step + 1])[0] for view in views},
-            "ee": END_EFFECTORS.index(values["end_effector"]),
-        }
-        if segm:
-            observation["segm"] = {view: values[f"segm_{view}"][step] for view in views}
-        return Step(observation, actions[step])
 
     def batch(self, row: int) -> pa.RecordBatch:
         """Read one row as it is stored.
