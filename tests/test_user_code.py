@@ -94,7 +94,7 @@ def test_spawned_processes_can_import_what_a_file_defines(file):
         ("syntax.py:make", r"which raised SyntaxError: .*syntax.py, line 1"),
         ("leaves.py:make", "which raised SystemExit: 3"),
         ("missing.py:make", r"ModuleNotFoundError: No module named 'no_such' \(missing.py, line 1\)"),
-        ("functions.py:needy", r"needs arguments \(run\)"),
+        ("functions.py:needy", r"missing 1 required positional argument: 'run'"),
         ("functions.py:fails", r"raised ZeroDivisionError: division by zero \(functions.py, line 5\)\.$"),
     ],
 )

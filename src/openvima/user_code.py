@@ -6,7 +6,6 @@ Loading runs the code. A name on the command line is trusted; one inside a file 
 import hashlib
 import importlib
 import importlib.util
-import inspect
 import re
 import sys
 import sysconfig
@@ -62,11 +61,6 @@ def call_function(source: str, *, what: str) -> Any:
         ConfigError: As for `load_function`, or the function needs arguments or raises.
     """
     function = load_function(source, what=what)
-    if needed := _required_arguments(function):
-        raise ConfigError(
-            f"{what} is {source!r}, whose function needs arguments ({', '.join(needed)}); give a function "
-            "that needs none."
-        )
     try:
         return function()
     except OpenVimaError:
@@ -197,12 +191,3 @@ def _module_name(path: Path, earlier: ModuleType | None) -> str:
         if found is not None and found.origin is not None and Path(found.origin) == path:
             return path.stem
     return f"openvima_user_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-
-
-def _required_arguments(function: Callable[..., Any]) -> list[str]:
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # some built-in types have none
-        return []
-    optional = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return [p.name for p in parameters if p.default is p.empty and p.kind not in optional]

@@ -96,7 +96,7 @@ class FlatAction(gymnasium.ActionWrapper):
         return np.array([*scaled.flat, np.sin(angle_rad), np.cos(angle_rad)], np.float32)
 
 
-class FlatObservation(gymnasium.Wrapper):
+class FlatObservation(gymnasium.ObservationWrapper):
     """Gives observations as one vector: float32, each value −1 … 1.
 
     It holds what policies over objects see, no state of the simulator: `max_objects` rows for objects on the
@@ -151,11 +151,6 @@ class FlatObservation(gymnasium.Wrapper):
         self._prompt = self._encoded_prompt()
         return self.observation(observation), info
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        """Take a step."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self.observation(observation), float(reward), terminated, truncated, info
-
     def observation(self, observation: Mapping[str, Any]) -> np.ndarray:
         """Return an observation of the running episode as a vector."""
         objects = self._rows([(observe(observation), True)], "max_objects")
@@ -204,7 +199,7 @@ class FlatObservation(gymnasium.Wrapper):
         return rows
 
 
-class ImageObservation(gymnasium.Wrapper):
+class ImageObservation(gymnasium.ObservationWrapper):
     """Gives observations as a flat dictionary of images and words, such as SB3's `MultiInputPolicy` takes.
 
     | key | value |
@@ -263,11 +258,6 @@ shape (3 × max_prompt_images, 128 / shrink, 256 / shrink), zeros where there is
             self._prompt[3 * index : 3 * index + 3] = _shrunk(image, self.shrink)
         self._words = _words(parts)
         return self.observation(observation), info
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        """Take a step."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self.observation(observation), float(reward), terminated, truncated, info
 
     def observation(self, observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Return an observation of the running episode as a flat dictionary."""

@@ -1,13 +1,12 @@
 """Import of the published demonstrations: where their episodes lie, names of tasks, the conversion."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from openvima.atomic_io import NO_SPACE, atomic_write_file, folder_lock
 from openvima.data.encoding import ShardInfo
@@ -24,14 +23,12 @@ from openvima.data.published_episode import ASSETS, DOMAIN, LEVEL, package_versi
 from openvima.data.published_sources import EpisodeFolders, ZipArchive
 from openvima.data.records import Demonstration
 from openvima.data.shard import Shard, ShardWriter
-from openvima.errors import ConfigError, DatasetError, unknown_name
+from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import as_path, names_of, settle
 from openvima.multiprocess import Report, check_workers, imap_unordered
 from openvima.tasks import list_tasks, task_spec
 
 __all__ = ["Broken", "EpisodeKey", "ImportConfig", "PublishedData", "import_published"]
-
-Split = Literal["train", "validation"]
 
 # Folder names of the published files and of older ones, and what the tasks are called today.
 OLD_TASK_NAMES = {
@@ -40,28 +37,12 @@ OLD_TASK_NAMES = {
     "same_color": "same_texture",
     "sweep": "sweep_without_exceeding",
 }
-# The authors advise 600,000 episodes for training and 50,000 for validation, but list neither.
-_NUM_FOLDS = 13
 
 
 def current_task(folder_name: str) -> str | None:
     """Return the name of the task whose episodes a folder holds; None if there is no such task."""
     name = OLD_TASK_NAMES.get(folder_name, folder_name)
     return name if name in list_tasks() else None
-
-
-def assign_split(task: str, episode_id: str) -> Split:
-    """Tell whether an episode is for training or for validation, 12 to 1 and always the same.
-
-    Args:
-        task: Today's name of the task.
-        episode_id: Name of the episode's folder, such as "000123".
-    """
-    digest = hashlib.sha256(f"{task}/{int(episode_id):06d}".encode()).digest()
-    return "validation" if int.from_bytes(digest[:8], "big") % _NUM_FOLDS == 0 else "train"
-
-
-SPLITS = ("all", "train", "validation")
 
 
 class EpisodeKey(NamedTuple):
@@ -117,12 +98,9 @@ class PublishedData(Sequence[Demonstration]):
     Args:
         path: The zip archive, or a folder with unpacked episodes `…/TASK/ID/`.
         tasks: Keep the episodes of these tasks only; None keeps all.
-        split: "all", or one of two splits: "train" (twelve thirteenths, by a hash of task and id) or
-            "validation".
 
     Raises:
         DatasetError: There are no episodes, the archive is damaged, or it lacks a task.
-        ConfigError: There is no such split.
 
     Example:
         >>> data = PublishedData("vima.zip")
@@ -132,19 +110,14 @@ class PublishedData(Sequence[Demonstration]):
         'Stack objects in this order {frame_0} {frame_1} {frame_2}.'
     """
 
-    def __init__(
-        self, path: str | Path, *, tasks: str | Sequence[str] | None = None, split: str = "all"
-    ) -> None:
-        if split not in SPLITS:
-            raise ConfigError(unknown_name("split", split, SPLITS))
+    def __init__(self, path: str | Path, *, tasks: str | Sequence[str] | None = None) -> None:
         self.path = as_path(path)
         self.tasks = None if tasks is None else names_of(tasks)
-        self.split = split
         self._source = open_source(self.path)
         places, self.broken_folders = _sort_places(self._source)
         if self.tasks is not None:
             places = _select_tasks(places, self.tasks, self.path)
-        self.places = tuple(place for place in places if split in ("all", assign_split(*place.key)))
+        self.places = tuple(places)
         if not self.places:
             raise DatasetError(
                 f"{self.path} holds no episodes; give vima.zip, or the folder it was unpacked to."
@@ -207,7 +180,7 @@ class PublishedData(Sequence[Demonstration]):
                 on_broken(found)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return partial(PublishedData, tasks=self.tasks, split=self.split), (self.path,)
+        return partial(PublishedData, tasks=self.tasks), (self.path,)
 
     def _read(self, place: EpisodePlace) -> Demonstration:
         found = read_place(self._source, place)
@@ -286,7 +259,6 @@ class ImportConfig:
         source: The published zip archive, or a folder with unpacked episodes.
         out: The folder to write.
         tasks: Old or new names of tasks; ("all",) means all that are there.
-        split: "all", or one of two splits: "train" (twelve thirteenths of each task) or "validation".
         episodes: At most so many of each task, the first ones; None means all.
         shard_size: Episodes in a file.
         compression: Codec of the files, "lz4" or "zstd".
@@ -297,7 +269,6 @@ class ImportConfig:
     source: Path
     out: Path
     tasks: tuple[str, ...] = ("all",)
-    split: str = "all"
     episodes: int | None = None
     shard_size: int = SHARD_SIZE
     compression: str = "zstd"
@@ -349,7 +320,7 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         WorkerError: A worker died. Whole shards are kept, and the same command goes on from there.
     """
     tasks = None if config.tasks == ("all",) else config.tasks
-    data = PublishedData(config.source, tasks=tasks, split=config.split)
+    data = PublishedData(config.source, tasks=tasks)
     blocks = plan(config, data)
     with folder_lock(config.out):
         _import(config, data, blocks, report)
@@ -467,7 +438,6 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
     info = blocks[0].info  # but for task and number, the same of all
     settings = {
         "tasks": sorted({block.info.task for block in blocks}),
-        "split": config.split,
         "level": info.level,
         "domain": info.domain,
         "episodes": config.episodes,

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from openvima.data import Demonstration
-from openvima.data.published import Broken, EpisodeKey, PublishedData, assign_split
+from openvima.data.published import Broken, EpisodeKey, PublishedData
 from openvima.data.published_episode import infer_picks
 from openvima.data.records import rollout_oracle
 from openvima.data.schema import UNKNOWN_ID
 from openvima.env import EnvConfig
-from openvima.errors import ConfigError, DatasetError, UnknownTaskError
+from openvima.errors import DatasetError, UnknownTaskError
 from openvima.scene import ObjectRecord
 from published_data import PUBLISHED, TODAY, Generation, MadeEpisode, jpeg, pickled, write_folder, write_zip
 
@@ -117,30 +117,10 @@ def test_what_is_not_there_is_said(path: Path, tmp_path: Path) -> None:
         PublishedData(path, tasks=["rotat"])
     with pytest.raises(DatasetError, match="no episode rearrange/000001"):
         PublishedData(path).read("rearrange", "000001")
-    with pytest.raises(ConfigError, match="'test'"):
-        PublishedData(path, split="test")
     with pytest.raises(DatasetError, match="no file or folder"):
         PublishedData(tmp_path / "missing.zip")
     with pytest.raises(DatasetError, match="holds no episodes"):
         PublishedData(tmp_path)
-
-
-def test_parts_are_disjoint_complete_and_always_the_same() -> None:
-    keys = [("rotate", f"{number:06d}") for number in range(13_000)]
-    validation = [key for key in keys if assign_split(*key) == "validation"]
-    assert 900 < len(validation) < 1100
-    assert [int(key[1]) for key in validation[:4]] == [4, 27, 40, 47]
-
-
-def test_a_part_can_be_read_alone(path: Path) -> None:
-    whole = PublishedData(path).keys
-    splits = {}
-    for split in ("train", "validation"):
-        keys = {key for key in whole if assign_split(*key) == split}
-        splits[split] = keys
-        if keys:
-            assert set(PublishedData(path, split=split).keys) == keys
-    assert splits["train"]
 
 
 def changed(**changes: object) -> Files:

@@ -131,7 +131,6 @@ def import_published(
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
     *,
     tasks: str = "all",
-    split: Literal["all", "train", "validation"] = "all",
     episodes: int | None = None,
     compression: Literal["lz4", "zstd"] = "zstd",
     workers: int = 1,
@@ -148,7 +147,6 @@ def import_published(
         source: The zip archive, or a folder with unpacked episodes.
         out: Folder to write to.
         tasks: Old or new names of tasks with commas between them, or "all".
-        split: All episodes, or one of two splits: train (twelve thirteenths) or validation.
         episodes: At most so many episodes of each task, the first ones; by default all.
         compression: Codec of the files; lz4 takes twice the space and is read faster.
         workers: Number of processes.
@@ -165,7 +163,6 @@ def import_published(
         source=source,
         out=out,
         tasks=parse_list(tasks),
-        split=split,
         episodes=episodes,
         compression=compression,
         workers=workers,
