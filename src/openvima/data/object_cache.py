@@ -517,22 +517,14 @@ def _write_missing(
         if file is None
     ]
     work.sort(key=lambda item: -item.index.num_rows)
-    total, note = sum(item.index.num_rows for item in work), _note_on_older(folder, kind)
+    total = sum(item.index.num_rows for item in work)
     try:
         for _ in imap_unordered(
-            _write, work, workers, report=report and (lambda done: report(done, total, note))
+            _write, work, workers, report=report and (lambda done: report(done, total, ""))
         ):
             pass  # the result of a job is its file
     finally:
         _extractor.cache_clear()  # where it was made here
-
-
-def _note_on_older(folder: Path, kind: InputKind) -> str:
-    """Say which folders of older versions a new one replaces."""
-    current = f"{kind}-v{CACHE_VERSION}"
-    names = {path.name for path in folder.parent.glob(f"{kind}-v[0-9]*")}
-    older = sorted(name for name in names if not name.startswith(current))
-    return f"extracting objects anew; delete {', '.join(older)} of older versions" if older else ""
 
 
 def _write(work: _Work, count: Callable[[int], None]) -> None:

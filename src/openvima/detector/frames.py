@@ -1,8 +1,7 @@
 """Annotated frames from demonstrations, for training and evaluating a detector, and their augmentation."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from openvima.data.rerender import with_random_appearance
 from openvima.data.schema import VIEWS
 from openvima.errors import DatasetError
 from openvima.perception.objects import MIN_PIXELS
-from openvima.render import channels_first
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
 
 _NUM_IDS = 256
@@ -88,36 +86,17 @@ class FrameSampler:
             rng: Selects the time step or prompt image.
         """
         episode, from_prompt = int(self.episodes[index]), rng.random() < self._prompt_prob
+        demo = self.dataset[episode]
         if self._rerendered_prob and rng.random() < self._rerendered_prob:
-            return self._rerendered_frames(episode, from_prompt, rng)
-        if from_prompt and (frames := self._prompt_frames(episode, rng)):
-            return frames
-        kinds = [f"{kind}_{view}" for view in VIEWS for kind in ("rgb", "segm")]
-        values = self.dataset.read(episode, [*kinds, "end_effector"])
-        time = int(rng.integers(len(values["rgb_front"])))
-        ids = range(FIRST_OBJECT_ID[values["end_effector"]], BACKGROUND_ID)
-        return _both_views(values, time, ids, prefix="")
-
-    def _rerendered_frames(self, episode: int, from_prompt: bool, rng: np.random.Generator) -> list[Frame]:
-        shard = self.dataset.shard(self.dataset.locate(episode)[0])
-        demo = with_random_appearance(self.dataset[episode], shard.info, 0)
+            shard = self.dataset.shard(self.dataset.locate(episode)[0])
+            demo = with_random_appearance(demo, shard.info, 0)
         if from_prompt and (images := list(demo.prompt.images.values())):
             image = images[int(rng.integers(len(images)))]
             ids = [record.object_id for record in image.objects]
             return [frame_of(image.rgb[view], image.segm[view], ids) for view in VIEWS]
         time = int(rng.integers(demo.num_steps + 1))
-        ids = range(FIRST_OBJECT_ID[demo.end_effector], BACKGROUND_ID)
-        return [frame_of(demo.rgb[view][time], demo.segm[view][time], ids) for view in VIEWS]
-
-    def _prompt_frames(self, episode: int, rng: np.random.Generator) -> list[Frame]:
-        kinds = [f"prompt_{kind}_{view}" for view in VIEWS for kind in ("rgb", "segm")]
-        values = self.dataset.read(episode, [*kinds, "prompt_images"])
-        images = values["prompt_images"]
-        if not images:
-            return []
-        index = int(rng.integers(len(images)))
-        ids = [record["id"] for record in images[index]["objects"]]
-        return _both_views(values, index, ids, prefix="prompt_")
+        shown = range(FIRST_OBJECT_ID[demo.end_effector], BACKGROUND_ID)
+        return [frame_of(demo.rgb[view][time], demo.segm[view][time], shown) for view in VIEWS]
 
 
 def held_out_frames(sampler: FrameSampler, count: int, *, seed: int) -> Iterator[Frame]:
@@ -139,17 +118,6 @@ def held_out_frames(sampler: FrameSampler, count: int, *, seed: int) -> Iterator
     order = rng.permutation(len(sampler))
     for index in range((count + 1) // 2):
         yield from sampler.sample(int(order[index % len(order)]), rng)
-
-
-def _both_views(values: Mapping[str, Any], index: int, ids: Sequence[int], *, prefix: str) -> list[Frame]:
-    return [
-        frame_of(
-            np.ascontiguousarray(channels_first(values[f"{prefix}rgb_{view}"][index])),
-            values[f"{prefix}segm_{view}"][index],
-            ids,
-        )
-        for view in VIEWS
-    ]
 
 
 RECOLOUR_PROB = 0.5  # of each object, so that unseen textures are found, too
