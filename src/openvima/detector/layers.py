@@ -183,6 +183,8 @@ class RegionProposalNetwork(nn.Module):
         config = self.config
         all_scores, all_deltas, all_anchors, groups = [], [], [], []
         levels = zip(predictions.anchors, predictions.objectness, predictions.deltas, strict=True)
+        # The best of each level first, then all levels of an image at once: suppression compares boxes of a
+        # level alone (`groups`), and its order is that of the scores over all levels.
         for level, (anchors, objectness, deltas) in enumerate(levels):
             scores, rows = objectness.topk(min(config.rpn_pre_nms_top_n, len(anchors)))
             all_scores.append(scores)

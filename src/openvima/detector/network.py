@@ -150,6 +150,7 @@ class MaskRCNN(nn.Module):
         deltas = deltas[rows, classes[rows]]
         boxes = decode_boxes(deltas, references[rows], BOX_WEIGHTS, height=size[0], width=size[1])
         kept = nms(boxes, scores[rows], config.nms_iou, owners[rows])
+        # `kept` are places in `rows`, by descending score over all images; each image takes its best.
         of_images = (kept[owners[rows[kept]] == image] for image in range(len(proposals)))
         kept = torch.cat([own[: config.max_detections] for own in of_images])
         rows = rows[kept]

@@ -298,6 +298,7 @@ class TokenPolicy(PolicyNetwork):
             tokens_BTQE = self._frame_tokens(features_BTVNF)
         tokens_BTQD = self.add_end_effector(tokens_BTQE, history.end_effector_BT)
         query_BT = torch.full_like(history.num_slots_BT, tokens_BTQD.shape[2] - 1)
+        # Where an episode is asked for its action may not depend on what pads the batch.
         if mask_BTQ is not None:
             # The last slot of the episode itself, be it padding or not; beyond it lies padding of the batch.
             query_BT = query_BT - history.masks_BTVN.shape[-1] + history.num_slots_BT.clamp(min=1)
@@ -357,6 +358,9 @@ class TokenPolicy(PolicyNetwork):
         modulo S, are the first objects. The result is numbered like that again; rows of the other objects
         are copies that no token refers to.
         """
+        # Objects (S) lie image after image, and images (J) begin where a prompt names them first: J and the
+        # place within (N) are read from that. Latents go back to the rows of their image's objects, as tokens
+        # do.
         count = prompts.masks_VS.shape[1]
         index_BL = prompts.object_index_BL
         is_first_S = torch.zeros(count, dtype=torch.bool, device=tokens_IE.device)

@@ -200,6 +200,9 @@ class CausalDecoder(nn.Module):
         if valid_BL.all():  # as where a single episode acts
             outputs_BLD, cache = self(cache, sequence_BLD, mask_BL)
             return outputs_BLD.unflatten(1, valid_BTQ.shape[1:]).split(sizes, dim=2), cache
+        # Valid tokens move to the front of each row, in their order, and their outputs back: the sequence is
+        # then as long as the longest episode, not as all slots together. Rows stay padded, hence `valid` once
+        # more.
         order_BP = valid_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
         order_BP = order_BP[:, : int(valid_BL.sum(dim=1).max())]
         index_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])

@@ -74,6 +74,9 @@ class RelativeRotation(nn.Module):
         values = F.normalize(torch.where(common_VN[..., _TOP, :, None], top, front), dim=-1)
         real, imaginary = values.unflatten(-1, (2, _NUM_CHANNELS, _NUM_HARMONICS)).unbind(-3)
         (x_a, x_b), (y_a, y_b) = real.unbind(0), imaginary.unbind(0)
+        # Features are complex amplitudes of harmonics of the rotation: turning an object multiplies harmonic
+        # k by exp(ik·angle), so that the product with the conjugate of the other crop peaks at the relative
+        # rotation.
         along = (x_a * x_b + y_a * y_b).sum(dim=-2)
         across = (x_a * y_b - y_a * x_b).sum(dim=-2)
         # Similarity after each rotation, in −1 … 1.

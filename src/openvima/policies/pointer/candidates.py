@@ -141,6 +141,9 @@ class PlaceCandidates:
         is_named_BT = targets.place_BT >= 0
         distance_BTC = (self.positions_BTC2 - goal_BT2[:, :, None]).norm(dim=-1)
         count = masks_BTC.shape[-1]
+        # A place is right if something is or was there. If the oracle named an object, only what is nearer to
+        # it than to others counts, and the object itself always does; with neither, the nearest point of the
+        # grid.
         near_BTC = (distance_BTC < COPIED_WITHIN_M) & masks_BTC & ~is_grid_C
         near_BTC &= ~is_named_BT[..., None] | self._nearest_to(targets.place_BT)
         nearest_BT = distance_BTC.masked_fill(~is_grid_C, torch.inf).argmin(-1)

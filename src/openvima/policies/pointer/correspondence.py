@@ -141,6 +141,9 @@ class Correspondence(nn.Module):
             ],
             dim=-1,
         )
+        # What is attended to counts as a pair: its first number is how much was found at all, and the rest of
+        # 1, that of the sink, leaves zeros. Differences of crops are taken view by view, in those that show
+        # both.
         attended_HNX = torch.einsum("...hnm,...nmx->...hnx", weights_HNM, pairs_NMX)
         differ_HVNX, target_VNF, found_HVN1 = self._in_views(own, other, weights_HNM)
         views = differ_HVNX.flatten(-4, -3).unbind(-3)  # (..., N, X) each

@@ -122,6 +122,8 @@ class Attributes(nn.Module):
 
         They are zero, and cost nothing, where none is selected.
         """
+        # Weights are square roots, since both sides of a dot product have them; prompts that select none,
+        # which are most, are left out of the projections and get zeros.
         rows = torch.nonzero(selected_BP.any(dim=1))[:, 0]
         projected = self(objects.features_VNF[rows], objects.boxes_VN4[rows], objects.masks_VN[rows])
         weights_BP = selected_BP[rows].to(projected.dtype)
@@ -182,6 +184,8 @@ def coreference(prompts: PromptBatch) -> torch.Tensor:
     next_is_image_BL = F.pad(is_image_BL, (0, 1))[:, 1:]
     next_but_one_is_image_BL = F.pad(is_image_BL, (0, 2))[:, 2:]
     is_before_BL = is_word_BL & next_is_image_BL & ~next_but_one_is_image_BL  # of one object alone
+    # "This is a wug {image}. … the wug": rows are words, columns the earlier same word that an image follows;
+    # one step to the right is the image itself. Several images of one word share its weight of 1.
     same_BLL = prompts.word_ids_BL[:, :, None] == prompts.word_ids_BL[:, None]
     same_BLL = (same_BLL & is_word_BL[:, :, None] & is_before_BL[:, None]).tril(diagonal=-1)
     weights_BLL = F.pad(same_BLL[:, :, :-1], (1, 0))  # from the earlier word to the image behind it

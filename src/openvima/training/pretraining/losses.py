@@ -128,6 +128,7 @@ def info_nce(
     scores = first @ second.T / temperature
     count = len(scores)
     diagonal = torch.eye(count, dtype=torch.bool, device=scores.device)
+    # Others of the same appearance are no negatives: they are masked, and the diagonal stays the target.
     scores = scores.masked_fill(is_match & ~diagonal, torch.finfo(scores.dtype).min)
     target = torch.arange(count, device=scores.device)
     loss = (F.cross_entropy(scores, target) + F.cross_entropy(scores.T, target)) / 2
@@ -177,6 +178,8 @@ def rotation_loss(
         )
         bins = scores_KR.shape[-1]
         position = rotations * (bins / (2 * math.pi))
+        # A rotation between two bins counts for both, the more the nearer: bins are a circle, hence the
+        # modulo.
         low = position.floor()
         weight = (position - low).to(scores_KR.dtype)
         of_low = F.nll_loss(scores_KR, low.long() % bins, reduction="none")
@@ -259,6 +262,9 @@ def attribute_loss(
     same_PMM = same_PMM & is_pair_MM & ~torch.eye(len(is_seen_M), dtype=torch.bool, device=is_seen_M.device)
     scores_PMM = projected_PMW @ projected_PMW.mT / temperature
     lowest = torch.finfo(scores_PMM.dtype).min
+    # Each pair that is alike is one softmax against all that differ, summed as softplus; pairs that are
+    # neither alike nor different take no part. Rows (M) are the objects of all three images, one matrix per
+    # attribute.
     negatives_PM1 = scores_PMM.masked_fill(~different_PMM, lowest).logsumexp(dim=-1, keepdim=True)
     nll_PM = (F.softplus(negatives_PM1 - scores_PMM) * same_PMM).sum(dim=-1)
     count_PM = same_PMM.sum(dim=-1)
