@@ -159,5 +159,5 @@ def test_loader_workers_and_gradient_accumulation_change_only_the_last_bits(bins
 def test_a_missing_device_is_named() -> None:
     for device in ("gpu0", "meta", "cuda:99", *(() if torch.cuda.is_available() else ("cuda",))):
         message = f"device is '{device}'; it must be auto, cpu"
-        with pytest.raises(ConfigError, match=message), join_processes(device, "ddp"):
+        with pytest.raises(ConfigError, match=message), join_processes(device):
             pass
