@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from openvima.cli.terminal import print_files, print_table, table_console
+from openvima.cli.terminal import print_files, print_table
 
 if TYPE_CHECKING:
     from openvima.policies.build import PolicyConfig, PolicySize
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 Precision = Literal["float32", "bfloat16", "float16", "float64"]
-FULL_WIDTH = 100  # columns of the terminal that all columns of the table need
 _NOTES = (
     "layers: self-attention, in vima and flamingo with cross-attention to the prompt before it",
     "positions: position tables and learned tokens; images: with the fusion of end effector and image",
@@ -252,24 +251,14 @@ def _print_table(sizes: dict[str, "PolicySize"]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    console = table_console()
-    rows = {name: _cells(name, size) for name, size in sizes.items()}
-    columns = list(next(iter(rows.values())))
-    if console.width < FULL_WIDTH:
-        columns = [name for name in columns if name not in ("heads", "actions", "positions", "frozen")]
     table = Table(title="parameters in millions", box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
-    for name in columns:
-        style = "bold" if name in ("preset", "total") else ""
-        table.add_column(name, justify="left" if name == "preset" else "right", no_wrap=True, style=style)
-    architecture = next(iter(sizes.values())).architecture
-    for name, cells in rows.items():
-        if sizes[name].architecture != architecture:
-            table.add_section()
-            architecture = sizes[name].architecture
-        table.add_row(*(cells[column] for column in columns))
-    print_table(table, console)
-    for note in _NOTES:
-        console.print(note, highlight=False)
+    rows = [_cells(name, size) for name, size in sizes.items()]
+    for number, name in enumerate(rows[0]):
+        table.add_column(name, justify="right" if number else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row.values())
+    print_table(table)
+    print(*_NOTES, sep="\n")
 
 
 def _cells(name: str, size: "PolicySize") -> dict[str, str]:

@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.cli.terminal import print_table, table_console
+from openvima.cli.terminal import print_table
 from openvima.tasks.options import option_descriptions
 from openvima.tasks.registry import oracle_record
 
 if TYPE_CHECKING:
     from openvima.tasks import TaskSpec
-
-FULL_WIDTH = 110  # columns of the terminal that all columns of the table need
 
 
 def main(
@@ -46,30 +44,22 @@ def main(
     from rich.table import Table
     from rich.text import Text
 
-    console = table_console()
-    table = Table(title=f"{len(specs)} tasks", show_lines=True)
-    columns = ["task", "family", "prompt", "tool", "levels", "steps", "oracle"]
-    if console.width < FULL_WIDTH:  # else words of the prompts would break
-        columns = [name for name in columns if name not in ("family", "oracle")]
-    for name in columns:
-        table.add_column(name, no_wrap=name in ("task", "tool", "steps", "oracle"), overflow="fold")
-        if name == "levels" and console.width < FULL_WIDTH:
-            table.columns[-1].max_width = len("train L1")  # in two lines, which prompts need anyway
+    columns = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
+    table = Table(*columns, title=f"{len(specs)} tasks", show_lines=True)
     for spec in specs:
-        cells = {
-            "task": spec.name,
-            "family": ", ".join(spec.families).replace("_", " "),
-            "prompt": Text(spec.template),  # rich would read its braces and brackets as markup
-            "tool": spec.end_effector,
-            "levels": " ".join(spec.levels),
-            "steps": f"{spec.oracle_max_steps} + 2",
-            "oracle": _percent(oracle_record(spec.name)),
-        }
-        table.add_row(*(cells[name] for name in columns))
-    print_table(table, console)
-    console.print("steps: step limit of the oracle, and what a policy may use beyond it")
-    console.print("oracle: its success rate in %, over all levels; --json has each level")
-    console.print("`openvima tasks TASK` lists the options of a task")
+        table.add_row(
+            spec.name,
+            ", ".join(spec.families).replace("_", " "),
+            Text(spec.template),  # rich would read its braces and brackets as markup
+            spec.end_effector,
+            " ".join(spec.levels),
+            f"{spec.oracle_max_steps} + 2",
+            _percent(oracle_record(spec.name)),
+        )
+    print_table(table)
+    print("steps: step limit of the oracle, and what a policy may use beyond it")
+    print("oracle: its success rate in %, over all levels; --json has each level")
+    print("`openvima tasks TASK` lists the options of a task")
     return 0
 
 

@@ -117,56 +117,35 @@ def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> R
     Returns:
         A callback `report(done, total, note)`.
     """
-    stage, stages_ended, shown_s, pace = None, set[str](), 0.0, Pace(clock)
+    stage, stages_ended, shown_s, start = None, set[str](), 0.0, (0.0, 0)
 
     def report(done: int, total: int, note: str) -> None:
-        nonlocal stage, shown_s, pace
+        nonlocal stage, shown_s, start
         now_s, before = clock(), stage
         word = note.partition(" ")[0].rstrip(":,")
         stage = word if any(map(str.isalpha, word)) else ""
         if stage != before:
-            pace = Pace(clock)
-        pace.update(done)
+            start = now_s, done
         is_end = done == total and stage not in stages_ended
         if stage != before or is_end or now_s - shown_s >= LINE_S:
             shown_s = now_s
             if done == total:
                 stages_ended.add(stage)
-            text = f"{label}: {pace.summary(done, total)}{f'; {note}' if note else ''}"
+            pace = _pace(done - start[1], now_s - start[0], total - done)
+            share = f" ({100 * done // total} %)" if total else ""
+            text = f"{label}: {done:,} of {total:,}{share}{pace}{f'; {note}' if note else ''}"
             print(text, file=sys.stderr, flush=True)
 
     return report
 
 
-class Pace:
-    """Things done a second; where possible since the first one, which leaves out the start of workers.
-
-    Args:
-        clock: Returns the time in seconds.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._marks: list[tuple[float, int]] = []  # of the first update, and of the first progress
-        self.rate: float | None = None
-
-    def update(self, count: int) -> None:
-        """Take note of how many are done."""
-        now_s = self._clock()
-        if not self._marks or (len(self._marks) == 1 and count > self._marks[0][1]):
-            self._marks.append((now_s, count))
-        for since_s, before in self._marks:  # the later one counts if anything was done after it
-            if now_s > since_s and count > before:
-                self.rate = (count - before) / (now_s - since_s)
-
-    def summary(self, done: int, total: int) -> str:
-        """Describe in a line how far it is, how fast, and how long it still takes."""
-        text = f"{done:,} of {total:,}" + (f" ({100 * done // total} %)" if total else "")
-        if self.rate is None:
-            return text
-        speed = f"{self.rate:.1f}/s" if self.rate >= 1 else f"{60 * self.rate:.1f}/min"
-        left = f", {_duration((total - done) / self.rate)} left" if done < total else ""
-        return f"{text}, {speed}{left}"
+def _pace(done: int, seconds: float, left: int) -> str:
+    """Say how fast it is since the stage began, and how long it still takes; empty at the beginning."""
+    if not (done > 0 and seconds > 0):
+        return ""
+    rate = done / seconds
+    speed = f"{rate:.1f}/s" if rate >= 1 else f"{60 * rate:.1f}/min"
+    return f", {speed}" + (f", {_duration(left / rate)} left" if left else "")
 
 
 def _duration(seconds: float) -> str:

@@ -271,10 +271,6 @@ class ImageMaker:
                 raise InputFileError(f"{label}: {error}") from None
         if isinstance(given, str) or type(given) is int:
             return _object_image(known_object(given, self.handles, label))
-        if isinstance(given, Mapping):
-            if set(given) != {"object", "texture"}:
-                raise SceneError(f"{label} has fields {shown([*given])}; allowed are object and texture.")
-            return self._from_catalogue(given["object"], given["texture"], label)
         parts = entries(given, label)
         if len(parts) == 2 and all(isinstance(part, str) for part in parts):
             return self._from_catalogue(parts[0], parts[1], label)

@@ -25,7 +25,7 @@ from openvima.evaluation.results import FILE_NAME, Results
 from openvima.evaluation.sources import weights_hash
 from openvima.evaluation.verification import is_marked_verified
 from openvima.hub import HubName, commit, hub_name
-from openvima.input_files import as_path, read_text, read_yaml
+from openvima.input_files import as_path, read_yaml
 from openvima.policies.base import require_torch
 from openvima.policies.naming import (
     CHECKPOINTS_FOLDER,
@@ -39,9 +39,7 @@ from openvima.report.table import Line, Table, markdown
 from openvima.report.tables import paper_tables
 from openvima.report.text import role
 
-_SESSIONS_FILE = "sessions_log.jsonl"
 _BUNDLED_RUN = "training"  # settings of the run beside a bundled checkpoint
-_MAX_LOG_BYTES = 2**20
 _SETTINGS = (
     "preset",
     "init_from",
@@ -213,19 +211,14 @@ def _training(folder: Path) -> str:
     if run is None:
         return "Not recorded: the checkpoint does not lie in its run folder.\n"
     recorded = read_yaml(run / CONFIG_FILE)
-    data, session = _mapping(recorded.get("demonstrations")), _last_session(run)
-    stated, git = _mapping(session.get("data")), _mapping(session.get("git"))
+    data = _mapping(recorded.get("demonstrations"))
     settings = {name: _setting(recorded["training"], name) for name in _SETTINGS}
     left_out = _setting(recorded["training"], "loader.exclude_tasks")
     values = {
         "demonstrations": data.get("episodes"),
-        "by task": ", ".join(f"{task} {count}" for task, count in _mapping(stated.get("tasks")).items()),
-        "content hash of the demonstrations": stated.get("content_hash"),
         "tasks left out": left_out,
         "held-out demonstrations among them": data.get("held_out"),
         **settings,
-        "commit of openvima": git.get("commit"),
-        **{name: f"version {version}" for name, version in _mapping(session.get("versions")).items()},
     }
     return facts("What the run folder records.", values)
 
@@ -240,14 +233,6 @@ def _run_folder(folder: Path) -> Path | None:
         except (OSError, OpenVimaError, LookupError, TypeError):
             continue
     return None
-
-
-def _last_session(run: Path) -> Mapping[str, Any]:
-    try:
-        lines = read_text(run / _SESSIONS_FILE, max_bytes=_MAX_LOG_BYTES).splitlines()
-        return _mapping(json.loads(lines[-1]))
-    except (OSError, InputFileError, LookupError, ValueError, RecursionError):
-        return {}
 
 
 def _mapping(value: object) -> Mapping[str, Any]:

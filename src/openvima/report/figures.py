@@ -5,7 +5,6 @@ A `RateFigure` holds success rates over a quantity, such as model size or a corr
 
 import html
 import io
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -126,10 +125,8 @@ def _cell(point: RatePoint) -> Estimate | str:
 # Stand-ins that matplotlib draws with; the page's colours replace them, see `_themed`.
 _INK, _MUTED, _GRID = "#010101", "#020202", "#030303"
 _PANEL_WIDTH_IN = 3.9
-_LEAST_GAP = 0.12  # between named values of an axis, as a fraction of its length
 _DODGE = 0.16  # between the curves of named values, which are 1 apart
-_CHARACTER_IN = 0.055  # height of a tilted name, for each of its characters
-_MAX_TILTED = 24  # characters of a tilted name
+_PERCENT_TICKS = range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)]
 _STYLE: Any = {
     "svg.hashsalt": "openvima",  # element names in the file are the same in every run
     "svg.fonttype": "none",
@@ -151,66 +148,33 @@ _STYLE: Any = {
 
 
 def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str:
-    """Draw the success rates of one level: a row a task, a dot with its interval a policy.
+    """Draw the success rates of one level: a heading a task, below it a dot with its interval a policy.
 
     Args:
         results: The evaluation.
-        level: The level.
-        colours: Name of each policy to the CSS variable of its colour, such as "--series-1".
+        level: One of its levels.
+        colours: Name of each policy to the CSS variable of its colour.
 
     Returns:
         An `<svg>` element.
     """
-    rows = {
-        task: {
-            policy: (row.rate, row.interval)
-            for policy in results.policy_names()
-            if (row := results.row(policy, task, level))
-        }
-        for task in results.tasks(level)
-    }
-    return dot_chart(rows, colours, title=f"Success rates at level {level}", name=f"level-{level}")
-
-
-def dot_chart(
-    rows: Mapping[str, Mapping[str, tuple[float, Interval]]],
-    colours: Mapping[str, str],
-    *,
-    title: str,
-    name: str,
-) -> str:
-    """Draw success rates by category: a heading a category, below it a dot with its interval a series.
-
-    Args:
-        rows: Rate and interval, as fractions, of each series in each category.
-        colours: Name of each series to the CSS variable of its colour; each has a line in every category.
-        title: What screen readers say.
-        name: Put before the names of its elements; no other chart of the page may have it.
-
-    Returns:
-        An `<svg>` element.
-    """
-    lines_a_row = len(colours) + 1.6  # the heading stands above its dots
-    num_lines = lines_a_row * len(rows)
-    figure, axes = _panel(0.45 + 0.155 * num_lines, margins_in=(0.12, 0.3, 0.22, 0.05))
-    for row_index, (heading, dots) in enumerate(rows.items()):
-        top = row_index * lines_a_row
-        axes.text(0, top + 0.55, heading, fontsize=9.5, color=_INK, va="center")
-        for index, (series, variable) in enumerate(colours.items()):
-            if series not in dots:
-                continue
-            y = top + 1.55 + index
-            rate, (low, high) = dots[series]
-            colour = _series(variable)
-            ends = [100 * low, 100 * high]
-            axes.plot(ends, [y, y], color=colour, linewidth=2.4, alpha=0.45, solid_capstyle="round")
-            axes.plot([100 * rate], [y], "o", color=colour, markersize=5)
+    tasks, lines_a_task = results.tasks(level), len(colours) + 1.6  # the heading stands above its dots
+    num_lines = lines_a_task * len(tasks)
+    figure, axes = _panel(0.45 + 0.155 * num_lines)
+    for number, task in enumerate(tasks):
+        axes.text(0, lines_a_task * number + 0.55, task, fontsize=9.5, color=_INK, va="center")
+    for line, (policy, variable) in enumerate(colours.items()):
+        rows = {n: row for n, task in enumerate(tasks) if (row := results.row(policy, task, level))}
+        heights = [lines_a_task * number + 1.55 + line for number in rows]
+        low, high = zip(*(row.interval for row in rows.values()), strict=True) if rows else ((), ())
+        style: Any = {"color": _series(variable)}
+        axes.hlines(heights, _percent(low), _percent(high), linewidth=2.4, alpha=0.45, **style)
+        axes.plot(_percent(row.rate for row in rows.values()), heights, "o", markersize=5, **style)
     axes.set_xlim(-2, 102)
     axes.set_ylim(num_lines, -0.2)
-    axes.set_xticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
+    axes.set_xticks(*_PERCENT_TICKS)
     axes.set_yticks([])
-    axes.tick_params(length=0)
-    return _themed(figure, name, title, colours.values())
+    return _themed(figure, f"level-{level}", f"Success rates at level {level}", colours.values())
 
 
 def rate_chart(rates: RateFigure, index: int, colours: Mapping[str, str]) -> str:
@@ -225,58 +189,32 @@ def rate_chart(rates: RateFigure, index: int, colours: Mapping[str, str]) -> str
         An `<svg>` element.
     """
     panel = rates.panels[index]
-    ticks = _ticks(rates)
-    longest = max((len(rates.tick(x)) for x in ticks), default=0)
-    bottom = 0.45 + (_CHARACTER_IN * min(_MAX_TILTED, longest) if rates.named else 0.0)
-    figure, axes = _panel(2.15 + bottom, margins_in=(0.5, bottom, 0.16, 0.08))
+    figure, axes = _panel(3.6 if rates.named else 2.6)
     for number, curve in enumerate(panel.curves):
         colour = _series(colours[curve.name])
         shift = _DODGE * (number - (len(panel.curves) - 1) / 2) if rates.named else 0.0
-        at = [point.x + shift for point in curve.points]
-        style: dict[str, Any] = {"color": colour, "marker": "o", "linewidth": 1.8, "markersize": 4.5}
+        style: dict[str, Any] = {"linewidth": 1.8, "markersize": 4.5}
         if curve.published:
-            style |= {"linestyle": (0, (3, 2)), "linewidth": 1.2, "markerfacecolor": "none", "markersize": 4}
+            style = {"linestyle": (0, (3, 2)), "linewidth": 1.2, "markerfacecolor": "none", "markersize": 4}
         if rates.named:
             style["linestyle"] = "none"
-        axes.plot(at, [100 * point.rate for point in curve.points], **style)
+        at = [point.x + shift for point in curve.points]
+        axes.plot(at, _percent(point.rate for point in curve.points), marker="o", color=colour, **style)
         for x, point in zip(at, curve.points, strict=True):
-            seeds = [100 * rate for rate in point.seeds]
+            seeds = _percent(point.seeds)
             axes.plot([x] * len(seeds), seeds, "_", color=colour, markersize=8, markeredgewidth=1.2)
-            if point.interval:
-                ends = [100 * end for end in point.interval]
-                axes.plot([x] * 2, ends, color=colour, linewidth=2.4, alpha=0.4, solid_capstyle="round")
+            axes.vlines(x, *_percent(point.interval or (0, 0)), color=colour, linewidth=2.4, alpha=0.4)
     if rates.logarithmic:
         axes.set_xscale("log")
+    ticks = sorted({p.x for each in rates.panels for curve in each.curves for p in curve.points})
     tilt: Any = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if rates.named else {}
-    axes.set_xticks(ticks, [_cut(rates.tick(x)) for x in ticks], **tilt)
+    axes.set_xticks(ticks, [rates.tick(x) for x in ticks], **tilt)
     axes.set_xticks([], minor=True)
     axes.set_ylim(-3, 103)
-    axes.set_yticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
+    axes.set_yticks(*_PERCENT_TICKS)
     axes.set_xlabel(rates.quantity)
-    axes.tick_params(length=0)
     title = f"{rates.caption} {panel.title}"
     return _themed(figure, f"{rates.label}-{index}", title, [colours[c.name] for c in panel.curves])
-
-
-def _ticks(rates: RateFigure) -> list[float]:
-    """Values to name on the axis."""
-    values = {p.x for panel in rates.panels for curve in panel.curves for p in curve.points}
-    return sorted(values) if rates.named else _spaced(values, rates.logarithmic)
-
-
-def _cut(name: str) -> str:
-    return name if len(name) <= _MAX_TILTED else f"{name[: _MAX_TILTED - 1]}…"
-
-
-def _spaced(values: Iterable[float], logarithmic: bool) -> list[float]:
-    """Leave out values whose names would overlap on an axis; the largest one stays."""
-    at = {x: math.log(x) if logarithmic else x for x in sorted(values, reverse=True)}
-    gap = _LEAST_GAP * (max(at.values()) - min(at.values())) if at else 0.0
-    kept: list[float] = []
-    for x, position in at.items():
-        if not kept or at[kept[-1]] - position >= gap:
-            kept.append(x)
-    return kept
 
 
 def curve_chart(
@@ -294,36 +232,35 @@ def curve_chart(
         An `<svg>` element.
     """
     variables = [f"--series-{index + 1}" for index in range(len(curves))]
-    figure, axes = _panel(2.5, margins_in=(0.5, 0.45, 0.1, 0.3))
+    figure, axes = _panel(2.5)
     for (label, points), variable in zip(curves.items(), variables, strict=True):
-        steps = [step for step, _ in points]
-        values = [100 * value if percent else value for _, value in points]
+        steps, values = zip(*points, strict=True)
         marker = "o" if len(points) < 30 else ""
-        axes.plot(
-            steps, values, marker=marker, color=_series(variable), linewidth=1.8, markersize=3.5, label=label
-        )
+        style: Any = {"marker": marker, "markersize": 3.5, "color": _series(variable), "linewidth": 1.8}
+        axes.plot(steps, _percent(values) if percent else values, label=label, **style)
     if percent:
         axes.set_ylim(-2, 102)
-        axes.set_yticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
+        axes.set_yticks(*_PERCENT_TICKS)
     axes.set_title(title, loc="left", fontsize=10, color=_INK)
     axes.set_xlabel("step")
-    axes.tick_params(length=0)
     if len(curves) > 1:
         axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
     return _themed(figure, name, title, variables)
 
 
-def _panel(height_in: float, margins_in: tuple[float, float, float, float]) -> tuple[Any, Any]:
-    """Make a figure with one pair of axes; margins are left, bottom, right, top."""
+def _percent(fractions: Iterable[float]) -> list[float]:
+    return [100 * fraction for fraction in fractions]
+
+
+def _panel(height_in: float) -> tuple[Any, Any]:
+    """Make a figure with one pair of axes."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    left, bottom, right, top = margins_in
-    width = (_PANEL_WIDTH_IN - left - right) / _PANEL_WIDTH_IN
-    height = (height_in - bottom - top) / height_in
     with rc_context(_STYLE):
-        figure = Figure(figsize=(_PANEL_WIDTH_IN, height_in))
-        axes = figure.add_axes((left / _PANEL_WIDTH_IN, bottom / height_in, width, height))
+        figure = Figure(figsize=(_PANEL_WIDTH_IN, height_in), layout="constrained")
+        axes = figure.subplots()
+    axes.tick_params(length=0)
     return figure, axes
 
 

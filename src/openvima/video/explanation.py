@@ -25,7 +25,6 @@ PLACE: Colour = (0, 104, 201)
 COLOURS: dict[str, Colour] = {"pick": PICK, "place": PLACE, "decoder": (104, 64, 160)}
 HEAT_COLOURS = {"pose0": PICK, "pose1": PLACE}
 LEAST_SHOWN = 0.01  # probability below which a label would say 0 or 1 %
-_LEAST_FULL_BAR = 0.1  # a distribution without a higher peak does not fill its histogram
 _HOT = 0.02  # probability of a cell of the heat map that is drawn in full colour
 _NUM_LINES, _LINE_CHARACTERS = 8, 62  # of words, in a panel
 _KINDS = {
@@ -71,9 +70,7 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
     legend = f"below the prompt: attention of {whose}"
     draw.text((12, HEIGHT - 16), legend, font=font(13), fill=MUTED, anchor="lm")
     top = TOP.height * ENLARGE
-    if explanation.bins:
-        _draw_histograms(draw, explanation, top)
-    else:
+    if not explanation.bins:
         names = {placement.id: f"{placement.object}, {placement.texture}" for placement in scene.placements}
         picks = sorted(explanation.objects, key=lambda each: -each.probability)[:3]
         rows = [(each.probability, names.get(each.object_id, "object")) for each in picks]
@@ -286,25 +283,3 @@ def _draw_rotation(draw: ImageDraw.ImageDraw, explanation: Explanation, top: int
             draw.rectangle((x - 2, base - 20 * probability, x + 2, base), fill=PLACE)
     for x, label in ((left, "180°"), ((left + right) / 2, "0°"), (right, "−180°")):
         draw.text((x, base + 3), label, font=font(12), fill=MUTED, anchor="ma")
-
-
-def _draw_histograms(draw: ImageDraw.ImageDraw, explanation: Explanation, top: int) -> None:
-    """Draw the marginal distribution of every component of the action."""
-    titles = ("x", "y", "qx", "qy", "qz", "qw")
-    width = (WIDTH - 64) // len(titles)
-    for number, probabilities in enumerate(explanation.bins.values()):
-        row, column = divmod(number, len(titles))
-        kind = ("pick", "place")[row]
-        left, base = 60 + width * column, top + 70 + 48 * row
-        if not row:
-            at = (left + width / 2 - 4, top + 10)
-            draw.text(at, titles[column], font=font(13), fill=MUTED, anchor="mm")
-        if not column:
-            draw.text((10, base - 16), kind, font=font(14, bold=True), fill=COLOURS[kind], anchor="lm")
-        bars = width - 12
-        draw.line((left, base, left + bars, base), fill=MUTED)
-        for k, probability in enumerate(probabilities / max(probabilities.max(), _LEAST_FULL_BAR)):
-            x0, x1 = left + bars * k / len(probabilities), left + bars * (k + 1) / len(probabilities) - 1
-            draw.rectangle((x0, base - 24 * probability, max(x0, x1), base), fill=COLOURS[kind])
-        peak = percent(probabilities.max())
-        draw.text((left + bars, base - 27), peak, font=font(12), fill=INK, anchor="rd")
