@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from openvima.catalog.textures import BASE_COLOURS
+from openvima.catalog.textures import TEXTURES
 from openvima.env import TabletopEnv
 from openvima.errors import ActionError, PolicyError
 from openvima.evaluation import score
@@ -48,7 +48,14 @@ def is_told_by_colours(info: dict) -> bool:
 
 
 def colours(text: str) -> tuple[frozenset[str], bool, bool]:
-    found = frozenset(re.findall("|".join(BASE_COLOURS), text))
+    found = frozenset(
+        re.findall(
+            "|".join(
+                spec.name for spec in TEXTURES.values() if spec.category == "plain" and not spec.is_dark
+            ),
+            text,
+        )
+    )
     return found, "dark" in text, bool(re.search("swirl|paisley", text))
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from openvima.cli.main import main
-from openvima.errors import MissingExtraError
+from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation import EvaluationConfig, Results
 from openvima.evaluation.sources import PolicySource
-from openvima.report import evaluate_and_report
+from openvima.report import VideoSelection, evaluate_and_report
 from openvima.report import videos as report_videos
 from openvima.report.page import default_command
 from openvima.video.encoder import load_clips
@@ -17,7 +17,7 @@ from openvima.video.encoder import load_clips
 
 def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(results):
     config = EvaluationConfig(("mine=runs/a", "oracle", "random"))
-    jobs = report_videos.recording_jobs(config, 2, results)
+    jobs = report_videos.recording_jobs(config, VideoSelection(2), results)
     recorded = [(job.batch.policy, job.batch.task, job.batch.level, job.batch.first_seed) for job in jobs]
     assert sorted(recorded) == [
         *(("mine", "rotate", "L1", seed) for seed in (0, 1, 9)),
@@ -33,7 +33,7 @@ def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(resul
 def test_failures_are_recorded_first_and_within_a_budget(results, monkeypatch):
     monkeypatch.setattr(report_videos, "MOST_VIDEOS", 4)
     config = EvaluationConfig(("mine=runs/a", "oracle"))
-    jobs = report_videos.recording_jobs(config, 1, results)
+    jobs = report_videos.recording_jobs(config, VideoSelection(), results)
     assert [job.episode for job in jobs] == [
         *(("mine", *cell) for cell in (("rotate", "L1", 9), ("rotate", "L3", 3), ("stack<b>", "L1", 6))),
         ("mine", "rotate", "L1", 0),
@@ -54,19 +54,38 @@ def test_the_table_is_printed_before_any_video(tmp_path, monkeypatch, capsys):
 
 
 def test_without_trained_policies_all_are_recorded(results):
-    jobs = report_videos.recording_jobs(EvaluationConfig(("random",)), 1, results)
+    jobs = report_videos.recording_jobs(EvaluationConfig(("random",)), VideoSelection(), results)
     assert {job.batch.policy for job in jobs} == {"random"}
 
 
 def test_no_videos_are_recorded_if_none_are_requested(results):
-    assert report_videos.recording_jobs(EvaluationConfig(("oracle",)), 0, results) == []
+    assert report_videos.recording_jobs(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
 
 
-def test_more_videos_are_added_to_those_recorded_before(tmp_path):
+def test_requested_episodes_are_recorded_of_every_policy(results):
+    settings = {"tasks": ("rotate",), "levels": ("L1", "L3"), "episodes": 10}
+    config = EvaluationConfig(("mine=runs/a", "oracle"), **settings)
+    videos = VideoSelection(0, ("rotate/4", "rotate/L3/5"))
+    assert [job.episode for job in report_videos.recording_jobs(config, videos, results)] == [
+        *(("mine", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
+        *(("oracle", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
+    ]
+
+
+@pytest.mark.parametrize("text", ["rotate", "rotate/L1", "rotate/10", "twist/3", "rotate/L2/3", "rotate/-1"])
+def test_requested_episodes_outside_the_evaluation_are_refused(text):
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=10)
+    with pytest.raises(ConfigError, match=f"record_video is '{text}'"):
+        report_videos.requested_episodes(config, VideoSelection(record_video=(text,)))
+
+
+def test_further_videos_are_added_to_those_recorded_before(tmp_path):
     config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=2, out=tmp_path)
     notes = []
-    evaluate_and_report(config, 1)
-    evaluate_and_report(config, 2, lambda done, total, note: notes.append(note))
+    evaluate_and_report(config, VideoSelection(0, ("rotate/1",)))
+    evaluate_and_report(
+        config, VideoSelection(0, ("rotate/0",)), lambda done, total, note: notes.append(note)
+    )
     assert notes == ["recorded 1 of 1 (--videos 0: none)"]
     assert [clip.seed for clip in load_clips(tmp_path)] == [0, 1]
 

@@ -8,7 +8,7 @@ import pytest
 from openvima.evaluation.comparison import compare_pairs
 from openvima.evaluation.results import Results
 from openvima.report.table import latex, markdown
-from openvima.report.tables import paper_tables
+from openvima.report.tables import compact_tables, paper_tables
 
 
 @pytest.fixture
@@ -119,3 +119,10 @@ def test_a_weak_difference_is_marked_in_markdown_and_latex(results):
     assert "+30.0 (+10.0 to +50.0) ?" in markdown(tables)
     assert r"+30.0 {\footnotesize(+10.0 to +50.0)} ?" in latex(tables)
     assert "?: weak" in tables[-1].caption
+
+
+def test_the_compact_table_has_the_best_policy_of_each_level_in_bold(results):
+    (table,) = compact_tables(results, published=False)
+    assert cells_of(markdown([table]), "mine")[0][0].startswith("**75.0** (")
+    assert cells_of(markdown([table]), "oracle")[0][0].startswith("100.0 (")  # an upper bound
+    assert latex([table]).count(r"\textbf") == 2  # one a level

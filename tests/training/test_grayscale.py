@@ -8,7 +8,7 @@ import torch
 
 from openvima.catalog.packs import load_assets
 from openvima.catalog.random_pack import RandomAppearanceAssets, is_random
-from openvima.catalog.textures import NEUTRAL_COLOUR
+from openvima.catalog.textures import texture_spec
 from openvima.perception.objects import observe_prompt_image
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Prompt, Scene
@@ -54,7 +54,8 @@ def test_a_grayscale_prompt_image_has_no_colour_and_the_scene_keeps_its_own(rast
     pairs = pairs_of(rasteriser, RED_A, BLUE_A, HIGH_HEART, is_grayscale=[True, False, True])
     assert pairs.is_grayscale.tolist() == [True, False, True]
     largest = chroma(pairs.prompt_crops).flatten(1).amax(1)
-    neutral = max(NEUTRAL_COLOUR) - min(NEUTRAL_COLOUR)
+    texel = texture_spec("gray").texel
+    neutral = max(texel) - min(texel)
     assert (largest[pairs.is_grayscale] <= neutral).all()  # the neutral colour is a warm gray
     assert (largest[~pairs.is_grayscale] > 4 * neutral).all()
     assert pairs.prompt_masks.all()

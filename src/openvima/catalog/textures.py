@@ -1,12 +1,12 @@
-"""The 82 textures of the benchmark, 49 light and 33 dark, and the neutral gray of some prompt images.
+"""The 82 textures of the benchmark, 49 light and 33 dark, and the neutral gray of some prompts.
 
-Source: the texture list and base colours of VIMA-Bench. A dark colour is the light one with its HSV value
-lowered by 0.3.
+They are read from `textures.json`. Source: the texture list and base colours of VIMA-Bench. A dark
+colour is the light one with its HSV value lowered by 0.3.
 """
 
-import colorsys
+import json
 from dataclasses import dataclass
-from itertools import combinations
+from pathlib import Path
 from typing import Literal
 
 from openvima.errors import UnknownNameError, unknown_name
@@ -18,28 +18,6 @@ Rgb = tuple[float, float, float]
 
 NEUTRAL_TEXTURE = "gray"
 DARK_VALUE_DROP = 0.3  # of the HSV value, whose range is [0, 1]
-
-BASE_COLOURS: dict[str, tuple[int, int, int]] = {
-    "blue": (78, 121, 167),
-    "red": (255, 87, 89),
-    "green": (89, 169, 79),
-    "orange": (242, 142, 43),
-    "yellow": (237, 201, 72),
-    "purple": (176, 122, 161),
-    "pink": (255, 157, 167),
-    "cyan": (118, 183, 178),
-    "olive": (128, 128, 0),
-}
-"""Plain colours as 8-bit RGB; patterns are made of them."""
-
-NEUTRAL_COLOUR = (186, 176, 172)
-SPECIAL_NAMES = (
-    *("brick", "tiles", "wooden", "granite", "plastic", "polka dot", "checkerboard", "tiger", "magma"),
-    "rainbow",
-)
-COLOUR_PAIRS = tuple(combinations(("red", "yellow", "green", "blue", "purple"), 2))
-PATTERN_COLOURS = ("red", "yellow", "green", "blue", "purple")
-_WITHOUT_DARK_VARIANT = ("olive",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,66 +58,27 @@ class TextureSpec:
         return (red, green, blue)
 
 
-def darkened(colour: Rgb) -> Rgb:
-    """Lower the HSV value of an RGB colour in [0, 1] by 0.3, not below 0."""
-    hue, saturation, value = colorsys.rgb_to_hsv(*colour)
-    return colorsys.hsv_to_rgb(hue, saturation, max(0.0, value - DARK_VALUE_DROP))
+def _load() -> dict[str, TextureSpec]:
+    records = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
+    return {
+        record["name"]: TextureSpec(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items()})
+        for record in records
+    }
 
 
-def _unit_rgb(colour: tuple[int, int, int]) -> Rgb:
-    red, green, blue = colour
-    return (red / 255, green / 255, blue / 255)
-
-
-def _identifier(name: str) -> str:
-    return name.upper().replace(" ", "_")
-
-
-def _light_and_dark(
-    name: str, category: TextureCategory, base_colours: tuple[str, ...]
-) -> tuple[TextureSpec, ...]:
-    """A pattern and, except for paisleys, its dark variant."""
-    if category == "paisley":
-        return (TextureSpec(name, _identifier(name), category, base_colours=base_colours),)
-    dark = f"dark {name}"
-    return (
-        TextureSpec(name, _identifier(name), category, base_colours=base_colours, dark_variant=dark),
-        TextureSpec(dark, _identifier(dark), category, is_dark=True, base_colours=base_colours),
-    )
-
-
-def _patterns() -> list[TextureSpec]:
-    specs = [TextureSpec(name, _identifier(name), "special") for name in SPECIAL_NAMES]
-    for pair in COLOUR_PAIRS:
-        specs += _light_and_dark(f"{pair[0]} and {pair[1]} stripe", "stripe", pair)
-    for pair in COLOUR_PAIRS:
-        specs += _light_and_dark(f"{pair[0]} and {pair[1]} polka dot", "polka_dot_2", pair)
-    for colour in PATTERN_COLOURS:
-        specs += _light_and_dark(f"{colour} swirl", "swirl", (colour,))
-    for colour in PATTERN_COLOURS:
-        specs += _light_and_dark(f"{colour} paisley", "paisley", (colour,))
-    return specs
-
-
-def _plain_colours() -> list[TextureSpec]:
-    light, dark = [], []
-    for name, rgb in BASE_COLOURS.items():
-        colour = _unit_rgb(rgb)
-        dark_name = None if name in _WITHOUT_DARK_VARIANT else f"dark {name}"
-        light.append(TextureSpec(name, _identifier(name), "plain", colour=colour, dark_variant=dark_name))
-        if dark_name:
-            dark_id = _identifier(dark_name)
-            dark.append(TextureSpec(dark_name, dark_id, "plain", is_dark=True, colour=darkened(colour)))
-    return light + dark
-
-
-TEXTURES: dict[str, TextureSpec] = {spec.name: spec for spec in (*_patterns(), *_plain_colours())}
+TEXTURES: dict[str, TextureSpec] = _load()
 """The 82 textures by display name: patterns, each light one followed by its dark one, then plain colours."""
 
 REGISTERED_TEXTURES: dict[str, TextureSpec] = {}
 """Textures of users by display name, from `register_texture`."""
 
-_NEUTRAL = TextureSpec(NEUTRAL_TEXTURE, "GRAY", "neutral", colour=_unit_rgb(NEUTRAL_COLOUR))
+_NEUTRAL = TEXTURES.pop(NEUTRAL_TEXTURE)
+BASE_COLOURS: dict[str, tuple[int, ...]] = {
+    name: tuple(round(255 * part) for part in spec.colour)
+    for name, spec in TEXTURES.items()
+    if spec.colour and not spec.is_dark
+}
+"""Plain colours as 8-bit RGB; patterns are made of them."""
 
 
 def texture_spec(name: str) -> TextureSpec:

@@ -1,11 +1,14 @@
 """`openvima demo`: record a video of the oracle or of a policy on one task or on an episode from a file."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
+
+if TYPE_CHECKING:
+    from openvima.scene import Episode
 
 
 def main(
@@ -85,37 +88,38 @@ def main(
     if boxes is not None and policy in ("oracle", "random"):
         raise ConfigError(f"--boxes is {boxes!r}, but {policy} uses no boxes; name a trained policy.")
     from openvima.catalog import load_assets
-    from openvima.env import EnvConfig
+    from openvima.env import EnvConfig, load_episode
     from openvima.evaluation.config import Batch
     from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_rollout_policy
     from openvima.evaluation.sources import PolicySource
+    from openvima.policies.naming import ORACLE
+    from openvima.scene import HOST_TASK
     from openvima.serving.chat import VlmConfig
+    from openvima.tasks.oracle import require_goals
     from openvima.tasks.sampling import check_task_options
 
     source = PolicySource(policy, policy, trust_code)
     source.check()  # before a scene is built
-    if episode is not None:
-        return _record_file(
-            episode,
-            policy,
-            out,
-            assets=assets,
-            compat=compat,
-            device=device,
-            boxes=boxes or "",
-            trust_code=trust_code,
-            explain=explain,
-        )
-    assert task is not None  # as checked
     env_config = EnvConfig(assets, compat, prompts, task_options, control)
     load_assets(env_config.assets)  # may register objects of the task that is sampled next
-    check_task_options((task,), env_config.task_options)
+    start: int | Episode = seed
+    if episode is not None:
+        start = load_episode(episode, assets=assets)
+        env = env_config.make(HOST_TASK, "train", domain="user", realtime=True)
+        what, title = str(episode), episode.stem
+        if policy == ORACLE:
+            require_goals(start.problem)
+    else:
+        assert task is not None  # as checked
+        check_task_options((task,), env_config.task_options)
+        env = env_config.make(task, level, domain="user", realtime=True)
+        what, title = f"{task}, seed {seed}", f"{task} · {level} · seed {seed}"
     batch = Batch(
         policy,
         policy,
-        task,
-        level,
+        env.task,
+        env.level,
         first_seed=seed,
         episodes=1,
         env_config=env_config,
@@ -125,25 +129,11 @@ def main(
         vlm=VlmConfig(base_url, view, vlm),
     )
     explain = explain or source.kind == "vlm"
-    env = env_config.make(task, level, domain="user", realtime=True)
-    title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
-    outcome = record_episode(env, load_rollout_policy(batch), seed, out, title=title, explain=explain)
+    title = f"{title} · {Path(policy).name}"
+    outcome = record_episode(env, load_rollout_policy(batch), start, out, title=title, explain=explain)
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
+    if not env.episode.problem.goals and not env.outcome.failure:
+        ended = outcome.reason
     steps = "1 step" if outcome.steps == 1 else f"{outcome.steps} steps"
-    print(f"{out}: {task}, seed {seed}, by {policy}: {ended}; {steps}")
-    return 0
-
-
-def _record_file(file: Path, policy: str, out: Path, **options: Any) -> int:
-    """Play the episode of a file."""
-    from openvima.env import load_episode
-    from openvima.evaluation import play
-
-    episode = load_episode(file, assets=options["assets"])
-    result = play(episode, policy, video=out, title=f"{file.stem} · {Path(policy).name}", **options)
-    ended = "solved" if result.outcome.success else f"not solved: {result.outcome.reason}"
-    if not episode.problem.goals and not result.outcome.failure:
-        ended = result.outcome.reason
-    steps = "1 step" if result.steps == 1 else f"{result.steps} steps"
-    print(f"{out}: {file}, by {policy}: {ended}; {steps}")
+    print(f"{out}: {what}, by {policy}: {ended}; {steps}")
     return 0

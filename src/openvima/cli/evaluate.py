@@ -21,6 +21,7 @@ from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 if TYPE_CHECKING:
     from openvima.evaluation import EvaluationConfig, Results
+    from openvima.report import VideoSelection
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +78,13 @@ class RecordingOptions:
     Args:
         videos: Solved episodes to record, and failures, of each trained policy, task and level; failures
             first, at most 40 times as many in all, after the table is printed. 0 records none.
+        record_video: Further episodes to record, of every policy, comma-separated: TASK/SEED or
+            TASK/LEVEL/SEED.
         report: Whether to record videos and write report.html.
     """
 
     videos: int = 1
+    record_video: str = ""
     report: bool = True
 
 
@@ -198,13 +202,14 @@ def main(
         Exit status.
     """
     from openvima.env import EnvConfig
-    from openvima.errors import LimitReachedError
+    from openvima.errors import ConfigError, LimitReachedError
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.ablations import IN_CONTEXT
     from openvima.evaluation.config import plan
     from openvima.evaluation.results import FILE_NAME
     from openvima.evaluation.runner import evaluate_range, finished_part
     from openvima.multiprocess import num_cpus
+    from openvima.report import VideoSelection
     from openvima.serving.chat import VlmConfig
 
     ablations = parse_list(ablation.ablations) + (IN_CONTEXT,) * ablation.in_context
@@ -239,6 +244,9 @@ def main(
     if workers is None and jobs.engine == "processes" and network.device == "cpu":
         config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
     print_left_out(config.tasks, environment.prompts, config.levels)
+    selection = VideoSelection(recording.videos, parse_list(recording.record_video))
+    if recording.record_video and not recording.report:
+        raise ConfigError("--record-video needs the report; drop --no-report.")
     if jobs.list_shards:
         for number, shard in enumerate(plan(config)):
             names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)
@@ -253,7 +261,7 @@ def main(
             return 0
     try:
         if recording.report:
-            path = _evaluate_and_report(config, recording.videos, as_json=as_json)
+            path = _evaluate_and_report(config, selection, as_json=as_json)
         else:
             with progress_bar("evaluation") as bar:
                 path = evaluate(config, bar)
@@ -269,7 +277,7 @@ def main(
     return 0
 
 
-def _evaluate_and_report(config: "EvaluationConfig", videos: int, *, as_json: bool) -> Path:
+def _evaluate_and_report(config: "EvaluationConfig", videos: "VideoSelection", *, as_json: bool) -> Path:
     """Evaluate, print the scores, then record videos; evaluation and videos have a bar each."""
     from openvima.evaluation.results import FILE_NAME
     from openvima.report import evaluate_and_report

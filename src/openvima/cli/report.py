@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -23,6 +23,7 @@ def main(
     out: Path | None = None,
     compare: str | None = None,
     runs: tuple[Path, ...] = (),
+    tables: Literal["all", "levels"] = "all",
     published: bool = True,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -40,6 +41,8 @@ def main(
         compare: Policies with commas in between; each is compared with the first, seed by seed.
             POLICY:ABLATION stands for its score under an ablation.
         runs: Folders of training runs, or their metrics.jsonl, whose learning curves to show.
+        tables: What a .md or .tex file has: all, or levels, a compact one of the means by level with the best
+            policy of each in bold.
         published: Whether to show published numbers of the same tasks beside those measured.
         as_json: Print the comparisons as JSON.
 
@@ -52,7 +55,7 @@ def main(
     from openvima.evaluation.verification import is_marked_verified
     from openvima.report.curves import run_labels
     from openvima.report.table import latex, markdown
-    from openvima.report.tables import paper_tables
+    from openvima.report.tables import compact_tables, paper_tables
     from openvima.report.text import Confirmation, finding
 
     _check(results, out)
@@ -68,7 +71,11 @@ def main(
     ]
     if out is not None and (write := {".md": markdown, ".tex": latex}.get(out.suffix.lower())):
         confirmed = all(each.confirmed for each in confirmations)
-        written = paper_tables(merged.results, comparisons, published=published, confirmed=confirmed)
+        written = (
+            paper_tables(merged.results, comparisons, published=published, confirmed=confirmed)
+            if tables == "all"
+            else compact_tables(merged.results, published=published)
+        )
         atomic_write_file(out, write(written))
         print(f"Tables: {out}")
         return 0

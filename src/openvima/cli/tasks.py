@@ -57,8 +57,8 @@ def main(
             _percent(oracle_record(spec.name)),
         )
     print_table(table)
-    print("steps: step limit of the oracle, and what a policy may use beyond it")
-    print("oracle: its success rate in %, over all levels; --json has each level")
+    print("steps: the oracle's limit, and what a policy may add to it")
+    print("oracle: success rate in %, over all levels (--json: each)")
     print("`openvima tasks TASK` lists the options of a task")
     return 0
 
@@ -120,4 +120,4 @@ def _record(spec: "TaskSpec") -> dict[str, object]:
 def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
     episodes = sum(level["episodes"] for level in record.values())
     solved = sum(level["successes"] for level in record.values())
-    return f"{100 * solved / episodes:.2f}" if episodes else "–"
+    return f"{100 * solved / episodes:.2f}" if episodes else "-"

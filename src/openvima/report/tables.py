@@ -15,6 +15,7 @@ from openvima.evaluation.comparison import (
 )
 from openvima.evaluation.results import LevelMean, Results
 from openvima.evaluation.statistics import Interval, mean_of_rates
+from openvima.policies.naming import ORACLE
 from openvima.report.published import (
     BESIDE,
     is_comparable,
@@ -184,6 +185,26 @@ def paper_tables(
     if confirmed:
         return [replace(table, caption=f"{table.caption} {_CONFIRMED}") for table in tables]
     return [replace(tables[0], caption=f"{tables[0].caption} {_UNCONFIRMED}"), *tables[1:]]
+
+
+def compact_tables(results: Results, *, published: bool = True) -> list[Table]:
+    """Means by level alone, the best policy of each level in bold; the oracle, an upper bound, is none."""
+    table = _mean_table(results, results.means(), published=published and is_comparable(results))
+    rivals = [n for n in results.policy_names() if results.policies.get(n, {}).get("kind") != ORACLE]
+    for column in range(len(results.levels())):
+        measured = [line.cells[column] for line in table.lines if line.name in rivals]
+        best = max((cell.value for cell in measured if isinstance(cell, Estimate)), default=None)
+        table = replace(table, lines=tuple(_emphasise(line, column, best, rivals) for line in table.lines))
+    return [table]
+
+
+def _emphasise(line: Line, column: int, best: float | None, rivals: Sequence[str]) -> Line:
+    cell = line.cells[column]
+    if not isinstance(cell, Estimate) or cell.value != best or line.name not in rivals:
+        return line
+    cells = list(line.cells)
+    cells[column] = replace(cell, is_best=True)
+    return replace(line, cells=tuple(cells))
 
 
 def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:

@@ -1,14 +1,16 @@
 """Report assets: an evaluation followed by videos of some of its episodes and by the report."""
 
 import importlib.util
+import re
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
 from openvima.atomic_io import folder_lock
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.evaluation.config import Batch, EvaluationConfig
+from openvima.evaluation.config import Batch, EvaluationConfig, cells
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
@@ -21,7 +23,33 @@ from openvima.report.text import Confirmation
 from openvima.video.encoder import Clip, load_clips, png, save_clips
 
 REPORT_NAME = "report.html"
-MOST_VIDEOS = 40  # for each of a task; one takes about a second
+MOST_VIDEOS = 40  # for each of `per_task`; one takes about a second
+_EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSelection:
+    """Which episodes to record for the report.
+
+    Args:
+        per_task: Solved episodes, and failures, of each trained policy, task and level; failures first, and
+            at most `MOST_VIDEOS` times as many in all.
+        record_video: Further episodes, of every policy: "task/seed" at the task's first level, or
+            "task/level/seed".
+
+    Raises:
+        ConfigError: `per_task` is negative.
+    """
+
+    per_task: int = 1
+    record_video: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.per_task < 0:
+            raise ConfigError(f"videos is {self.per_task}; it must be at least 0.")
+
+
+DEFAULT_VIDEOS = VideoSelection()
 
 
 def require_extra() -> None:
@@ -40,7 +68,7 @@ def require_extra() -> None:
 
 def evaluate_and_report(
     config: EvaluationConfig,
-    videos: int = 1,
+    videos: VideoSelection = DEFAULT_VIDEOS,
     progress: Report | None = None,
     on_results: Callable[[Results], None] | None = None,
 ) -> Path:
@@ -48,8 +76,7 @@ def evaluate_and_report(
 
     Args:
         config: What to evaluate.
-        videos: How many solved episodes, and how many failures, of each trained policy, task and level to
-            record; failures first, and at most `MOST_VIDEOS` times as many in all.
+        videos: Which episodes to record.
         progress: As for `evaluate`.
         on_results: Called with the results before any video is recorded.
 
@@ -57,12 +84,11 @@ def evaluate_and_report(
         `results.json`; `report.html` and the folder `videos` are beside it.
 
     Raises:
-        ConfigError: `videos` is negative, or as for `evaluate`.
+        ConfigError: An episode to record is not part of the evaluation, or as for `evaluate`.
         MissingExtraError: matplotlib, PyAV or Jinja is not installed, or as for `evaluate`.
     """
     require_extra()
-    if videos < 0:
-        raise ConfigError(f"videos is {videos}; it must be at least 0.")
+    requested_episodes(config, videos)
     with config.served() as served:
         prepared = prepare(served)
         with folder_lock(config.out):
@@ -102,14 +128,41 @@ def _recorded(
     return found
 
 
-def recording_jobs(config: EvaluationConfig, videos: int, results: Results) -> list[Job]:
+def requested_episodes(config: EvaluationConfig, videos: VideoSelection) -> list[tuple[str, str, int]]:
+    """Parse `videos.record_video` into task, level and seed.
+
+    Raises:
+        ConfigError: A name cannot be parsed, or the episode is not part of the evaluation.
+    """
+    played = cells(config)
+    requested = []
+    for text in videos.record_video:
+        found = _EPISODE.fullmatch(text)
+        if found is None:
+            raise ConfigError(
+                f"record_video is {text!r}; give TASK/SEED or TASK/LEVEL/SEED, such as rotate/L1/3."
+            )
+        task, wanted, seed = found[1], found[2], int(found[3])
+        level = next((level for name, level in played if name == task and wanted in (None, level)), None)
+        last = config.seed + config.episodes - 1
+        if level is None or not config.seed <= seed <= last:
+            raise ConfigError(
+                f"record_video is {text!r}, which is not evaluated; tasks and levels are those of this "
+                f"evaluation, and seeds {config.seed} to {last}."
+            )
+        requested.append((task, level, seed))
+    return requested
+
+
+def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Results) -> list[Job]:
     """Choose which episodes to record.
 
-    Of each task and level: the first `videos` solved episodes and failures of every trained policy.
+    Of each task and level: the first `videos.per_task` solved episodes and failures of every trained policy.
     Of the oracle the first solved ones of each task. Without trained policies and oracle, of all policies.
-    Failures come first, and the budget ends the list.
+    Failures come first, and the budget ends the list. Then the requested episodes, of
+    every policy.
     """
-    sources = config.sources
+    sources, requested = config.sources, requested_episodes(config, videos)
     shown = [source for source in sources if source.kind in (*TRAINED_KINDS, ORACLE)] or list(sources)
     jobs: list[Job] = []
     for success in (False, True):
@@ -120,8 +173,14 @@ def recording_jobs(config: EvaluationConfig, videos: int, results: Results) -> l
                 if row is None or (source.kind == ORACLE and not (success and level == levels[0])):
                     continue
                 seeds = [outcome.seed for outcome in row.outcomes if outcome.success == success]
-                jobs += [_job(config, results, source, row, seed) for seed in seeds[:videos]]
-    return jobs[: MOST_VIDEOS * videos]
+                jobs += [_job(config, results, source, row, seed) for seed in seeds[: videos.per_task]]
+    jobs = jobs[: MOST_VIDEOS * videos.per_task]
+    for source in sources:
+        for task, level, seed in requested:
+            row = results.row(source.name, task, level)
+            if row is not None:
+                jobs.append(_job(config, results, source, row, seed))
+    return list(dict.fromkeys(jobs))
 
 
 def record_clip(job: Job, count: Callable[[int], None]) -> Clip:
