@@ -120,6 +120,11 @@ def test_descriptions_get_the_article_that_their_sentence_needs(template: str, t
     assert text_of(prompt_of(template, a="heart", b="bowl")) == text
 
 
+def test_the_name_of_a_letter_is_no_article() -> None:
+    prompt = prompt_of("Reverse the order of {a} {b}.", a="letter A", b="bowl")
+    assert text_of(prompt) == "Reverse the order of the red letter A the red bowl."
+
+
 def test_shapes_alone_are_introduced_by_name() -> None:
     text = "This is a wug {gray_1}. This is a dax {gray_2}. Put a wug into a dax."
     prompt = prompt_of(text, gray_1="L-shaped block", gray_2="pan")

@@ -174,19 +174,21 @@ def with_phrases(text: str, phrases: Mapping[str, str]) -> str:
         >>> with_phrases("Put any {a} into the {b}.", {"a": "red cross", "b": "blue bowl"})
         'Put any red cross into the blue bowl.'
     """
-    result = ""
+    result = before = ""
     for number, piece in enumerate(PLACEHOLDER.split(text)):
         if number % 2 == 0:
-            result += piece
-        elif piece in phrases:
-            result = _append_phrase(result, phrases[piece])
+            before = piece
+        elif (
+            piece in phrases
+        ):  # the article of the phrase before is none of this one: "the letter A the star"
+            result += _append_phrase(before, phrases[piece], is_first=not result and not before)
         else:
-            result += f"{{{piece}}}"
-    return result
+            result += f"{before}{{{piece}}}"
+    return result + before
 
 
-def _append_phrase(before: str, phrase: str) -> str:
-    """Append a phrase to the beginning of a text."""
+def _append_phrase(before: str, phrase: str, *, is_first: bool) -> str:
+    """Append a phrase to the piece of text before it."""
     article = "an" if _VOWEL.match(phrase) else "a"
     if _INTRODUCED.search(before):
         return f"{before.rstrip()}: {article} {phrase}"
@@ -196,7 +198,7 @@ def _append_phrase(before: str, phrase: str) -> str:
         return f"{before}{phrase}{'es' if phrase.endswith(('s', 'x', 'sh', 'ch')) else 's'}"
     if _DETERMINED.search(before):
         return before + phrase
-    starts_sentence = not before or before.rstrip().endswith((".", "!", "?"))
+    starts_sentence = is_first or before.rstrip().endswith((".", "!", "?"))
     return f"{before}{'The' if starts_sentence else 'the'} {phrase}"
 
 
