@@ -75,6 +75,8 @@ _PAPERS_FRAMES: Mapping[str, Any] = {
     "schedule.steps": 8000,
     "loader.batch_size": 64,
     "loader.rerendered_prob": 0.4,
+    # Of the tasks that take longest to learn; see results/2026-11-28_vima_comparisons.md.
+    "loader.repeat_tasks": "novel_adj=6,pick_in_order_then_restore=8",
     "optimizer.learning_rate": 5e-4,
     "optimizer.weight_decay": 0.0,
     "schedule.warmup_steps": 200,
@@ -96,7 +98,7 @@ _PAPERS: Mapping[str, Any] = {
     "augmentation.centre_picks": True,
     "augmentation.leftmost_first": True,
     "augmentation.rename_objects_prob": 0.3,
-    "augmentation.turn_comparisons_prob": 0.7,
+    "augmentation.turn_comparisons_prob": 0.8,
     "augmentation.shuffle_sentences_prob": 0.3,
     "augmentation.distractor_prob": 0.3,
 }
