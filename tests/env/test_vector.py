@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -17,7 +16,6 @@ from openvima.errors import (
     ActionError,
     ConfigError,
     EpisodeError,
-    OracleError,
     UnknownTaskError,
 )
 from openvima.policies import RandomPolicy
@@ -169,18 +167,6 @@ def test_a_bad_reset_is_refused_and_changes_nothing(pair: VectorEnv, arguments: 
     assert [episode.seed for episode in pair.get_attr("episode")] == [4, 9]
 
 
-def test_an_error_in_a_call_does_no_harm(pair: VectorEnv) -> None:
-    pair.reset(seed=[4, 9])
-    pair.step(oracle_actions(pair))
-    with pytest.raises(OracleError):  # everything is done already
-        pair.call("oracle_decision")
-    with pytest.raises(AttributeError, match="scenery"):
-        pair.get_attr("scenery")
-    with pytest.raises(ConfigError, match="no modality 'sound'"):
-        pair.set_attr("modalities", "sound")
-    assert pair.reset(seed=np.int64(5))[1]["seed"].tolist() == [5, 6]
-
-
 def test_prompts_and_observations_feed_a_policy(pair: VectorEnv) -> None:
     observations, _ = pair.reset(seed=2)
     policy = RandomPolicy(seed=1)
@@ -304,28 +290,6 @@ def test_an_episode_does_not_depend_on_how_many_are_played_at_once() -> None:
     expected = play(1, 0)
     assert len({str(episode) for episode in expected.values()}) == 6
     assert play(3, 0) == play(3, 2) == expected
-
-
-@pytest.mark.parametrize(
-    ("kind", "settings"),
-    [("sync", {}), ("async", {"context": "spawn", "shared_memory": False})],
-)
-@pytest.mark.slow
-def test_gymnasiums_own_function_gives_the_same_bytes(kind: str, settings: dict) -> None:
-    envs = gymnasium.make_vec(
-        "openvima/rotate-v1", num_envs=2, vectorization_mode=kind, vector_kwargs=settings, level="L1"
-    )
-    observations, _ = envs.reset(seed=[4, 9])
-    prompts = envs.get_attr("prompt")
-    after, rewards, *_ = envs.step(oracle_actions(envs))
-    for index, seed in enumerate([4, 9]):
-        single = TabletopEnv("rotate", level="L1")
-        assert frozen(rows(envs, observations)[index]) == frozen(single.reset(seed=seed)[0])
-        assert frozen(prompt_bytes(prompts[index : index + 1])) == frozen(prompt_bytes((single.prompt,)))
-        expected, reward, *_ = single.step(single.oracle_decision().action)
-        assert frozen(rows(envs, after)[index]) == frozen(expected)
-        assert rewards[index] == reward
-    envs.close()
 
 
 def test_gymnasiums_wrappers_take_the_infos() -> None:

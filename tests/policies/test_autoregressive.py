@@ -251,16 +251,6 @@ def test_actions_as_they_are_sent_come_back_as_the_same_tokens(component: int) -
     assert len(back[:, component].unique(dim=0)) == NUM_BINS[component]
 
 
-def test_half_precision_gives_actions_on_bins(demonstrations) -> None:
-    policy = NetworkPolicy(network_of(CONFIGS["midas"]), dtype=torch.bfloat16)
-    policy.reset([demonstrations[0].prompt])
-    for _ in range(2):
-        (action,) = policy.act([demonstrations[0].observation(0)])
-    vector = torch.from_numpy(np.concatenate(list(action.values())))[None]
-    unit = to_unit_range(vector.double())
-    torch.testing.assert_close(decode_bins(encode_bins(unit), torch.float64), unit, rtol=0, atol=1e-6)
-
-
 @torch.no_grad()
 def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonstrations) -> None:
     on = network_of(with_visual_residual(preset("vima-nano")))
@@ -276,12 +266,3 @@ def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonst
     expected = on.prompt.images(tokens_IE)[prompts.object_index_BL[is_image_BL]]
     torch.testing.assert_close(added_BLD[is_image_BL], expected)  # widths are equal: no layer behind
     assert expected.abs().max() > 1e-3
-
-
-def test_switches_change_nothing_else_and_can_be_undone() -> None:
-    plain = preset("vima-nano")
-    both = with_visual_residual(with_head(plain, "autoregressive"))
-    assert replace(both, head=plain.head, prompt=plain.prompt) == plain
-    assert with_visual_residual(with_head(both, "bins"), False) == plain
-    midas = preset("midas-nano")
-    assert (both.images, both.prompt, both.head) == (midas.images, midas.prompt, midas.head)

@@ -9,7 +9,7 @@ import torch
 from openvima.cli import quickstart
 from openvima.cli.main import main
 from openvima.env.config import DEFAULT_ENV_CONFIG
-from openvima.errors import InputFileError, PolicyError, UnknownPolicyError
+from openvima.errors import InputFileError, UnknownPolicyError
 from openvima.evaluation import Results
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
@@ -20,7 +20,6 @@ from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.naming import (
     BUNDLED,
-    CHECKPOINTS_FOLDER,
     MODEL_CARD,
     SMALL,
     find_checkpoint,
@@ -92,16 +91,6 @@ def test_without_its_weights_the_message_says_where_they_belong(bundled: Path, c
     assert main(["quickstart"]) == 2
     assert "lacks the weights" in capsys.readouterr().err
     assert not list(Path().iterdir())
-
-
-def test_a_checkpoint_here_of_the_same_name_is_not_mistaken_for_it(bundled: Path) -> None:
-    save_checkpoint(build_network(narrow_small(), seed=6), f"run/{CHECKPOINTS_FOLDER}/000001")
-    Path("run").rename(SMALL)
-    with pytest.raises(PolicyError, match=r"write \./openvima-small for the folder"):
-        load_policy(SMALL)
-    here = load_policy(f"./{SMALL}").network.query
-    assert torch.equal(here.float(), build_network(narrow_small(), seed=6).query)
-    assert weights_hash(f"./{SMALL}") == weights_hash(Path(SMALL)) != weights_hash(bundled)
 
 
 def test_training_begins_with_it(bundled: Path, monkeypatch: pytest.MonkeyPatch) -> None:

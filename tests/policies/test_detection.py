@@ -10,7 +10,6 @@ from openvima.env import TabletopEnv
 from openvima.errors import PolicyError, ShapeError
 from openvima.perception.objects import (
     FRONT,
-    GROUND_TRUTH,
     TOP,
     ObjectViews,
     crop_box,
@@ -198,19 +197,6 @@ def test_an_image_of_one_object_keeps_the_highest_score_even_below_the_threshold
     found = extractor.in_prompt_image(prompt_image("object"))
     assert found.boxes[:, :, 0].tolist() == [[155], [15]]
     assert len(extractor.in_prompt_image(prompt_image("scene"))) == 2
-
-
-def test_an_image_in_which_nothing_is_found_shows_nothing() -> None:
-    extractor = DetectedObjects(Fixed(plain(), plain()))
-    for kind in ("object", "scene"):
-        assert len(extractor.in_prompt_image(prompt_image(kind))) == 0
-
-
-def test_prompt_images_can_be_left_to_another_extractor(starts) -> None:
-    env, _ = starts[0]
-    extractor = DetectedObjects(Fixed(plain(), plain()), prompt_extractor=GROUND_TRUTH)
-    for image in env.prompt.images.values():
-        assert_same(extractor.in_prompt_image(image), observe_prompt_image(image))
 
 
 class Bright:

@@ -11,7 +11,7 @@ import torch
 
 from openvima.errors import PolicyError, PromptError, ShapeError, UnknownWordWarning
 from openvima.perception.objects import GroundTruth, observe
-from openvima.policies import inference, preset
+from openvima.policies import preset
 from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.actions import (
@@ -193,12 +193,6 @@ def test_images_that_did_not_change_are_encoded_once(policy, prompts, pool, monk
     np.testing.assert_array_equal(first, [vector(action) for action in policy.act([pool[0], pool[0]])])
 
 
-def test_images_encoded_in_pieces_give_the_same_actions(policy, prompts, pool, monkeypatch) -> None:
-    at_once = played(policy, prompts, pool, (2, 0))
-    monkeypatch.setattr(inference, "MAX_CROPS_ON_CPU", 1)
-    assert_same_actions(played(policy, prompts, pool, (2, 0)), at_once)
-
-
 def test_a_reset_forgets(policy, prompts, pool) -> None:
     first = played(policy, prompts, pool, (2, 0))
     played(policy, prompts, pool, (1,))
@@ -241,17 +235,6 @@ def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
         for row, action in enumerate(policy.act(seen)):
             if action is not None:
                 np.testing.assert_array_equal(vector(action), expected[row, step][0])
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.slow
-def test_half_precision_gives_valid_actions(name, prompts, pool) -> None:
-    policy = NetworkPolicy(network_of(name), dtype=torch.bfloat16)
-    for action, query in played(policy, prompts, pool).values():
-        assert np.isfinite(query).all()
-        assert ((action[[0, 6]] >= 0.25) & (action[[0, 6]] <= 0.75)).all()
-        assert (np.abs(action[[1, 7]]) <= 0.5).all()
-        assert (np.abs(action) <= 1).all()
 
 
 def test_half_precision_does_not_blur_the_places_that_it_points_at(prompts, pool) -> None:

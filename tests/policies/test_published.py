@@ -234,13 +234,6 @@ def test_a_file_becomes_the_network_with_or_without_unused_entries(
     assert {name: parameter.requires_grad for name, parameter in loaded.named_parameters()} == trained
 
 
-def test_masks_that_some_versions_store_may_be_in_every_file(network, architecture, tmp_path) -> None:
-    values = contents(network, architecture)
-    prefix = "xattn_gpt" if architecture in DECODER_NAMES else "transformer.lm"
-    values["state_dict"][f"policy.{prefix}.h.0.attn.bias"] = torch.ones(1, 1, 512, 512).tril()
-    assert_same(load_published(saved(values, tmp_path)).state_dict(), network.state_dict())
-
-
 def test_missing_unexpected_and_misshapen_weights_are_listed_in_one_message(vima_contents, tmp_path) -> None:
     weights = vima_contents["state_dict"]
     del weights["policy.end_effector_encoder.weight"], weights["policy.xattn_gpt.positions_embed.weight"]

@@ -83,18 +83,6 @@ def test_blanks_before_a_placeholder_leave_no_lone_marker(tokenizer) -> None:
     assert tokenizer.encode(" \n\t") == []
 
 
-@pytest.mark.parametrize("scheme", ["always", "first"])
-def test_other_conversions_of_the_same_vocabulary_give_the_same_ids(tokenizer, scheme, tmp_path) -> None:
-    """Some conversions leave out the split at blanks; transformers 4 takes that from the file as it is."""
-    from tokenizers import pre_tokenizers
-
-    steps = pre_tokenizers.Metaspace(prepend_scheme=scheme)
-    other = T5Tokenizer(write_tokenizer(tmp_path, steps))
-    other._tokenizer.backend_tokenizer.pre_tokenizer = steps  # which transformers 5 replaces
-    for text in ("Put the ", ".", " into the ", " , 30", "Rotates the."):
-        assert other.encode(text) == tokenizer.encode(text)
-
-
 def test_a_prompt_is_read_with_placeholders_between_words_and_the_end_mark(tokenizer) -> None:
     import numpy as np
 
@@ -249,12 +237,6 @@ def test_weights_in_pickled_and_in_half_precision_files_are_read(
         torch.testing.assert_close(pickled[name], tensor, rtol=0, atol=0)
         assert half[name].dtype == torch.float32
         torch.testing.assert_close(half[name], tensor, rtol=1e-2, atol=1e-2)
-
-
-def test_decoders_in_the_file_are_passed_over(reference, small_sizes, tmp_path) -> None:
-    values = {**reference.state_dict(), "decoder.final_layer_norm.weight": torch.ones(24)}
-    torch.save(values, tmp_path / "pytorch_model.bin")
-    assert torch.equal(loaded(small_sizes, tmp_path).prompt.words.weight, reference.shared.weight)
 
 
 def test_frozen_weights_are_copied_and_stay_frozen(reference, weights_folder, small_sizes) -> None:

@@ -14,10 +14,9 @@ from openvima.scene.action import HIGHEST_TIP_Z_M, MAX_MOVE_M, MAX_TURN_RAD, Too
 from openvima.sim import World, ur5
 from openvima.sim.model import FLOOR_Z_M
 from openvima.sim.spatula import SWEEP_M_S
-from openvima.sim.tool_path import PathFollower, onward_path, tool_path
+from openvima.sim.tool_path import PathFollower, tool_path
 from openvima.sim.tool_world import MAX_JOINT_SPEED, ToolWorld
 from openvima.sim.ur5 import (
-    HOVER_TIP_Z_M,
     JOINT_LIMITS,
     PROBE_BELOW_TIP_M,
     SWEEP_TIP_Z_M,
@@ -171,38 +170,6 @@ def test_bodies_that_hover_at_the_start_settle_first() -> None:
     world = ToolWorld(hovering, ASSETS)
     assert not world.command(OFF)
     assert world.scene[5].pose.z == pytest.approx(scene[5].pose.z, abs=1e-3)
-
-
-def test_a_path_is_taken_up_where_the_tool_is() -> None:
-    world = ToolWorld(table(("block", 0.6, 0.3, 0.0)), ASSETS)
-    (block,) = (placement.id for placement in world.scene.placements)
-    action = Action.planar((0.6, 0.3), (0.5, 0.1), 0.6)
-
-    def next_waypoint(object_id: int) -> tuple:
-        waypoint = onward_path(action, object_id, world)[0]
-        pose = waypoint.pose
-        return round(pose.x, 6), round(pose.y, 6), round(pose.z, 6), round(pose.yaw_rad, 6), waypoint.tool
-
-    above, below = HOVER_TIP_Z_M, -1.0
-    go(world, 0.5, 0.2, 0.1, tool=False)
-    assert next_waypoint(block) == pytest.approx((0.6, 0.3, above, 0, False))
-    go(world, 0.56, 0.3, 0.1, tool=False)
-    assert next_waypoint(block) == pytest.approx((0.6, 0.3, 0.04 / 0.3, 0, False), abs=1e-5)
-    go(world, 0.605, 0.3, 0.1, tool=False)
-    assert next_waypoint(block) == pytest.approx((0.6, 0.3, below, 0, True))
-    go(world, 0.605, 0.3, 0.0, tool=True)
-    assert world.grasped == block
-    assert next_waypoint(block) == pytest.approx((0.605, 0.3, above, 0, True))
-    assert next_waypoint(block + 1) == pytest.approx((0.605, 0.3, above, 0, False))  # puts it down
-    place = (0.5 + 0.005 * math.cos(0.6), 0.1 + 0.005 * math.sin(0.6))
-    go(world, 0.6, 0.25, 0.2, tool=True)
-    assert next_waypoint(block) == pytest.approx((*place, above, 0.6, True), abs=1e-5)
-    go(world, *place, 0.1, tool=True, yaw_rad=0.5)
-    assert next_waypoint(block) == pytest.approx((*place, below, 0.6, True), abs=1e-5)
-    go(world, *place, 0.0, tool=True, yaw_rad=0.6)
-    assert next_waypoint(block) == pytest.approx((*place, above, 0.6, False), abs=1e-5)
-    world.command(ToolCommand(0.0, 0.0, 0.05, 0.0, False))
-    assert not world.holds
 
 
 @pytest.mark.parametrize("end_effector", ["suction", "spatula"])

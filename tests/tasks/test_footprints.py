@@ -4,49 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from openvima.catalog.packs import load_assets
 from openvima.scene import Placement, Pose, Zone
 from openvima.tasks import sample_episode
-from openvima.tasks.kernels import mark_free_centres, nth_centre, squared_depths
+from openvima.tasks.kernels import mark_free_centres, squared_depths
 from openvima.tasks.pushes import Rectangle
 from openvima.tasks.table import is_wedged
-
-rectangles = st.builds(
-    Rectangle,
-    st.floats(-0.1, 0.1),
-    st.floats(-0.1, 0.1),
-    st.floats(-4, 4),
-    st.floats(0.005, 0.05),
-    st.floats(0.005, 0.05),
-)
-
-
-def grid(rectangle: Rectangle) -> list[tuple[float, float]]:
-    c, s = math.cos(rectangle.yaw_rad), math.sin(rectangle.yaw_rad)
-    steps = [-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0]
-    local = [(rectangle.half_x * i, rectangle.half_y * j) for i in steps for j in steps]
-    return [(rectangle.x + c * u - s * v, rectangle.y + s * u + c * v) for u, v in local]
-
-
-def contains(rectangle: Rectangle, point: tuple[float, float]) -> bool:
-    dx, dy = point[0] - rectangle.x, point[1] - rectangle.y
-    c, s = math.cos(rectangle.yaw_rad), math.sin(rectangle.yaw_rad)
-    return abs(c * dx + s * dy) < rectangle.half_x and abs(c * dy - s * dx) < rectangle.half_y
-
-
-@given(rectangles, rectangles)
-def test_rectangles_that_share_a_point_are_near(a: Rectangle, b: Rectangle) -> None:
-    if any(contains(a, point) for point in grid(b)) or any(contains(b, point) for point in grid(a)):
-        assert a.comes_near(b) and b.comes_near(a)
-
-
-@given(rectangles, rectangles)
-def test_rectangles_with_a_gap_are_not_near(a: Rectangle, b: Rectangle) -> None:
-    if not a.comes_near(b):
-        assert not any(contains(a, point) for point in grid(b))
 
 
 @pytest.mark.parametrize(("x", "near"), [(0.0311, False), (0.0309, True), (0.02, True)])
@@ -115,34 +79,6 @@ def test_free_centres_are_those_of_the_naive_search(side: int, num_blots: int) -
         np.testing.assert_array_equal(centres, expected)
         np.testing.assert_array_equal(counts, expected.sum(axis=1))
         assert num_free == expected.sum()
-
-
-def test_an_even_window_is_one_cell_longer_towards_the_low_side() -> None:
-    labels = np.zeros((20, 20), np.int16)
-    labels[10, 10] = 5
-    centres = free_centres(labels, 4)[1]
-    assert not centres[9, 10] and not centres[12, 10]  # windows of rows 7–10 and 10–13
-    assert centres[8, 10] and centres[13, 10]
-
-
-def test_centres_keep_half_a_window_from_the_edge() -> None:
-    num_free, centres, _ = free_centres(np.zeros((320, 160), np.int16), 58)
-    rows, columns = np.nonzero(centres)
-    assert (rows.min(), columns.min()) == (30, 30)
-    assert (rows.max(), columns.max()) == (318 - 28, 158 - 28)
-    assert num_free == len(rows)
-
-
-def test_a_window_larger_than_the_raster_fits_nowhere() -> None:
-    assert free_centres(np.zeros((20, 20), np.int16), 19)[0] == 0
-
-
-def test_centres_are_counted_row_by_row() -> None:
-    labels = np.zeros((12, 9), np.int16)
-    labels[5, 4] = 5
-    num_free, centres, counts = free_centres(labels, 3)
-    listed = [nth_centre(centres, counts, index) for index in range(num_free)]
-    assert listed == [tuple(cell) for cell in np.argwhere(centres).tolist()]
 
 
 @pytest.mark.parametrize("density", [0.3, 0.7, 0.95, 1.0])

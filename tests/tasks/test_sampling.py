@@ -150,12 +150,6 @@ def test_goals_constraints_and_prompt_follow_the_ids() -> None:
         assert set(constraint.object_ids) == {5, 6, 7} - {target.id, base.id}
 
 
-def test_compat_keeps_the_order_of_placing() -> None:
-    for seed in range(20):
-        target, base = roles(sample_episode("visual_manipulation", seed=seed, compat=True))
-        assert (base.id, target.id) == (5, 6)
-
-
 def test_a_free_place_keeps_half_a_window_from_edge_and_objects(assets: Assets) -> None:
     table = table_for(assets)
     table.add("block", "red", size=(0.07, 0.07, 0.07), pose=Pose.planar(0.5, 0.0))

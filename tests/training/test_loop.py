@@ -1,7 +1,6 @@
 """Whole runs: resuming, differing settings, content of the run folder."""
 
 import json
-import shutil
 import subprocess
 import threading
 
@@ -9,7 +8,7 @@ import pytest
 import torch
 
 from openvima.data import Dataset
-from openvima.errors import AssetError, ConfigError, DatasetError, FolderLockedError, InputFileError
+from openvima.errors import ConfigError, DatasetError, FolderLockedError, InputFileError
 from openvima.policies import load_policy
 from openvima.training import TrainingConfig, train
 from openvima.training.config import ScheduleConfig
@@ -77,24 +76,6 @@ def test_without_demonstrations_the_error_says_how_to_make_some(settings, tmp_pa
     assert not settings["out"].exists()
 
 
-@pytest.mark.parametrize("where", ["data", "object_cache"])
-def test_a_cache_that_cannot_be_written_is_refused_before_pretraining(settings, tmp_path, where):
-    if where == "data":
-        settings["data"] = shutil.copytree(settings["data"], tmp_path / "copy")
-        shutil.rmtree(settings["data"] / "object_cache", ignore_errors=True)
-        (settings["data"] / "object_cache").touch()  # where even root cannot write
-    else:
-        (tmp_path / "file").touch()
-        settings["object_cache"] = tmp_path / "file"
-    notes = []
-    with pytest.raises(DatasetError, match=r"cannot write the object cache to .*: .*--object-cache"):
-        train(TrainingConfig.of(settings), lambda done, total, note: notes.append(note))
-    assert notes == [] and not (settings["out"] / "config.yaml").exists()
-    settings["object_cache"] = str(tmp_path / "elsewhere")
-    train(TrainingConfig.of(settings))
-    assert list((tmp_path / "elsewhere").iterdir())
-
-
 def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
     run = train(TrainingConfig.of(settings))
     kept = {folder.name for folder in (run / "checkpoints").iterdir() if folder.is_dir()}
@@ -156,12 +137,6 @@ def test_the_last_checkpoint_is_that_of_most_steps_of_the_last_stage(tmp_path):
 def test_settings_that_contradict_the_preset_leave_no_run_folder(settings, change, message):
     with pytest.raises(ConfigError, match=message):
         train(TrainingConfig.of({**settings, **change}))
-    assert not settings["out"].exists()
-
-
-def test_an_unknown_asset_pack_leaves_no_run_folder(settings):
-    with pytest.raises(AssetError, match="nosuch"):
-        train(TrainingConfig.of({**settings, "assets": "nosuch"}))
     assert not settings["out"].exists()
 
 

@@ -261,39 +261,3 @@ def test_false_positives_come_anywhere_among_the_ordered_objects_of_a_view(views
     assert {place == 0 for place, _ in places} == {True, False}
     assert {place == count for place, count in places} == {True, False}
     assert changed.targets is batch.targets
-
-
-def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
-    batch = collate_examples(VIEWS, views[0])
-    after = add_false_positives(batch, "views", probability=0.3, rngs=rngs_of(views[0], 1)).history
-    visible_BTV = after.masks_BTVN.sum(dim=3)
-    for b, t in np.argwhere(batch.history.steps_BT.numpy()):
-        for v in range(2):  # visible ones first, then empty ones: black, without a box
-            count = int(visible_BTV[b, t, v])
-            assert after.masks_BTVN[b, t, v, :count].all()
-            assert not after.crop_index_BTVN[b, t, v, count:].any()
-            assert not after.boxes_BTVN4[b, t, v, count:].any()
-        false = visible_BTV[b, : t + 1] - batch.history.masks_BTVN.sum(dim=3)[b, : t + 1]
-        expected = (batch.history.num_slots_BT[b, : t + 1] + false.sum(dim=1)).max()
-        assert after.num_slots_BT[b, t] == expected
-    assert not after.num_slots_BT[~batch.history.steps_BT].any()
-    assert not views[1][0].any()
-
-
-def test_without_false_positives_views_are_unchanged(views):
-    batch = collate_examples(VIEWS, views[0])
-    after = add_false_positives(batch, "views", probability=0.0, rngs=rngs_of(views[0])).history
-    count = batch.history.masks_BTVN.shape[3]
-    assert torch.equal(after.num_slots_BT, batch.history.num_slots_BT)
-    assert torch.equal(after.crop_index_BTVN[..., :count], batch.history.crop_index_BTVN)
-    assert torch.equal(after.boxes_BTVN4[..., :count, :], batch.history.boxes_BTVN4)
-    assert not after.masks_BTVN[..., count:].any()
-
-
-def test_whole_frames_get_no_false_positives_and_stay_uint8(demonstrations_of_several_steps):
-    processor = Processor("frames", (64, 128), tokens_per_image=1)
-    examples, images = examples_of(demonstrations_of_several_steps, processor)
-    assert images.dtype == torch.uint8
-    assert images.shape[1:] == (3, 64, 128)
-    batch = collate_examples(processor, examples)
-    assert add_false_positives(batch, "frames", probability=1.0, rngs=rngs_of(examples)) is batch

@@ -280,20 +280,6 @@ def test_a_prompt_without_objects_is_possible(head, inputs):
     assert head.loss(blank, targets_at(blank, place_of(blank, FIRST_STEP)))[0].isfinite()
 
 
-def test_the_appearance_loss_trains_attention_and_not_the_logit_scale(head, inputs):
-    words = torch.eye(A, dtype=torch.float64)[:M].expand(B, M, A)
-    inputs = with_prompt(inputs, text_appearance_BLA=words, describes_BL=torch.ones(B, M, dtype=torch.bool))
-    probabilities = torch.softmax(head.pick.appearance_scores(inputs), dim=-1)[..., 0]
-    (-probabilities.log().mean()).backward()
-    trained = {name for name, parameter in head.named_parameters() if parameter.grad is not None}
-    assert trained == {
-        f"pick.{of}{name}.{part}"
-        for of in ("prompt_", "grounding.")
-        for name in ("query", "key")
-        for part in ("weight", "bias")
-    }
-
-
 @pytest.mark.parametrize(("slot", "counts"), [(2, True), (0, False), (-1, False)])
 def test_a_place_at_another_object_in_view_is_trained_by_appearance_too(slot, counts, head, inputs):
     """Not where the object stays where it is, or goes to no object in view."""
@@ -393,14 +379,6 @@ def test_what_to_pick_depends_on_where_the_last_object_was_picked_and_put(head, 
     before, after = torch.softmax(head.pick(inputs), -1), torch.softmax(head.pick(elsewhere), -1)
     assert torch.equal(after[:, 0], before[:, 0])  # nothing was taken before it
     assert ((after[:, 1] - before[:, 1]).abs().amax(-1) > 1e-3).all()
-
-
-def test_only_the_places_of_the_last_action_count_and_all_that_is_far_counts_alike(head, inputs):
-    rotated_tool = inputs.previous_BTC.clone()
-    rotated_tool[:, 1:, [2, 3, 4, 5, 8, 9, 10, 11]] += 1.0
-    assert torch.equal(head.pick(replace(inputs, previous_BTC=rotated_tool)), head.pick(inputs))
-    far, farther = (previous(inputs, 0, torch.full((B, T, 2), value)) for value in (50.0, 60.0))
-    assert torch.equal(head.pick(far), head.pick(farther))
 
 
 def test_the_pick_depends_on_neighbours_and_on_what_a_scene_shows_there(head, inputs):
