@@ -14,7 +14,7 @@ from openvima.errors import OracleError
 from openvima.tasks import list_tasks, task_spec
 
 EVERYWHERE = [(task, level) for task in list_tasks() for level in task_spec(task).levels]
-NUM_SEEDS = 4
+NUM_SEEDS = 2
 
 
 def play(env: TabletopEnv, seed: int) -> str:

@@ -42,9 +42,9 @@ def test_every_template_is_reached_and_its_sentence_read_as_meant(kind: str, num
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", tasks_at("L7"))
-def test_sampler_and_resolver_agree_on_ten_thousand_sentences(task: str) -> None:
-    row = measure(task, range(2000))
-    assert row["differing"] == [] and row["failed"] == 0 and row["distinct"] > 1400
+def test_sampler_and_resolver_agree_on_two_thousand_sentences(task: str) -> None:
+    row = measure(task, range(400))
+    assert row["differing"] == [] and row["failed"] == 0 and row["distinct"] > 280
 
 
 @pytest.mark.parametrize("kind", PHRASES)
