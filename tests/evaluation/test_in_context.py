@@ -10,7 +10,7 @@ from openvima.cli.main import main
 from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv, save_episode
 from openvima.errors import ConfigError, OracleError, PolicyError, PromptError, UnknownPolicyError
-from openvima.evaluation import EvaluationConfig, Results, play
+from openvima.evaluation import EvaluationConfig, Results, play, rollout
 from openvima.evaluation.ablations import ABLATIONS, EXAMPLE_PROMPTS, IN_CONTEXT, ORACLE_DEMONSTRATION, ablate
 from openvima.evaluation.config import cells
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, in_context_prompt
@@ -223,5 +223,5 @@ class Noting(RandomPolicy):
 
 def test_the_motion_is_the_prompt_of_a_policy() -> None:
     policy, env = Noting(), TabletopEnv("twist", level="L1", domain="eval")
-    play([env], [0], PromptedRolloutPolicy(policy, ORACLE_DEMONSTRATION))
+    rollout.play([env], [0], PromptedRolloutPolicy(policy, ORACLE_DEMONSTRATION))
     assert policy.prompts[0].text.startswith("Follow this motion: {frame_0} {frame_1}")
