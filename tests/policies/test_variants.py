@@ -168,7 +168,6 @@ def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name
 @pytest.mark.parametrize(
     ("name", "switches", "words"),
     [
-        ("vima-nano", {"image_tokens": "voxels"}, "image_tokens.*voxels.*object-perceiver"),
         ("gato-nano", {"image_tokens": "objects"}, "has 'patches' alone; take a preset vima-… or midas-…"),
         ("nano", {"image_tokens": "patches"}, "pointer models have objects alone; take nano-bins"),
         ("small", {"text_encoder": "t5-base"}, "pointer models have a vocabulary of words alone"),
