@@ -1,4 +1,4 @@
-"""Architectures with tokens of objects, of patches and of views overfit 12 demonstrations."""
+"""Architectures with tokens of objects and of views overfit 32 demonstrations."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -34,9 +34,9 @@ from small_networks import (
 pytestmark = pytest.mark.slow
 
 DEMONSTRATIONS = {
-    "rotate": 6,
-    "visual_manipulation": 4,
-    "manipulate_old_neighbor": 2,
+    "rotate": 22,
+    "visual_manipulation": 6,
+    "manipulate_old_neighbor": 4,
 }  # the last in two steps
 MAX_STEPS = 140
 WARMUP_STEPS = 25
@@ -51,18 +51,18 @@ PATCH_SHARE = 0.03
 
 @pytest.fixture(scope="module")
 def demonstrations() -> dict[str, list[Demonstration]]:
-    """Of each task some, 12 in all."""
+    """Of each task some, 32 in all."""
     runs = {}
     for task, count in DEMONSTRATIONS.items():
         env = TabletopEnv(task, level="train", domain="user")
         runs[task] = [rollout_oracle(env, seed) for seed in range(count)]
-    assert sum(len(group) for group in runs.values()) == 12
+    assert sum(len(group) for group in runs.values()) == 32
     assert max(run.num_steps for group in runs.values() for run in group) == 2
     return runs
 
 
-@pytest.mark.parametrize("architecture", ["vima", "gato", "midas"])
-def test_each_architecture_overfits_12_demonstrations_and_repeats_them(architecture, demonstrations) -> None:
+@pytest.mark.parametrize("architecture", ["vima", "midas"])
+def test_each_architecture_overfits_32_demonstrations_and_repeats_them(architecture, demonstrations) -> None:
     model = build_network(preset(f"{architecture}-nano"), seed=0).eval()  # that is, without dropout
     tasks = [read(model, group) for group in demonstrations.values()]
     overfit(model, tasks)
@@ -145,7 +145,7 @@ def bins(action: dict) -> "torch.Tensor":
     return encode_bins(to_unit_range(vector))
 
 
-def test_the_object_head_overfits_12_demonstrations(demonstrations, tmp_path) -> None:
+def test_the_object_head_overfits_32_demonstrations(demonstrations, tmp_path) -> None:
     sizes = preset("nano")
     sizes = replace(
         sizes,
@@ -161,7 +161,7 @@ def test_the_object_head_overfits_12_demonstrations(demonstrations, tmp_path) ->
     config = TrainingConfig(
         data=tmp_path,
         out=tmp_path,
-        loader=LoaderConfig(batch_size=12),
+        loader=LoaderConfig(batch_size=32),
         augmentation=AugmentationConfig(false_positive_prob=0.0),
     )
     stage = BehaviourCloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
