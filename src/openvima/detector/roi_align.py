@@ -1,5 +1,7 @@
 """RoIAlign: features of a pyramid resampled on a fixed grid inside boxes; masks in and out of such grids.
 
+Inference on a CPU takes the Numba kernels.
+
 Source: Mask R-CNN (He et al. 2017), section 3; with the half-pixel shift of later versions.
 """
 
