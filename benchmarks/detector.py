@@ -147,7 +147,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--quick", action="store_true", help="two time steps and one round, for a smoke test")
     parser.add_argument("--detector", type=Path, help="trained detector; by default the bundled one")
-    parser.add_argument("--preset", default="small", help="size of the trained network")
+    parser.add_argument(
+        "--preset", default="small", choices=("small", "resnet50"), help="size of the trained network"
+    )
     parser.add_argument("--rounds", type=int, default=5, help="rounds after the warm-up")
     parser.add_argument("--json", type=Path, help="file to write")
     options = parser.parse_args()

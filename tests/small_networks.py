@@ -39,7 +39,7 @@ def narrow_small(width: int = 32, crop_width: int = 4) -> PointerConfig:
 def one_level_detector() -> DetectorConfig:
     """Sizes of a detector that trains in moments."""
     return DetectorConfig(
-        BackboneConfig((1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8),
+        BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8),
         (32.0,),
         box_head_widths=(8,),
         mask_head_widths=(8,),

@@ -92,6 +92,18 @@ def test_invalid_options_of_evaluate_give_a_one_line_error(detector, data, capsy
     assert re.search(message, told)
 
 
+def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):
+    from openvima.detector import checkpoint
+
+    monkeypatch.setattr(checkpoint, "load_detectron2", lambda file: MaskRCNN(tiny))
+    words = ["detector", "convert", "weights.pth", str(tmp_path / "converted")]
+    assert main(words) == 0
+    assert load_network(tmp_path / "converted").config == tiny
+    assert main(words) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main([*words, "--force"]) == 0
+
+
 def test_a_missing_detector_gives_a_one_line_error(tmp_path, capsys):
     assert main(["detector", "show", str(tmp_path / "none")]) == 2
     assert "there is no folder" in capsys.readouterr().err

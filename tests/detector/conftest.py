@@ -22,7 +22,9 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture
 def tiny() -> DetectorConfig:
     """The smallest sizes that make sense."""
-    backbone = BackboneConfig(depths=(1, 1), widths=(8, 16), stem_width=8, stem_kernel=3, fpn_width=16)
+    backbone = BackboneConfig(
+        block="basic", depths=(1, 1), widths=(8, 16), stem_width=8, stem_kernel=3, fpn_width=16
+    )
     return DetectorConfig(
         backbone,
         anchor_sizes=(16.0, 32.0),

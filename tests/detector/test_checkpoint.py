@@ -1,6 +1,9 @@
-"""Checkpoints of detectors."""
+"""Checkpoints of detectors, and files of Detectron2."""
 
 import re
+import sys
+import types
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,12 +11,71 @@ import yaml
 
 from openvima.detector import load_detector
 from openvima.detector.checkpoint import (
+    detectron2_config,
+    from_detectron2,
+    load_detectron2,
     load_network,
     save_network,
 )
-from openvima.detector.config import BackboneConfig, DetectorConfig, detector_config
+from openvima.detector.config import BackboneConfig, DetectorConfig, detector_config, resnet50
 from openvima.detector.network import MaskRCNN
 from openvima.errors import ConfigError, InputFileError
+
+
+def detectron2_layout(num_classes: int = 1) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of Detectron2's Mask R-CNN R50-FPN, written down from its architecture."""
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def conv_norm(name: str, out: int, inputs: int, kernel: int) -> None:
+        shapes[f"{name}.weight"] = (out, inputs, kernel, kernel)
+        for part in ("weight", "bias", "running_mean", "running_var"):
+            shapes[f"{name}.norm.{part}"] = (out,)
+
+    def layer(name: str, out: int, *rest: int) -> None:
+        shapes[f"{name}.weight"], shapes[f"{name}.bias"] = (out, *rest), (out,)
+
+    conv_norm("backbone.bottom_up.stem.conv1", 64, 3, 7)
+    inputs = 64
+    for stage, (blocks, inner) in enumerate(((3, 64), (4, 128), (6, 256), (3, 512)), start=2):
+        for block in range(blocks):
+            name = f"backbone.bottom_up.res{stage}.{block}"
+            if block == 0:
+                conv_norm(f"{name}.shortcut", 4 * inner, inputs, 1)
+            conv_norm(f"{name}.conv1", inner, inputs, 1)
+            conv_norm(f"{name}.conv2", inner, inner, 3)
+            conv_norm(f"{name}.conv3", 4 * inner, inner, 1)
+            inputs = 4 * inner
+        layer(f"backbone.fpn_lateral{stage}", 256, inputs, 1, 1)
+        layer(f"backbone.fpn_output{stage}", 256, 256, 3, 3)
+    layer("proposal_generator.rpn_head.conv", 256, 256, 3, 3)
+    layer("proposal_generator.rpn_head.objectness_logits", 3, 256, 1, 1)
+    layer("proposal_generator.rpn_head.anchor_deltas", 12, 256, 1, 1)
+    layer("roi_heads.box_head.fc1", 1024, 256 * 49)
+    layer("roi_heads.box_head.fc2", 1024, 1024)
+    layer("roi_heads.box_predictor.cls_score", num_classes + 1, 1024)
+    layer("roi_heads.box_predictor.bbox_pred", 4 * num_classes, 1024)
+    for number in range(1, 5):
+        layer(f"roi_heads.mask_head.mask_fcn{number}", 256, 256, 3, 3)
+    shapes["roi_heads.mask_head.deconv.weight"] = (256, 256, 2, 2)
+    shapes["roi_heads.mask_head.deconv.bias"] = (256,)
+    layer("roi_heads.mask_head.predictor", num_classes, 256, 1, 1)
+    return shapes
+
+
+@pytest.fixture(scope="module")
+def foreign() -> dict[str, torch.Tensor]:
+    """Random weights of that layout, with what else such files hold."""
+    generator = torch.Generator().manual_seed(0)
+    weights = {
+        name: torch.randn(shape, generator=generator) * 0.02 for name, shape in detectron2_layout(2).items()
+    }
+    for name in weights:
+        if name.endswith(("norm.weight", "running_var")):
+            weights[name] = weights[name].abs() + 1
+    weights["pixel_mean"] = torch.tensor([100.0, 110.0, 120.0]).view(3, 1, 1)
+    weights["pixel_std"] = torch.tensor([57.0, 58.0, 59.0]).view(3, 1, 1)
+    weights["proposal_generator.anchor_generator.cell_anchors.0"] = torch.zeros(3, 4)
+    return weights
 
 
 def test_a_detector_reads_what_it_wrote(tiny, tmp_path):
@@ -38,19 +100,127 @@ def test_weights_of_other_sizes_are_refused_by_name(tiny, tmp_path):
 
 
 def test_sizes_survive_a_file_and_wrong_ones_are_told():
-    config = detector_config("small")
-    assert DetectorConfig.from_dict(yaml.safe_load(yaml.safe_dump(config.to_dict()))) == config
+    for name in ("small", "resnet50"):
+        config = detector_config(name)
+        assert DetectorConfig.from_dict(yaml.safe_load(yaml.safe_dump(config.to_dict()))) == config
     with pytest.raises(ConfigError, match="Did you mean 'small'"):
         detector_config("smal")
     with pytest.raises(ConfigError, match="unknown fields colour"):
         DetectorConfig.from_dict({**detector_config("small").to_dict(), "colour": 1})
-    backbone = BackboneConfig((1, 1), (8,), 8, 3, 16)
-    with pytest.raises(ConfigError, match="anchor_sizes have 2, 1, 2 numbers"):
+    backbone = BackboneConfig("basic", (1, 1), (8,), 8, 3, 16)
+    with pytest.raises(ConfigError, match=r"depths has 2 stages.*anchor_sizes has 2 numbers"):
         DetectorConfig(backbone, (1.0, 2.0))
 
 
-def test_a_config_written_before_some_sizes_went_is_read():
-    config = detector_config("small")
-    values = {**config.to_dict(), "min_size": None, "max_size": 1333, "channel_order": "rgb"}
-    values["backbone"] |= {"block": "basic", "extra_level": False}
-    assert DetectorConfig.from_dict(values) == config
+def test_the_layout_of_detectron2_is_that_of_ours_name_by_name(foreign):
+    config = detectron2_config(foreign)
+    assert config == replace(
+        resnet50(), num_classes=2, pixel_mean=(100.0, 110.0, 120.0), pixel_std=(57.0, 58.0, 59.0)
+    )
+    with torch.device("meta"):
+        expected = MaskRCNN(config).state_dict()
+    given = from_detectron2(foreign)
+    expected = {name: tensor for name, tensor in expected.items() if "num_batches" not in name}
+    assert {name: tensor.shape for name, tensor in given.items()} == {
+        name: tensor.shape for name, tensor in expected.items()
+    }
+    block = "backbone.bottom_up.res4.3.conv2"
+    assert torch.equal(given["backbone.stages.2.3.layers.1.conv.weight"], foreign[f"{block}.weight"])
+    assert torch.equal(given["backbone.stages.2.3.layers.1.norm.bias"], foreign[f"{block}.norm.bias"])
+    assert torch.equal(given["backbone.lateral.3.weight"], foreign["backbone.fpn_lateral5.weight"])
+
+
+@pytest.mark.slow
+def test_a_file_of_detectron2_is_read_and_finds_something(foreign, tmp_path):
+    torch.save({"model": foreign, "iteration": 7}, tmp_path / "mask_rcnn.pth")
+    network = load_detectron2(tmp_path / "mask_rcnn.pth")
+    network.config = replace(
+        network.config, min_size=64, rpn_post_nms_top_n=4, rpn_pre_nms_top_n=8, score_threshold=0.0
+    )
+    (found,) = network(torch.randint(0, 256, (1, 3, 64, 96), dtype=torch.uint8))
+    assert len(found.boxes) and found.masks.shape[1:] == (64, 96)
+
+
+@pytest.fixture
+def settings(monkeypatch):
+    """A function that makes settings of the class that Detectron2's have, which is missing afterwards."""
+    module = types.ModuleType("detectron2.config.config")
+    module.CfgNode = type("CfgNode", (dict,), {"__module__": module.__name__})  # type: ignore[attr-defined]
+    for name in ("detectron2", "detectron2.config"):
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+
+    def nested(values):
+        node = module.CfgNode({k: nested(v) if isinstance(v, dict) else v for k, v in values.items()})
+        node.__dict__["__immutable__"] = False
+        return node
+
+    return nested
+
+
+def saved(foreign, settings, file, values):
+    torch.save({"model": foreign, "cfg": settings(values)}, file)
+    for name in ("detectron2.config.config", "detectron2.config", "detectron2"):
+        del sys.modules[name]
+    return file
+
+
+def test_settings_in_the_file_say_how_images_are_prepared(foreign, settings, tmp_path):
+    bare = {name: tensor for name, tensor in foreign.items() if not name.startswith("pixel")}
+    values = {
+        "INPUT": {"FORMAT": "RGB", "MIN_SIZE_TEST": 0},
+        "MODEL": {
+            "PIXEL_MEAN": [1.0, 2.0, 3.0],
+            "ANCHOR_GENERATOR": {"SIZES": [[8], [16], [32], [64], [128]], "OFFSET": 0.0},
+            "RPN": {"POST_NMS_TOPK_TEST": 500, "BBOX_REG_WEIGHTS": (1.0, 1.0, 1.0, 1.0)},
+            "RESNETS": {"STRIDE_IN_1X1": False},
+            "ROI_HEADS": {"SCORE_THRESH_TEST": 0.5},
+        },
+    }
+    config = load_detectron2(saved(bare, settings, tmp_path / "with.pth", values)).config
+    assert config == replace(
+        resnet50(),
+        backbone=replace(resnet50().backbone, stride_in_1x1=False),
+        num_classes=2,
+        channel_order="rgb",
+        min_size=None,
+        pixel_mean=(1.0, 2.0, 3.0),
+        anchor_sizes=(8.0, 16.0, 32.0, 64.0, 128.0),
+        rpn_post_nms_top_n=500,
+        score_threshold=0.5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"MODEL": {"ANCHOR_GENERATOR": {"OFFSET": 0.5}}}, "OFFSET is 0.5; only 0.0 is supported"),
+        ({"MODEL": {"ANCHOR_GENERATOR": {"SIZES": [[32, 64, 128, 256, 512]]}}}, "one per level"),
+        ({"MODEL": {"ROI_BOX_HEAD": {"POOLER_TYPE": "ROIAlign"}}}, "only 'ROIAlignV2'"),
+        ({"INPUT": {"FORMAT": "YUV"}}, "channel order 'yuv'"),
+        ({"MODEL": {"RPN": {"POST_NMS_TOPK_TEST": "many"}}}, "invalid settings"),
+    ],
+)
+def test_settings_of_another_computation_are_refused(foreign, settings, tmp_path, values, message):
+    kinds = "roi_heads.box_predictor.cls_score.weight"  # enough to see the number of kinds
+    file = saved({kinds: foreign[kinds]}, settings, tmp_path / "other.pth", values)
+    with pytest.raises(InputFileError, match=message):
+        load_detectron2(file)
+
+
+def test_what_is_no_such_file_is_refused(tiny, tmp_path):
+    with pytest.raises(InputFileError, match="no file"):
+        load_detectron2(tmp_path / "none.pth")
+    torch.save({"model": MaskRCNN(tiny).state_dict()}, tmp_path / "ours.pth")
+    with pytest.raises(InputFileError, match="Mask R-CNN of Detectron2"):
+        load_detectron2(tmp_path / "ours.pth")
+    torch.save({"model": re.compile("x")}, tmp_path / "code.pth")
+    with pytest.raises(InputFileError, match="Nothing in it was executed"):
+        load_detectron2(tmp_path / "code.pth")
+
+
+def test_missing_weights_are_told(foreign, tmp_path):
+    fewer = {name: tensor for name, tensor in foreign.items() if "mask_fcn2" not in name}
+    torch.save(fewer, tmp_path / "part.pth")
+    with pytest.raises(InputFileError, match=r"missing: mask_head.convs.1.weight, mask_head.convs.1.bias"):
+        load_detectron2(tmp_path / "part.pth")

@@ -5,15 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from openvima.detector import load_detector, load_extractor
-from openvima.detector.config import small
+from openvima.detector.config import resnet50, small
 from openvima.detector.detection import DetectedObjects
 from openvima.detector.network import (
     FrameDetector,
     Instances,
     MaskRCNN,
     fuse_batch_norm,
+    resized_shape,
     to_detections,
 )
 from openvima.env import TabletopEnv
@@ -114,6 +116,39 @@ def test_images_of_odd_sizes_are_padded_and_boxes_stay_inside(tiny):
     assert (found.boxes[:, 2] <= 83).all() and (found.boxes[:, 3] <= 61).all()
 
 
+def test_enlarged_images_give_boxes_in_pixels_of_the_image(tiny):
+    (found,) = made(replace(tiny, score_threshold=0.0, min_size=128, channel_order="bgr"))(images(1))
+    assert len(found.boxes) and (found.boxes[:, 2] <= 96).all() and (found.boxes[:, 3] <= 64).all()
+    assert found.boxes[:, 2].max() > 48
+
+
+@pytest.mark.parametrize(("height", "width"), [(128, 256), (480, 640), (1080, 1920), (333, 500), (801, 800)])
+def test_resized_shapes_equal_those_of_detectron2(height, width):
+    # Detectron2 scales the shorter side, then limits the longer one, then rounds halves up.
+    low, high = 800.0, 800.0 * max(height, width) / min(height, width)
+    shrink = min(1.0, 1333 / high)
+    short, long = int(low * shrink + 0.5), int(high * shrink + 0.5)
+    assert resized_shape(resnet50(), height, width) == ((short, long) if height < width else (long, short))
+
+
+@pytest.mark.parametrize("min_size", [30, 100])
+def test_images_are_resized_as_pillow_does(tiny, min_size):
+    network = made(replace(tiny, min_size=min_size, pixel_mean=(0.0,) * 3, pixel_std=(1.0,) * 3))
+    prepared, scale, (height, width) = network._preprocess(images(1))
+    image = Image.fromarray(images(1)[0].permute(1, 2, 0).numpy())
+    expected = np.asarray(image.resize((width, height), Image.Resampling.BILINEAR)).transpose(2, 0, 1)
+    assert np.abs(prepared[0, :, :height, :width].numpy() - expected).max() <= 1  # it counts in integers
+    assert scale.tolist() == pytest.approx([width / 96, height / 64] * 2)
+
+
+def test_boxes_are_scaled_per_axis(tiny):
+    # 64 × 96 pixels become 10 × 15 in both, but 65 × 96 do not grow evenly.
+    network = made(replace(tiny, min_size=10))
+    _, scale, size = network._preprocess(images(1, 65, 96))
+    assert size == (10, 15)
+    assert scale.tolist() == pytest.approx([15 / 96, 10 / 65] * 2)
+
+
 def test_fusing_batch_normalisation_keeps_the_detections(tiny):
     network = made(replace(tiny, score_threshold=0.0)).train()
     nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
@@ -138,9 +173,25 @@ def test_masks_are_those_of_the_best_class(tiny):
     assert len(found.masks) and not found.masks.any()
 
 
+def test_frozen_batch_normalisation_keeps_its_statistics(tiny):
+    config = replace(tiny, backbone=replace(tiny.backbone, frozen_batch_norm=True))
+    network = MaskRCNN(config).train()
+    before = network.backbone.stem.norm.running_mean.clone()
+    nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
+    network.losses(images(2), [nothing] * 2, sampled=8, generator=torch.Generator())
+    assert torch.equal(network.backbone.stem.norm.running_mean, before)
+
+
 def test_the_small_variant_fits_into_the_package():
     weights = [tensor for tensor in made(small()).state_dict().values() if tensor.is_floating_point()]
     assert sum(tensor.numel() for tensor in weights) * 4 < 8e6
+
+
+def test_the_published_architecture_has_the_published_number_of_weights():
+    with torch.device("meta"):
+        network = MaskRCNN(replace(resnet50(), num_classes=80))
+    # 44.4 million without the constants of batch normalisation, as counted for Mask R-CNN R50-FPN on COCO
+    assert round(sum(parameter.numel() for parameter in network.parameters()) / 1e6, 1) == 44.4
 
 
 def test_boxes_are_converted_to_covered_pixels():

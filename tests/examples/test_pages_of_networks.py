@@ -50,10 +50,13 @@ def test_the_page_names_every_command_of_the_detector() -> None:
 
 
 def test_the_sizes_of_detectors_are_those_of_the_networks() -> None:
-    with torch.device("meta"):
-        network = MaskRCNN(detector_config("small"))
-    count = sum(parameter.numel() for parameter in network.parameters()) / 1e6
-    assert f"{count:.2f} M, {4 * count:.1f} MB" in DETECTOR
+    counts = {}
+    for name in ("small", "resnet50"):
+        with torch.device("meta"):
+            network = MaskRCNN(detector_config(name))
+        counts[name] = sum(parameter.numel() for parameter in network.parameters()) / 1e6
+    assert f"{counts['small']:.2f} M, {4 * counts['small']:.1f} MB" in DETECTOR
+    assert f"| {counts['resnet50']:.0f} M |" in DETECTOR
     assert ", ".join(f"{size:g}" for size in detector_config("small").anchor_sizes) in DETECTOR
 
 

@@ -1,4 +1,4 @@
-"""Train, evaluate and visualise the detector, which finds objects in pixels."""
+"""Train, evaluate, visualise and convert the detector, which finds objects in pixels."""
 
 import json
 import shlex
@@ -143,6 +143,37 @@ def show(
     return 0
 
 
+def convert(
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")],
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")],
+    *,
+    force: bool = False,
+) -> int:
+    """Convert a Detectron2 checkpoint of Mask R-CNN with ResNet-50; nothing in the file is executed.
+
+    Example: openvima detector convert mask_rcnn.pth published-detector
+
+    Args:
+        source: The .pth file.
+        out: Folder to write to.
+        force: Replace an existing checkpoint.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.errors import ConfigError
+    from openvima.policies.base import require_torch
+
+    if out.exists() and not force:
+        raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
+    require_torch("reading a detector")
+    from openvima.detector.checkpoint import load_detectron2, save_network
+
+    save_network(load_detectron2(source), out)
+    print(out)
+    return 0
+
+
 @contextmanager
 def _frames(
     data: Path | None,
@@ -220,4 +251,4 @@ def _print_result(result: "CocoEvaluation") -> None:
         print(f"{name:<8}" + "".join(f"{cell:>8.3f}" for cell in cells))
 
 
-COMMANDS = {"train": train, "evaluate": evaluate, "show": show}
+COMMANDS = {"train": train, "evaluate": evaluate, "show": show, "convert": convert}

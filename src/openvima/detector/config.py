@@ -2,17 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.config_fields import build_config
 
 FIRST_STRIDE = 4  # of the finest pyramid level, in pixels
-# Fields of configs that were written when there was a ResNet-50, too; `small` had one value for each.
-_RETIRED = frozenset({"min_size", "max_size", "channel_order", "block", "extra_level"}) | {
-    "frozen_batch_norm",
-    "stride_in_1x1",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,18 +15,31 @@ class BackboneConfig:
     """A ResNet with a feature pyramid network (FPN).
 
     Args:
+        block: "basic" (two 3 × 3 convolutions) or "bottleneck" (a 3 × 3 between two 1 × 1 convolutions).
         depths: Blocks per stage; the first stage has stride 4, and the stride doubles with each further one.
         widths: Output channels of each stage.
         stem_width: Channels of the stem.
         stem_kernel: Kernel size of the stem.
         fpn_width: Channels of the pyramid levels.
+        extra_level: Max-pool the coarsest level once more, for the largest anchors.
+        frozen_batch_norm: Keep the loaded batch statistics. For pretrained weights and small batches.
+        stride_in_1x1: Put the stride of a bottleneck into its first 1 × 1 convolution instead of the 3 × 3.
     """
 
+    block: Literal["basic", "bottleneck"]
     depths: tuple[int, ...]
     widths: tuple[int, ...]
     stem_width: int
     stem_kernel: int
     fpn_width: int
+    extra_level: bool = False
+    frozen_batch_norm: bool = False
+    stride_in_1x1: bool = False
+
+    @property
+    def num_levels(self) -> int:
+        """Number of pyramid levels."""
+        return len(self.widths) + self.extra_level
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +50,20 @@ class DetectorConfig:
         backbone: ResNet and feature pyramid.
         anchor_sizes: Anchor size of each level in pixels; each cell has three aspect ratios of equal area.
         rpn_foreground_iou: Anchors with at least this IoU are foreground. With anchors far apart for the size
-            of the objects, few reach the usual 0.7.
+            of the objects, few reach the 0.7 of the published network.
         num_classes: Classes without background; every detection is an object, whatever its class.
-        pixel_mean: Subtracted from each channel (0 to 255).
-        pixel_std: Divides each channel.
+        min_size: Images are resized until their shorter side has this many pixels; None keeps their size.
+        max_size: Limit of the longer side of resized images.
+        channel_order: Of the input: "rgb" or "bgr".
+        pixel_mean: Subtracted from each channel (0 to 255), in the input's order.
+        pixel_std: Divides each channel, in the input's order.
         rpn_pre_nms_top_n: Boxes per level before non-maximum suppression (NMS).
         rpn_post_nms_top_n: Proposals per image after NMS.
         rpn_nms_iou: NMS threshold of proposals.
         canonical_size: Side in pixels of the boxes that are pooled from `canonical_level`; boxes half as
             large are pooled from the level below.
         canonical_level: Index of a level; the finest is 0.
-        roi_sampling_ratio: RoIAlign samples per cell in each direction.
+        roi_sampling_ratio: RoIAlign samples per cell in each direction; 0 adapts to the size of the box.
         box_pool_size: RoIAlign output size of the box head.
         box_head_widths: Hidden widths of the box head.
         mask_pool_size: RoIAlign output size of the mask head; masks have twice this size.
@@ -66,6 +77,9 @@ class DetectorConfig:
     anchor_sizes: tuple[float, ...]
     rpn_foreground_iou: float = 0.5
     num_classes: int = 1
+    min_size: int | None = None
+    max_size: int = 1333
+    channel_order: Literal["rgb", "bgr"] = "rgb"
     pixel_mean: tuple[float, float, float] = (127.5, 127.5, 127.5)
     pixel_std: tuple[float, float, float] = (63.75, 63.75, 63.75)
     rpn_pre_nms_top_n: int = 100
@@ -83,11 +97,33 @@ class DetectorConfig:
     max_detections: int = 100
 
     def __post_init__(self) -> None:
-        stages = len(self.backbone.depths), len(self.backbone.widths), len(self.anchor_sizes)
-        if len({*stages}) > 1 or not stages[0]:
-            raise ConfigError(
-                f"depths, widths and anchor_sizes have {str(stages)[1:-1]} numbers; give one per stage."
+        backbone, problems = self.backbone, []
+        if backbone.block not in ("basic", "bottleneck"):
+            problems.append(unknown_name("block", backbone.block, ("basic", "bottleneck")))
+        if self.channel_order not in ("rgb", "bgr"):
+            problems.append(unknown_name("channel order", self.channel_order, ("rgb", "bgr")))
+        if len(backbone.depths) != len(backbone.widths) or not backbone.depths:
+            problems.append(
+                f"depths has {len(backbone.depths)} stages and widths {len(backbone.widths)}; give both one "
+                "number per stage."
             )
+        if len(self.anchor_sizes) != backbone.num_levels:
+            problems.append(
+                f"anchor_sizes has {len(self.anchor_sizes)} numbers; the pyramid has {backbone.num_levels} "
+                "levels."
+            )
+        for name in (
+            "num_classes",
+            "rpn_pre_nms_top_n",
+            "rpn_post_nms_top_n",
+            "box_pool_size",
+            "mask_pool_size",
+            "max_detections",
+        ):
+            if getattr(self, name) < 1:
+                problems.append(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        if problems:
+            raise ConfigError(" ".join(problems))
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested dictionaries of plain values."""
@@ -100,28 +136,55 @@ class DetectorConfig:
         Raises:
             ConfigError: A field is missing or unknown, or the sizes contradict each other.
         """
-        backbone = values.get("backbone")
-        kept = {name: value for name, value in values.items() if name not in _RETIRED}
-        if isinstance(backbone, Mapping):
-            kept["backbone"] = {name: value for name, value in backbone.items() if name not in _RETIRED}
-        return build_config(DetectorConfig, kept, "detector")
+        return build_config(DetectorConfig, values, "detector")
 
 
 def small() -> DetectorConfig:
     """0.57 M parameters, for frames of 128 × 256 pixels; trains from scratch within an hour on two cores."""
     backbone = BackboneConfig(
-        depths=(1, 1, 1), widths=(32, 64, 128), stem_width=16, stem_kernel=5, fpn_width=32
+        block="basic", depths=(1, 1, 1), widths=(32, 64, 128), stem_width=16, stem_kernel=5, fpn_width=32
     )
     # Half of the objects are 22 to 25 pixels high and 24 to 26 wide. With these sizes 13 anchors per object
     # have an IoU of 0.5; with 16, 32 and 64 it was 5.5.
     return DetectorConfig(backbone, anchor_sizes=(20.0, 28.0, 60.0), mask_head_widths=(32, 32))
 
 
-DETECTORS: dict[str, Callable[[], DetectorConfig]] = {"small": small}
+def resnet50() -> DetectorConfig:
+    """44 M parameters: ResNet-50 with FPN, in the default configuration of Detectron2."""
+    backbone = BackboneConfig(
+        block="bottleneck",
+        depths=(3, 4, 6, 3),
+        widths=(256, 512, 1024, 2048),
+        stem_width=64,
+        stem_kernel=7,
+        fpn_width=256,
+        extra_level=True,
+        frozen_batch_norm=True,
+        stride_in_1x1=True,
+    )
+    return DetectorConfig(
+        backbone,
+        anchor_sizes=(32.0, 64.0, 128.0, 256.0, 512.0),
+        rpn_foreground_iou=0.7,
+        min_size=800,
+        channel_order="bgr",
+        pixel_mean=(103.53, 116.28, 123.675),
+        pixel_std=(1.0, 1.0, 1.0),
+        rpn_pre_nms_top_n=1000,
+        rpn_post_nms_top_n=1000,
+        canonical_size=224.0,
+        canonical_level=2,
+        roi_sampling_ratio=0,
+        box_head_widths=(1024, 1024),
+        mask_head_widths=(256, 256, 256, 256),
+    )
+
+
+DETECTORS: dict[str, Callable[[], DetectorConfig]] = {"small": small, "resnet50": resnet50}
 
 
 def detector_config(name: str) -> DetectorConfig:
-    """Return the config of a named detector, "small".
+    """Return the config of a named detector, "small" or "resnet50".
 
     Raises:
         ConfigError: There is no detector of that name.

@@ -1,8 +1,37 @@
-"""Numba kernels of the detector: box decoding, suppression and pasting of masks."""
+"""Numba kernels of the detector: normalisation, pooling, box decoding, suppression, RoIAlign, pasting."""
 
 import numpy as np
 
 from openvima.compilation import njit
+
+
+@njit
+def look_up(images, table, out):
+    """Write `table` (3, 256) at images (B, 3, H, W), uint8, to the beginning of `out` (B, ≥ H, ≥ W, 3)."""
+    for image in range(images.shape[0]):
+        for row in range(images.shape[2]):
+            for column in range(images.shape[3]):
+                for channel in range(3):
+                    out[image, row, column, channel] = table[channel, images[image, channel, row, column]]
+
+
+@njit
+def relu_and_pool(x, out):
+    """Write maxima of 0 and 3 × 3 pixels of `x` (B, H, W, C), with stride 2, to `out`, half as large."""
+    _, height, width, channels = x.shape
+    highest = np.empty(width * channels, x.dtype)  # of three rows, where one at the border counts twice
+    for image in range(len(out)):
+        for i in range(out.shape[1]):
+            upper, middle = x[image, max(2 * i - 1, 0)].reshape(-1), x[image, 2 * i].reshape(-1)
+            lower = x[image, min(2 * i + 1, height - 1)].reshape(-1)
+            for k in range(len(highest)):
+                highest[k] = max(max(upper[k], middle[k]), max(lower[k], 0))
+            for j in range(out.shape[2]):
+                left, centre = max(2 * j - 1, 0) * channels, 2 * j * channels
+                right = min(2 * j + 1, width - 1) * channels
+                cell = out[image, i, j]
+                for k in range(channels):
+                    cell[k] = max(max(highest[left + k], highest[centre + k]), highest[right + k])
 
 
 @njit
@@ -39,6 +68,62 @@ def suppress(boxes, order, groups, iou_threshold):
                 if width * height > iou_threshold * (area + other - width * height):
                     kept[j] = False
     return kept
+
+
+@njit
+def align(features, boxes, images, levels, level, stride, sampling_ratio, out):
+    """Average samples of features (B, H, W, C) in cells of the boxes (R, 4) of a level, as `roi_align` does.
+
+    `images` (R,) and `levels` (R,) are those of the boxes; `out` is (R, C, size, size). Bilinear weights are
+    products of one for the row and one for the column, so features are summed over rows first. Indices are
+    unsigned, since the check for negative ones keeps loops from being vectorised: three times as fast.
+    """
+    _, height, width, _ = features.shape
+    size, channels, pitch = out.shape[2], np.uint64(out.shape[1]), np.uint64(width * out.shape[1])
+    strip, cell = np.empty(pitch, out.dtype), np.empty(channels, out.dtype)  # sums of a row of cells, of one
+    for r in range(len(boxes)):
+        if levels[r] != level:
+            continue
+        left, upper, right, lower = boxes[r, 0], boxes[r, 1], boxes[r, 2], boxes[r, 3]
+        x, x_weights = _sample_points(left, right, width, stride, size, sampling_ratio, out.dtype)
+        y, y_weights = _sample_points(upper, lower, height, stride, size, sampling_ratio, out.dtype)
+        num_x, num_y = len(x) // size, len(y) // size
+        first, last = x.min() * channels, (x.max() + np.uint64(1)) * channels
+        frame = features[images[r]].reshape(-1)
+        for row in range(size):
+            for k in range(first, last):
+                strip[k] = 0
+            for i in range(row * num_y, (row + 1) * num_y):
+                a, b = y[i, 0] * pitch, y[i, 1] * pitch
+                a_weight, b_weight = y_weights[i, 0], y_weights[i, 1]
+                for k in range(first, last):
+                    strip[k] += a_weight * frame[a + k] + b_weight * frame[b + k]
+            for column in range(size):
+                for k in range(channels):
+                    cell[k] = 0
+                for j in range(column * num_x, (column + 1) * num_x):
+                    a, b = x[j, 0] * channels, x[j, 1] * channels
+                    a_weight, b_weight = x_weights[j, 0], x_weights[j, 1]
+                    for k in range(channels):
+                        cell[k] += a_weight * strip[a + k] + b_weight * strip[b + k]
+                for k in range(channels):
+                    out[r, k, row, column] = cell[k]
+
+
+@njit
+def _sample_points(low, high, length, stride, size, sampling_ratio, dtype):
+    """Return the features beside each sampling point of an axis and their weights, (size · samples, 2)."""
+    start, extent = low / stride - 0.5, (high - low) / stride
+    samples = sampling_ratio if sampling_ratio else max(1, int(np.ceil(extent / size)))
+    indices, weights = np.zeros((size * samples, 2), np.uint64), np.zeros((size * samples, 2), dtype)
+    for n in range(len(indices)):
+        point = start + extent * (n + 0.5) / (size * samples)
+        if -1 <= point <= length:
+            point = min(max(point, 0.0), length - 1.0)
+            first = min(int(point), max(length - 2, 0))
+            indices[n, 0], indices[n, 1] = first, min(first + 1, length - 1)
+            weights[n, 0], weights[n, 1] = (first + 1 - point) / samples, (point - first) / samples
+    return indices, weights
 
 
 @njit

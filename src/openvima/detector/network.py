@@ -1,5 +1,6 @@
 """Mask R-CNN: instances with boxes, masks and scores from images, the training losses, and detection."""
 
+import math
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from openvima.detector.layers import (
     box_losses,
     mask_loss,
 )
-from openvima.detector.roi_align import paste_masks, pyramid_align
+from openvima.detector.roi_align import is_cpu_inference, normalise, paste_masks, pyramid_align
 from openvima.errors import ShapeError
 from openvima.policies.base import usable_device
 from openvima.policies.nn.layers import TensorRecord
@@ -82,12 +83,13 @@ class MaskRCNN(nn.Module):
             images: Shape (B, 3, H, W), uint8, RGB.
         """
         height, width = images.shape[2:]
-        levels = self.backbone(self._normalise(images))
-        proposals = self.rpn.propose(self.rpn(levels), height=height, width=width)
-        boxes, scores, classes, owners = self._detect_boxes(levels, proposals, (height, width))
+        inputs, scale, size = self._preprocess(images)
+        levels = self.backbone(inputs)
+        proposals = self.rpn.propose(self.rpn(levels), height=size[0], width=size[1])
+        boxes, scores, classes, owners = self._detect_boxes(levels, proposals, size)
         probabilities = self._predict_masks(levels, boxes, classes, owners)
         counts = owners.bincount(minlength=len(images)).tolist()
-        boxes = clip_boxes(boxes, height=height, width=width)
+        boxes = clip_boxes(boxes / scale, height=height, width=width)
         masks = paste_masks(probabilities, boxes, height=height, width=width)
         return [
             Instances(*own)
@@ -105,10 +107,10 @@ class MaskRCNN(nn.Module):
             sampled: Proposals per image in the losses of the heads.
             generator: Samples anchors and proposals, on the CPU.
         """
-        height, width = images.shape[2:]
-        levels = self.backbone(self._normalise(images))
+        inputs, scale, (height, width) = self._preprocess(images)
+        levels = self.backbone(inputs)
         predictions: AnchorPredictions = self.rpn(levels)
-        true_boxes = [own.boxes.to(self.pixel_mean.dtype) for own in targets]
+        true_boxes = [own.boxes.to(inputs.dtype) * scale for own in targets]
         losses = self.rpn.losses(predictions, true_boxes, generator)
         proposals = self.rpn.propose(predictions, height=height, width=width)
         samples = [
@@ -127,13 +129,28 @@ class MaskRCNN(nn.Module):
         masks = torch.cat([own.masks[s.matches] for own, s in zip(targets, samples, strict=True)])
         foreground = boxes[: len(matched)]
         pooled = self._pool(levels, foreground, indices[: len(matched)], self.config.mask_pool_size)
-        losses["mask"] = mask_loss(self.mask_head(pooled), proposals=foreground, masks=masks)
+        losses["mask"] = mask_loss(self.mask_head(pooled), proposals=foreground / scale, masks=masks)
         return losses
 
-    def _normalise(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Normalise images (B, 3, H, W), and pad them with zeros to multiples of the coarsest stride."""
+    def _preprocess(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, tuple[int, int]]:
+        """Return resized, normalised and padded images, the scale of boxes (4,), and the unpadded size."""
+        config = self.config
+        pixels = images.flip(1) if config.channel_order == "bgr" else images
+        before = pixels.shape[2:]
+        height, width = resized_shape(config, *before)
+        if (height, width) != before:
+            # Antialiased and rounded, as Pillow does it.
+            pixels = pixels.to(self.pixel_mean.dtype)
+            pixels = F.interpolate(pixels, (height, width), mode="bilinear", antialias=True).round()
+        scale = self.pixel_mean.new_tensor([width / before[1], height / before[0]]).repeat(2)
         divisor = self.backbone.size_divisor
-        height, width = (size + -size % divisor for size in pixels.shape[2:])
+        padded = height + -height % divisor, width + -width % divisor
+        return self._normalise(pixels, *padded), scale, (height, width)
+
+    def _normalise(self, pixels: torch.Tensor, height: int, width: int) -> torch.Tensor:
+        """Normalise pixels, and pad them with zeros."""
+        if pixels.dtype == torch.uint8 and is_cpu_inference(pixels):
+            return normalise(pixels, self.pixel_mean, self.pixel_std, height=height, width=width)
         padding = (0, width - pixels.shape[3], 0, height - pixels.shape[2])
         return F.pad((pixels - self.pixel_mean) / self.pixel_std, padding)
 
@@ -172,7 +189,7 @@ class MaskRCNN(nn.Module):
     ) -> torch.Tensor:
         config = self.config
         return pyramid_align(
-            levels,
+            levels[: len(config.backbone.widths)],  # the extra level is for proposals only
             boxes,
             images,
             size=size,
@@ -181,6 +198,14 @@ class MaskRCNN(nn.Module):
             canonical_size=config.canonical_size,
             canonical_level=config.canonical_level,
         )
+
+
+def resized_shape(config: DetectorConfig, height: int, width: int) -> tuple[int, int]:
+    """Return the height and width to which an image is resized; halves are rounded up."""
+    if config.min_size is None:
+        return height, width
+    scale = min(config.min_size / min(height, width), config.max_size / max(height, width))
+    return math.floor(height * scale + 0.5), math.floor(width * scale + 0.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,7 +276,9 @@ class FrameDetector:
                     f"the image is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W)."
                 )
         images = torch.from_numpy(np.stack(frames)).to(self.device)
-        return [to_detections(found) for found in self.network(images)]
+        # Networks that enlarge their images have large features.
+        size = len(images) if self.network.config.min_size is None else 1
+        return [to_detections(found) for part in images.split(size) for found in self.network(part)]
 
 
 def to_detections(found: Instances) -> Detections:

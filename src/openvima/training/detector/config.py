@@ -43,7 +43,7 @@ class DetectorTrainingConfig(RunConfig):
     """One training run of a detector.
 
     Args:
-        preset: Sizes: "small".
+        preset: Sizes: "small", or "resnet50" for the published architecture.
         init_from: Initial weights: a run folder, a checkpoint folder, or a file of Detectron2. They decide
             the sizes, whatever the preset.
         proposals_per_frame: Proposals of a frame that the heads are trained on.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from openvima.data.reader import Dataset, split_hashes
-from openvima.detector.checkpoint import load_network, load_weights, write_network
+from openvima.detector.checkpoint import load_detectron2, load_network, load_weights, write_network
 from openvima.detector.config import detector_config
 from openvima.detector.frames import Frame, FrameSampler, augment_frame, held_out_frames
 from openvima.detector.network import Instances, MaskRCNN
@@ -247,7 +247,8 @@ class DetectorStage:
 def _network(config: DetectorTrainingConfig) -> MaskRCNN:
     """Build the network, with the weights of `init_from` if given."""
     if config.init_from is not None:
-        return load_network(config.init_from)
+        is_file = config.init_from.is_file()
+        return load_detectron2(config.init_from) if is_file else load_network(config.init_from)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_seed(config.seed, "weights", 0))
         return MaskRCNN(detector_config(config.preset))
