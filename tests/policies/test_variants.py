@@ -8,7 +8,7 @@ import torch
 
 from openvima.errors import ConfigError
 from openvima.policies import preset
-from openvima.policies.build import build_network, config_from_dict, config_to_dict
+from openvima.policies.build import build_network, config_from_dict, config_to_dict, outline_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.image_encoders import Resampler, ResamplerConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -102,6 +102,14 @@ def test_training_has_a_setting_for_every_switch() -> None:
     assert with_variant(preset("nano"), asdict(ModelConfig())) == preset("nano")
 
 
+def test_conditioning_keeps_the_size_of_the_decoder() -> None:
+    """Both directions of the switch are inverse, and the published sizes differ by less than 2 %."""
+    config = preset("vima-2m")
+    prefix = with_variant(config, {"conditioning": "prefix"})
+    assert prefix.decoder == preset("gato-2m").decoder
+    assert with_variant(prefix, {"conditioning": "cross-attention"}) == config
+
+
 def test_image_tokens_are_those_of_the_baselines() -> None:
     for name, switch in {"gato": "patches", "gpt": "image", "flamingo": "image-perceiver"}.items():
         for size in ("nano", "2m"):
@@ -116,6 +124,21 @@ def test_image_tokens_are_those_of_the_baselines() -> None:
             assert with_variant(theirs, {"image_tokens": switch}) == theirs
     perceiver = with_variant(preset("vima-nano"), {"image_tokens": "object-perceiver"})
     assert with_variant(perceiver, {"image_tokens": "objects"}) == preset("vima-nano")
+
+
+def test_text_encoders_have_the_sizes_of_t5() -> None:
+    """Parameters of the encoders of T5 1.0 without word embeddings, as transformers counts them."""
+    for name, millions in {"t5-small": 18.88, "t5-base": 84.95, "t5-large": 302.04}.items():
+        config = with_variant(preset("midas-nano"), {"text_encoder": name})
+        assert config.prompt.tokenizer == "t5"
+        assert config.prompt.visual_residual
+        text = outline_network(config).prompt.text
+        assert sum(p.numel() for p in text.parameters()) / 1e6 == pytest.approx(millions, abs=0.01)
+        assert [b.query.weight.requires_grad for b in text.blocks][-3:] == [False, True, True]
+    assert with_variant(config, {"text_encoder": "small"}).prompt == preset("midas-nano").prompt
+    assert with_variant(preset("vima-2m"), {"text_encoder": "t5-base"}) == preset("vima-2m")
+    own = with_variant(preset("small"), {"text_encoder": "small"})
+    assert own == preset("small")
 
 
 def resampler_of(num_objects: int):
@@ -168,9 +191,11 @@ def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name
 @pytest.mark.parametrize(
     ("name", "switches", "words"),
     [
+        ("vima-nano", {"image_tokens": "voxels"}, "image_tokens.*voxels.*object-perceiver"),
         ("gato-nano", {"image_tokens": "objects"}, "has 'patches' alone; take a preset vima-… or midas-…"),
         ("nano", {"image_tokens": "patches"}, "pointer models have objects alone; take nano-bins"),
         ("small", {"text_encoder": "t5-base"}, "pointer models have a vocabulary of words alone"),
+        ("vima-nano", {"text_encoder": "bert"}, "text_encoder.*bert.*t5-small"),
         (
             "vima-nano",
             {"tuned_layers": 3},
@@ -184,6 +209,7 @@ def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name
         ("nano", {"crop_kernel": 2}, "last_kernel is 2; it must be"),
         ("nano", {"crop_width": 18}, "width is 18; it must be a multiple of 4"),
         ("vima-2m", {"crop_kernel": 1}, "crop_kernel is 1, but the network has no convolutions"),
+        ("vima-nano", {"conditioning": "suffix"}, "conditioning.*suffix.*cross-attention"),
         ("vima-nano", {"colour": "red"}, "colour"),
     ],
 )

@@ -15,6 +15,10 @@ from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.pointer.config import AttributeConfig, CandidateHeadConfig, PointerConfig
 from openvima.policies.sizes import T5_SIZES, size, t5_prompt_encoder
 
+CONDITIONINGS = ("cross-attention", "prefix")
+TEXT_ENCODERS = ("small", *T5_SIZES)
+IMAGE_TOKENS = ("objects", "object-perceiver", "image-perceiver", "patches", "image")
+
 
 def with_variant(config: PolicyConfig, switches: Mapping[str, Any]) -> PolicyConfig:
     """Return the same network with other parts.
@@ -47,6 +51,8 @@ def with_text_encoder(config: PolicyConfig, name: str) -> PolicyConfig:
     Raises:
         ConfigError: There is no such text encoder, or the network is a pointer model.
     """
+    if name != "small" and name not in T5_SIZES:
+        raise ConfigError(unknown_name("text_encoder", name, TEXT_ENCODERS))
     old = config.prompt
     if name == "small":
         new = size("nano").prompt if old.tokenizer == "t5" else old
@@ -72,7 +78,7 @@ def with_tuned_layers(config: PolicyConfig, count: int) -> PolicyConfig:
 
 
 def image_tokens(config: PolicyConfig) -> str:
-    """Return the image tokens of a network, by a name of `with_image_tokens`."""
+    """Return which of `IMAGE_TOKENS` a network has."""
     resampler = None if isinstance(config, PointerConfig) else config.resampler
     if isinstance(config.images, ObjectEncoderConfig):
         return "object-perceiver" if resampler else "objects"
@@ -84,7 +90,7 @@ def with_image_tokens(config: PolicyConfig, name: str) -> PolicyConfig:
 
     Args:
         config: The network.
-        name: "objects" and "object-perceiver", four latents of the objects of both
+        name: One of `IMAGE_TOKENS`. "objects" and "object-perceiver", four latents of the objects of both
             views, take crops; "image-perceiver", four latents, "patches" and "image", one token, are the
             tokens of VIMA-Flamingo, VIMA-Gato and VIMA-GPT of whole frames.
 
@@ -94,6 +100,8 @@ def with_image_tokens(config: PolicyConfig, name: str) -> PolicyConfig:
     Source: VIMA (Jiang et al. 2023), ablation of visual tokenizers.
     """
     own = image_tokens(config)
+    if name not in IMAGE_TOKENS:
+        raise ConfigError(unknown_name("image_tokens", name, IMAGE_TOKENS))
     if name == own:
         return config
     if isinstance(config, PointerConfig):
@@ -130,6 +138,8 @@ def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
     Raises:
         ConfigError: There is no such head, or the network is a pointer model.
     """
+    if name not in HEADS:
+        raise ConfigError(unknown_name("head", name, HEADS))
     if isinstance(config, PointerConfig):
         raise _not_of_pointers(f"head is {name!r}", "pointers to candidates alone")
     kind, head = HEADS[name], config.head
@@ -160,6 +170,8 @@ def with_conditioning(config: PolicyConfig, name: str) -> PolicyConfig:
 
     Source: VIMA (Jiang et al. 2023), ablation "gpt-decoder".
     """
+    if name not in CONDITIONINGS:
+        raise ConfigError(unknown_name("conditioning", name, CONDITIONINGS))
     is_prefix = isinstance(config.decoder, PrefixDecoderConfig)
     if is_prefix == (name == "prefix"):
         return config
