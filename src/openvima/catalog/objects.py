@@ -9,7 +9,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from openvima.catalog.geometry import Vector3
 from openvima.errors import UnknownNameError, unknown_name
@@ -69,11 +69,10 @@ class ObjectSpec:
 
 
 def _load() -> dict[str, ObjectSpec]:
-    records = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
-    return {
-        record["name"]: ObjectSpec(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items()})
-        for record in records
-    }
+    records: list[dict[str, Any]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
+    for record in records:
+        record |= {name: tuple(value) for name, value in record.items() if isinstance(value, list)}
+    return {record["name"]: ObjectSpec(**record) for record in records}
 
 
 OBJECTS: dict[str, ObjectSpec] = _load()

@@ -7,7 +7,7 @@ colour is the light one with its HSV value lowered by 0.3.
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from openvima.errors import UnknownNameError, unknown_name
 
@@ -59,11 +59,10 @@ class TextureSpec:
 
 
 def _load() -> dict[str, TextureSpec]:
-    records = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
-    return {
-        record["name"]: TextureSpec(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items()})
-        for record in records
-    }
+    records: list[dict[str, Any]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
+    for record in records:
+        record |= {name: tuple(value) for name, value in record.items() if isinstance(value, list)}
+    return {record["name"]: TextureSpec(**record) for record in records}
 
 
 TEXTURES: dict[str, TextureSpec] = _load()
