@@ -57,7 +57,7 @@ def test_a_file_that_is_missing_is_found(folder: Path, name: str) -> None:
     problem, *others = verify(folder, NO_REPLAY).problems
     assert others == []
     assert (problem.file, problem.cause) == (name, "it is missing")
-    with pytest.raises((DatasetError, DatasetError), match=name):
+    with pytest.raises((DatasetError), match=name):
         _ = Dataset(folder)[0]
 
 
@@ -94,7 +94,7 @@ def test_a_file_of_another_data_set_is_found(
     other = write_folder(folder.parent / "other", info, [demos[:2], demos[1:2] + demos[3:]])
     shutil.copy(other / name, folder / name)
     assert not verify(folder, NO_REPLAY).is_clean
-    with pytest.raises((DatasetError, DatasetError)):
+    with pytest.raises(DatasetError):
         list(Dataset(folder))
 
 

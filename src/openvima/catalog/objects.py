@@ -5,13 +5,13 @@ Two of them (stand and disk of the towers of Hanoi) belong to no released task.
 Source: the object list of VIMA-Bench; a few oddities are kept because published numbers depend on them.
 """
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from openvima.catalog.geometry import Vector3
+from openvima.catalog.records import read_records
 from openvima.errors import UnknownNameError, unknown_name
 
 ObjectKind = Literal["kit", "box", "compound", "mesh", "registered"]
@@ -68,14 +68,9 @@ class ObjectSpec:
     container: bool = False
 
 
-def _load() -> dict[str, ObjectSpec]:
-    records: list[dict[str, Any]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
-    for record in records:
-        record |= {name: tuple(value) for name, value in record.items() if isinstance(value, list)}
-    return {record["name"]: ObjectSpec(**record) for record in records}
-
-
-OBJECTS: dict[str, ObjectSpec] = _load()
+OBJECTS: dict[str, ObjectSpec] = {
+    record["name"]: ObjectSpec(**record) for record in read_records(Path(__file__).with_suffix(".json"))
+}
 """All objects by display name, in the benchmark's order."""
 
 

@@ -4,11 +4,11 @@ They are read from `textures.json`. Source: the texture list and base colours of
 colour is the light one with its HSV value lowered by 0.3.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from openvima.catalog.records import read_records
 from openvima.errors import UnknownNameError, unknown_name
 
 TextureCategory = Literal[
@@ -58,14 +58,9 @@ class TextureSpec:
         return (red, green, blue)
 
 
-def _load() -> dict[str, TextureSpec]:
-    records: list[dict[str, Any]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
-    for record in records:
-        record |= {name: tuple(value) for name, value in record.items() if isinstance(value, list)}
-    return {record["name"]: TextureSpec(**record) for record in records}
-
-
-TEXTURES: dict[str, TextureSpec] = _load()
+TEXTURES: dict[str, TextureSpec] = {
+    record["name"]: TextureSpec(**record) for record in read_records(Path(__file__).with_suffix(".json"))
+}
 """The 82 textures by display name: patterns, each light one followed by its dark one, then plain colours."""
 
 REGISTERED_TEXTURES: dict[str, TextureSpec] = {}

@@ -217,7 +217,7 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
         the settings and versions alone, not on who did the work, nor on interruptions.
 
     Raises:
-        UnknownTaskError, ConfigError, ConfigError: The settings do not fit.
+        UnknownTaskError, ConfigError: The settings do not fit.
         MissingExtraError: Ray was asked for and is not installed.
         DatasetError: The folder holds a data set of other settings or versions, or a larger one.
         DatasetError: A shard in the folder is damaged.

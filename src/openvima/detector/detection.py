@@ -220,7 +220,7 @@ class DetectedObjects:
             images: What `in_prompt_image` will be asked for.
 
         Raises:
-            PolicyError, ShapeError, ShapeError: As those methods.
+            PolicyError, ShapeError: As those methods.
         """
         pairs = [_Pair.of_observation(each) for each in observations]
         if self.prompt_extractor is None:

@@ -121,7 +121,7 @@ def scene_objects(given: object) -> list[SceneObject]:
 
     Raises:
         SceneError: An object is malformed, or two have one name.
-        UnknownNameError, UnknownNameError: The catalogue has no such object or texture.
+        UnknownNameError: The catalogue has no such object or texture.
     """
     if isinstance(given, Mapping):
         named = [scene_object(value, f"object {shown(name)}", name) for name, value in given.items()]
@@ -157,7 +157,7 @@ def scene_object(given: object, label: str, default_name: object) -> SceneObject
 
     Raises:
         SceneError: It is malformed.
-        UnknownNameError, UnknownNameError: The catalogue has no such object or texture.
+        UnknownNameError: The catalogue has no such object or texture.
     """
     if isinstance(given, SceneObject):
         values: dict[str, Any] = {name: getattr(given, name) for name in FIELDS}
@@ -187,7 +187,7 @@ def checked_appearance(object_name: object, texture: object, label: str) -> tupl
     """Check the names of an object and its texture.
 
     Raises:
-        UnknownNameError, UnknownNameError: The catalogue has no such object or texture.
+        UnknownNameError: The catalogue has no such object or texture.
         SceneError: A name is no text.
     """
     if not isinstance(object_name, str) or not isinstance(texture, str):

@@ -331,7 +331,7 @@ def composed_prompt(text: object, images: object, fills: ImageMaker) -> Prompt:
 
     Raises:
         SceneError: The text or an image is malformed, or a placeholder has no image.
-        UnknownNameError, UnknownNameError, InputFileError: As for `compose`.
+        UnknownNameError, InputFileError: As for `compose`.
     """
     text = _checked_text(text)
     if not isinstance(images, Mapping | None):
@@ -387,7 +387,7 @@ def compose(
     Raises:
         SceneError: An object is malformed, outside the workspace or overlaps another; the prompt, an image
             or a goal is malformed. The message names the object and the limit.
-        UnknownNameError, UnknownNameError: The catalogue has no such object or texture.
+        UnknownNameError: The catalogue has no such object or texture.
         InputFileError: A PNG file cannot be used.
 
     Example:
@@ -412,7 +412,7 @@ def composed(values: Mapping[str, Any], *, assets: Assets, photo: Callable[[str]
         photo: Reads a PNG file.
 
     Raises:
-        SceneError, UnknownNameError, UnknownNameError, InputFileError: As for `compose`.
+        SceneError, UnknownNameError, InputFileError: As for `compose`.
     """
     if unknown := [key for key in values if key not in COMPOSE_KEYS]:
         raise SceneError(unknown_name("key of a scene:", unknown[0], COMPOSE_KEYS))

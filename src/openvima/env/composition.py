@@ -185,7 +185,7 @@ class Composition:
         """Compose the episode.
 
         Raises:
-            SceneError, UnknownNameError, UnknownNameError: As for `compose`.
+            SceneError, UnknownNameError: As for `compose`.
         """
         composed = compose(
             list(self.objects),
@@ -223,7 +223,7 @@ class Composition:
 
         Raises:
             SceneError: The position is not free, or none is.
-            UnknownNameError, UnknownNameError: The catalogue has no such object or texture.
+            UnknownNameError: The catalogue has no such object or texture.
         """
         taken = {each.name for each in self.objects} | {*self.images}
         letters = "abcdefghijklmnopqrstuvwxyz"

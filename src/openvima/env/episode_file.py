@@ -111,7 +111,7 @@ def load_episode(path: str | Path, *, assets: str | Path | Assets = "procedural"
 
     Raises:
         InputFileError: The file cannot be read, or holds no valid episode; the message names the field.
-        SceneError, UnknownNameError, UnknownNameError: The scene is not possible.
+        SceneError, UnknownNameError: The scene is not possible.
         ConfigError: The seed of the episode is not allowed, or a function for the assets fails.
     """
     path = as_path(path)
@@ -137,7 +137,7 @@ def episode_from_values(
         folder: Folder of PNG files; None: there may be none.
 
     Raises:
-        InputFileError, SceneError, UnknownNameError, UnknownNameError, ConfigError: As for
+        InputFileError, SceneError, UnknownNameError, ConfigError: As for
             `load_episode`.
     """
     if not isinstance(values, Mapping):
@@ -273,7 +273,7 @@ def _check(episode: Episode) -> None:
     """Check what the types of the fields leave open.
 
     Raises:
-        InputFileError, SceneError, UnknownNameError, UnknownNameError, ConfigError: It is not valid.
+        InputFileError, SceneError, UnknownNameError, ConfigError: It is not valid.
     """
     for name in ("max_steps", "oracle_max_steps"):
         if not 1 <= getattr(episode, name) <= MAX_STEPS:

@@ -26,7 +26,7 @@ NO_GOALS = "the step limit is reached; the episode has no goals"
 OUT_OF_STEPS = "not done within the step limit"
 NO_ORACLE_ACTION = "the oracle has no action"
 # What one prompt or observation may cause, unlike a lost server or a missing package.
-_OF_EPISODES = (PolicyError, PromptError, ShapeError, ShapeError, ActionError)
+_OF_EPISODES = (PolicyError, PromptError, ShapeError, ActionError)
 
 
 class EpisodeSlot:

@@ -121,7 +121,7 @@ class Rasteriser:
             View name to image.
 
         Raises:
-            UnknownNameError, UnknownNameError, AssetError: An object has no shape or texture.
+            UnknownNameError, AssetError: An object has no shape or texture.
             ShapeError: An id is out of range, or a texture malformed.
             ConfigError: `enlarge` is below 1.
         """
@@ -132,7 +132,7 @@ class Rasteriser:
         """Render all images of a prompt in both views.
 
         Raises:
-            UnknownNameError, UnknownNameError, AssetError: An object has no shape or texture.
+            UnknownNameError, AssetError: An object has no shape or texture.
         """
         images = {name: self._prompt_image(name, fill) for name, fill in prompt.images}
         return RenderedPrompt(prompt.text, images)

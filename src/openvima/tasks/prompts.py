@@ -178,9 +178,8 @@ def with_phrases(text: str, phrases: Mapping[str, str]) -> str:
     for number, piece in enumerate(PLACEHOLDER.split(text)):
         if number % 2 == 0:
             before = piece
-        elif (
-            piece in phrases
-        ):  # the article of the phrase before is none of this one: "the letter A the star"
+        elif piece in phrases:
+            # Only the text between: "the letter A the star" has an article that is none of the star's.
             result += _append_phrase(before, phrases[piece], is_first=not result and not before)
         else:
             result += f"{before}{{{piece}}}"

@@ -71,7 +71,5 @@ def _prompt_scene(table: TableSampler, target: Placement, textures: tuple[str, .
         return sampler.choose(objects), sampler.choose(others)
 
     sampler.place_one("prompt object", lambda: (target.object, target.texture), size=target.size)
-    sampler.place_one(
-        "prompt distractor", lambda: (sampler.choose(objects), sampler.choose(others)), tries=11
-    )
+    sampler.place_one("prompt distractor", draw, tries=11)
     return SceneImage.of(sampler.placements)

@@ -242,12 +242,10 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     pretraining = {"pretraining.steps": None} if others.get("init_from") else {}
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
-    if tokens != "objects":
-        unfit = {"model.points"}
     if others.get("model.head") == "autoregressive":
         unfit |= {"augmentation.leftmost_first"}
     if tokens != "objects":
-        unfit |= {"optimizer.pointing_loss_weight"}
+        unfit |= {"model.points", "optimizer.pointing_loss_weight"}
     if tokens not in ("objects", "object-perceiver"):
         unfit |= _PAPERS.keys() - _PAPERS_FRAMES.keys()
     fit = {name: value for name, value in settings.items() if name not in unfit}

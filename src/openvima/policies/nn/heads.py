@@ -131,8 +131,10 @@ class AutoregressiveHead(nn.Module):
         previous = self._segment(previous_BTC, has_previous_BT)
         outputs_BTQD, cache = decode_observations(decoder, cache, observations, previous)
         output_BTD, ahead = observations.query(outputs_BTQD), cache
-        bins_BTC = encode_bins(torch.zeros(*output_BTD.shape[:2], ACTION_WIDTH, device=output_BTD.device))
-        actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        bins_BTC = torch.zeros(
+            *output_BTD.shape[:2], ACTION_WIDTH, dtype=torch.int64, device=output_BTD.device
+        )
+        pointed, before = [], (output_BTD, ahead)
 
         def read(component: int) -> None:
             nonlocal output_BTD, ahead
@@ -140,22 +142,24 @@ class AutoregressiveHead(nn.Module):
             exists_BT = torch.ones_like(bins_BTC[..., component], dtype=torch.bool)
             output_BTD, ahead = decoder(ahead, token_BTD, exists_BT)
 
-        half_width = ACTION_WIDTH // 2
-        for half in (0, 1):
-            before, first = (output_BTD, ahead), half * half_width
-            for component in range(first, first + half_width):
-                bins_BTC[..., component] = strategy(self.classifiers[component](output_BTD))
-                if component + 1 < ACTION_WIDTH:
-                    read(component)
-                actions_BTC[..., component] = actions_from_bins(bins_BTC, outputs_BTQD.dtype)[..., component]
-                if self.points and component == first + 1:
-                    point_at_object(half, actions_BTC, before[0], observations, strategy)
-                    moved = slice(first, component + 1)
-                    unit_BTC = to_unit_range(actions_BTC.to(torch.float64))
-                    bins_BTC[..., moved] = encode_bins(unit_BTC)[..., moved]
-                    output_BTD, ahead = before
-                    read(first)
-                    read(first + 1)
+        for component, classifier in enumerate(self.classifiers):
+            half, place = divmod(component, ACTION_WIDTH // 2)
+            if place == 0:
+                before = output_BTD, ahead
+            bins_BTC[..., component] = strategy(classifier(output_BTD))
+            if self.points and place == 1:  # the position is complete, and read again if it moves
+                actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+                point_at_object(half, actions_BTC, before[0], observations, strategy)
+                part = slice(component - 1, component + 1)
+                pointed.append((part, actions_BTC[..., part]))
+                bins_BTC[..., part] = encode_bins(to_unit_range(actions_BTC.to(torch.float64)))[..., part]
+                output_BTD, ahead = before
+                read(component - 1)
+            if component + 1 < ACTION_WIDTH:
+                read(component)
+        actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        for part, position_BT2 in pointed:
+            actions_BTC[..., part] = position_BT2
         return actions_BTC, cache
 
     def _segment(self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor) -> TokenSegment:
