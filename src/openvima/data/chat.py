@@ -296,21 +296,28 @@ def wording_hash() -> str:
 
 def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
     """Encode an image, shape (3, H, W), uint8, as a PNG file of `enlarge` times its size, unsmoothed."""
-    pixels = np.ascontiguousarray(channels_last(rgb))
-    height, width = pixels.shape[0] * enlarge, pixels.shape[1] * enlarge
-    rows = np.zeros((len(pixels), 1 + 3 * width), np.uint8)  # each begins with its filter, 0: as it is
-    rows[:, 1:] = np.repeat(pixels, enlarge, axis=1).reshape(len(pixels), -1)
-    # A repeated row is nothing but zeros to the one above, filter 2. All repetitions are compressed once, and
-    # inserted where the compressor refers to nothing before: a sixth of the time that Pillow takes.
-    repeated = (b"\2" + bytes(3 * width)) * (enlarge - 1)
-    packer = zlib.compressobj(1, wbits=-15)
+    _, height, width = rgb.shape
+    # The first byte of a row is its filter: 1 writes the difference to the left pixel, 2 that to the row above.
+    # So repetitions are zeros, and those of rows are compressed once, and inserted where the compressor refers
+    # to nothing before: a tenth of the time that Pillow takes.
+    rows = np.zeros((height, 1 + 3 * enlarge * width), np.uint8)
+    rows[:, 0] = 1
+    for channel, values in enumerate(np.diff(rgb, axis=2, prepend=np.uint8(0))):
+        rows[:, 1 + channel :: 3 * enlarge] = values
+    repeated = (b"\2" + bytes(3 * enlarge * width)) * (enlarge - 1)
+    packer = zlib.compressobj(1, wbits=-15, strategy=zlib.Z_RLE)
     inserted = packer.compress(repeated) + packer.flush(zlib.Z_FULL_FLUSH)
+    # Adler-32 is two sums, of the bytes and of the first sum after each: `repeated` moves them on like this.
+    high, low = divmod(zlib.adler32(repeated, 0), 1 << 16)
     data, checksum = [b"\x78\x01"], 1
     for row in map(bytes, rows):
         data += [packer.compress(row), packer.flush(zlib.Z_FULL_FLUSH), inserted]
-        checksum = zlib.adler32(repeated, zlib.adler32(row, checksum))
+        second, first = divmod(zlib.adler32(row, checksum), 1 << 16)
+        checksum = (second + len(repeated) * first + high) % 65521 << 16 | (first + low) % 65521
     data += [packer.flush(), checksum.to_bytes(4, "big")]
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # eight bits of red, green and blue
+    head = struct.pack(
+        ">IIBBBBB", enlarge * width, enlarge * height, 8, 2, 0, 0, 0
+    )  # eight bits of red, green and blue
     chunks = ((b"IHDR", head), (b"IDAT", b"".join(data)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -327,8 +334,7 @@ def _joined(parts: Sequence[Part]) -> tuple[Part, ...]:
     """Join texts that follow one another: a model's template may put anything between two of them."""
     joined: list[Part] = []
     for kind, group in groupby(parts, type):
-        found = list(group)
-        joined += ["\n".join(map(str, found))] if kind is str else found
+        joined += ["\n".join(map(str, group))] if kind is str else group
     return tuple(joined)
 
 

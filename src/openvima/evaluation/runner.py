@@ -355,8 +355,9 @@ def _play_chat(job: Job, policy: VlmPolicy, seed: int) -> tuple[EpisodeOutcome, 
     batch = job.batch
     chat = VlmRolloutPolicy(policy.new_session(), batch.ablation, name=batch.policy)
     recorder = ActionRecorder(chat)
-    env = batch.env_config.make(batch.task, batch.level, domain="eval")
-    (outcome,) = play([env], [seed], recorder, may_fail=job.may_fail)
+    with policy.client.turn:
+        env = batch.env_config.make(batch.task, batch.level, domain="eval")
+        (outcome,) = play([env], [seed], recorder, may_fail=job.may_fail)
     return outcome, recorder.steps[0], chat.said[0]
 
 

@@ -139,6 +139,9 @@ class ChatClient:
         )
         self.shots: dict[tuple[str, ...], tuple[Turn, ...]] = {}  # demonstrations, made once for all episodes
         self._lock = threading.Lock()
+        # Threads that compute at once hand the interpreter's lock to and fro, a third of a decision's time.
+        # So the episodes of an evaluation hold the turn, except while they wait for an answer.
+        self.turn = threading.Lock()
         self.is_stopped = False  # set to ask nothing more
         self._is_reached = False
         self._left_out: list[str] = []
@@ -162,12 +165,18 @@ class ChatClient:
         path = None if folder is None else folder / request[:2] / f"{request}.json"
         if path is not None and path.is_file():
             return Answer(**json.loads(path.read_text(encoding="utf-8")))
-        self._reserve()
-        answer = self._asked(settings, messages, request)
-        with self._lock:
-            self.num_tokens += answer.tokens_in + answer.tokens_out
-        if path is not None:
-            atomic_write_file(path, json.dumps(asdict(answer)) + "\n")
+        if is_shared := self.turn.locked():
+            self.turn.release()
+        try:
+            self._reserve()
+            answer = self._asked(settings, messages, request)
+            with self._lock:
+                self.num_tokens += answer.tokens_in + answer.tokens_out
+            if path is not None:
+                atomic_write_file(path, json.dumps(asdict(answer)) + "\n")
+        finally:
+            if is_shared:
+                self.turn.acquire()
         return answer
 
     def _settings(self, schema: Mapping[str, Any]) -> dict[str, Any]:
