@@ -147,11 +147,7 @@ class ChatClient:
         self._left_out: list[str] = []
 
     def ask(self, turns: Sequence[Turn], schema: Mapping[str, Any]) -> Answer:
-        """Ask for the next message of a conversation.
-
-        Args:
-            turns: The conversation.
-            schema: JSON schema of the answer.
+        """Ask for the next message of a conversation, of a JSON schema.
 
         Raises:
             ServerError: The server is away, or refuses the key, the model or the images.
