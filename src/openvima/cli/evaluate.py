@@ -1,4 +1,4 @@
-"""`openvima evaluate`: score policies on levels L1 to L4."""
+"""`openvima evaluate`: score policies on levels."""
 
 import json
 import sys

@@ -34,7 +34,7 @@ VERBS = {
     "policies": "list policies; convert, export and push checkpoints",
     "train": "train a policy on demonstrations",
     "detector": "train and evaluate the object detector",
-    "evaluate": "evaluate policies on levels L1 to L4",
+    "evaluate": "evaluate policies on the levels",
     "verify-results": "confirm an evaluation from its recorded actions",
     "study": "run an experiment of the papers: train, evaluate, plot",
     "serve": "serve a policy over WebSockets",
