@@ -228,6 +228,33 @@ OBJECT_STORE_BYTES = 100 * 2**20  # Ray's default is 30 % of the memory; results
 AUTO = "auto"  # the cluster that this machine belongs to
 
 
+def engine_problems(engine: str, address: str | None) -> Iterator[str]:
+    """Say what is wrong with an engine, "processes" or "ray", and with the address of its cluster."""
+    if engine not in ("processes", "ray"):
+        yield f"engine is {engine!r}; allowed are processes and ray."
+    elif address is not None and engine != "ray":
+        yield f"address is {address!r}, but the engine is {engine!r}; only 'ray' takes one."
+
+
+def imap_with_engine(
+    engine: str,
+    job: Job,
+    items: Sequence[Any],
+    num_workers: int | None,
+    *,
+    address: str | None = None,
+    report: Callable[[int], None] | None = None,
+) -> Iterator[tuple[Any, Any]]:
+    """Apply a job to every item with "processes" of this machine or with "ray".
+
+    Without `num_workers` it is one, or one per CPU of the cluster at `address`.
+    """
+    if engine == "processes":
+        return imap_unordered(job, items, num_workers or 1, report=report)
+    num_workers = num_workers or (1 if address is None else None)
+    return ray_imap_unordered(job, items, num_workers, address=address, report=report)
+
+
 def ray_imap_unordered(
     job: Job,
     items: Sequence[Any],

@@ -12,7 +12,6 @@ from openvima.report import write_report
 from openvima.report.figures import (
     RateCurve,
     RateFigure,
-    RatePanel,
     RatePoint,
     rate_figure_html,
     rate_table,
@@ -96,7 +95,7 @@ def test_the_page_shows_all_of_them(ablated, tmp_path):
 
 def figure() -> RateFigure:
     own = RateCurve("mi<ne", (RatePoint(0.01, 0.2, (0.1, 0.3)), RatePoint(1, 0.5, (0.4, 0.6))))
-    panels = tuple(RatePanel(level, (own, *data_fraction_curves(level))) for level in ("L1", "L4"))
+    panels = {level: (own, *data_fraction_curves(level)) for level in ("L1", "L4")}
     return RateFigure("data", "Success.", "fraction", panels, {0.01: "1 %", 1: "100 %"}, logarithmic=True)
 
 
@@ -124,10 +123,10 @@ def test_the_table_has_a_row_for_each_curve_of_each_panel():
 
 
 def test_charts_tell_measured_from_published_curves_and_share_colours():
-    text = rate_figure_html(figure(), {"mi<ne": "--series-3"})
+    text = rate_figure_html(figure())
     charts = re.findall(r"<svg.*?</svg>", text, flags=re.DOTALL)
     assert len(charts) == 2 and "mi&lt;ne" in text and "mi<ne" not in text
-    assert all("var(--series-3)" in chart for chart in charts)
+    assert all("var(--series-1)" in chart and "var(--series-2)" in chart for chart in charts)
     assert text.count('class="dot hollow"') == 2 and "VIMA 92M (published)" in text
     assert all(chart.count("stroke-dasharray") >= 2 for chart in charts)
     names = re.findall(r'\bid="([^"]*)"', text)

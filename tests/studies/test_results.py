@@ -62,9 +62,9 @@ def test_a_figure_has_the_panels_and_the_axis_of_the_study(
 ) -> None:
     study, _, _, points = made_up(name, tmp_path)
     figure = study_figure(study, points)
-    assert [panel.title for panel in figure.panels] == panels
+    assert list(figure.panels) == panels
     assert figure.named == named
-    assert all(curve.points for panel in figure.panels for curve in panel.curves)
+    assert all(curve.points for curves in figure.panels.values() for curve in curves)
 
 
 @pytest.mark.parametrize("name", ["corrupted-prompts", "level-drop"])

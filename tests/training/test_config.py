@@ -108,6 +108,8 @@ def test_settings_cannot_be_changed_afterwards() -> None:
 def test_an_invalid_choice_is_named() -> None:
     with pytest.raises(ConfigError, match=r"there is no runtime.precision 'float16'"):
         TrainingConfig.of({**FOLDERS, "runtime.precision": "float16"})
+    with pytest.raises(ConfigError, match=r"there is no model.crop_kernel 2\. Allowed: 1, 3\."):
+        TrainingConfig.of({**FOLDERS, "model.crop_kernel": 2})
 
 
 def test_an_unknown_setting_is_named_with_the_nearest_one() -> None:

@@ -30,7 +30,7 @@ from openvima.data.shard import Shard, ShardWriter, remedy
 from openvima.env import TabletopEnv
 from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OracleError, SamplingError
-from openvima.multiprocess import Report, imap_unordered
+from openvima.multiprocess import Report, imap_with_engine
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
 
@@ -270,7 +270,9 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
     for folder in (config.out, config.out / FAILED_FOLDER):
         (folder / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
     try:
-        for _ in _run(config, missing, count):
+        for _ in imap_with_engine(
+            config.engine, write_block, missing, config.workers, address=config.address, report=count
+        ):
             pass  # a block's result is its file
     finally:
         _remove_leftovers(config, own)
@@ -284,17 +286,6 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
 
 def _remove_leftovers(config: GenerateConfig, own: Sequence[Block]) -> None:
     remove_leftovers(config.out, None if config.shard_range is None else [block.path for block in own])
-
-
-def _run(
-    config: GenerateConfig, missing: Sequence[Block], report: Callable[[int], None]
-) -> Iterator[tuple[Block, None]]:
-    if config.engine == "processes":
-        return imap_unordered(write_block, missing, config.workers or 1, report=report)
-    from openvima.multiprocess import ray_imap_unordered
-
-    num_workers = config.workers or (1 if config.address is None else None)
-    return ray_imap_unordered(write_block, missing, num_workers, address=config.address, report=report)
 
 
 def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None:

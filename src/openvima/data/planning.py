@@ -20,7 +20,7 @@ from openvima.data.schema import CODECS
 from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
 from openvima.errors import ConfigError, brief_repr, unknown_name
 from openvima.input_files import settle
-from openvima.multiprocess import MAX_WORKERS
+from openvima.multiprocess import MAX_WORKERS, engine_problems
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.registry import named_tasks
 from openvima.tasks.sampling import MAX_SEED, check_task_options, check_text_form, takes_prompts
@@ -108,10 +108,7 @@ class GenerateConfig:
     def _contradictions(self) -> Iterator[str]:
         if self.compression not in CODECS:
             yield f"compression is {self.compression!r}; allowed are {' and '.join(CODECS)}."
-        if self.engine not in ("processes", "ray"):
-            yield f"engine is {self.engine!r}; allowed are processes and ray."
-        elif self.address is not None and self.engine != "ray":
-            yield f"address is {self.address!r}, but the engine is {self.engine!r}; only 'ray' takes one."
+        yield from engine_problems(self.engine, self.address)
         if self.shard_range is not None:
             start, stop = self.shard_range
             if not 0 <= start < stop:

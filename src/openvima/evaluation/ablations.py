@@ -419,8 +419,13 @@ def scenes_of(ablation: str) -> str:
     Args:
         ablation: As results name it; other names than those of ablations change no scenes.
     """
-    known = [(part, INPUT_ABLATIONS.get(part.partition(":")[0])) for part in ablation.split("+")]
-    return "+".join(part for part, found in known if found is not None and found.changes_scenes)
+    parts = zip(ablation.split("+"), map(INPUT_ABLATIONS.get, names_in(ablation)), strict=True)
+    return "+".join(part for part, found in parts if found is not None and found.changes_scenes)
+
+
+def names_in(text: str) -> list[str]:
+    """Return the parts of an ablation's name without their rates; they need not be known."""
+    return [part.partition(":")[0].strip() for part in text.split("+")]
 
 
 def canonical_ablation(text: str) -> str:

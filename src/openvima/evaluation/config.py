@@ -26,11 +26,13 @@ from openvima.evaluation.ablations import (
     ablation_parts,
     applies_to,
     canonical_ablation,
+    names_in,
 )
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import PolicySource, policy_sources
 from openvima.input_files import as_path, settle
+from openvima.multiprocess import engine_problems
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene.action import steps_per_primitive
 from openvima.serving.chat import DEFAULT_VLM, VlmConfig
@@ -147,12 +149,9 @@ class EvaluationConfig:
                 yield str(error)
         if self.precision is not None and self.precision not in PRECISIONS:
             yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
-        if self.engine not in ("processes", "ray"):
-            yield f"engine is {self.engine!r}; allowed are processes and ray."
+        yield from engine_problems(self.engine, self.address)
 
     def _contradictions(self) -> Iterator[str]:
-        if self.address is not None and self.engine == "processes":
-            yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
         if self.python is not None and not any(
             one.kind == "lerobot" for one in policy_sources(self.policies)
         ):
@@ -189,7 +188,7 @@ class EvaluationConfig:
         unusable = {DETECTED_BOXES, NOISY_BOXES} if extracts else set()
         if self.boxes is None:
             unusable.add(DETECTED_BOXES)
-        return tuple(name for name in self.all_ablations if unusable.isdisjoint(_names_in(name)))
+        return tuple(name for name in self.all_ablations if unusable.isdisjoint(names_in(name)))
 
     @property
     def all_ablations(self) -> tuple[str, ...]:
@@ -198,7 +197,7 @@ class EvaluationConfig:
 
     def uses(self, ablation: str) -> bool:
         """Whether an ablation is named, alone or among others."""
-        return any(ablation in _names_in(name) for name in self.ablations)
+        return any(ablation in names_in(name) for name in self.ablations)
 
     @contextmanager
     def served(self) -> "Iterator[EvaluationConfig]":
@@ -320,10 +319,6 @@ class Batch:
         return replace(self, source=source, env_config=replace(self.env_config, assets=assets), boxes=boxes)
 
 
-def _names_in(ablation: str) -> list[str]:
-    return [part.partition(":")[0].strip() for part in ablation.split("+")]
-
-
 def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]:
     """Pairs of task and level, by level and then by task.
 
@@ -402,7 +397,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             device=config.device,
             ablation=ablation,
             precision=config.precision or "",
-            boxes=(config.boxes or "") if DETECTED_BOXES in _names_in(ablation) else "",
+            boxes=(config.boxes or "") if DETECTED_BOXES in names_in(ablation) else "",
             trust_code=config.trust_code,
             vlm=config.kept_vlm,
         )

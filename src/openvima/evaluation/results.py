@@ -263,19 +263,19 @@ class Results:
 
     def to_json(self) -> str:
         """Return the text of `results.json`; equal results give equal bytes."""
-        invalid, raised = self.invalid_actions(), self.policy_errors()
+        early = {
+            "invalid_actions": ("invalid", self.invalid_actions()),
+            "policy_errors": ("raised", self.policy_errors()),
+        }
         content = {
             "schema": SCHEMA,
             "rows": [_row_record(row) for row in self.rows],
             "levels": [_level_record(mean) for mean in self.level_means()],
-            **(
-                {"invalid_actions": [_early_ends_record(found, "invalid") for found in invalid]}
-                if invalid
-                else {}
-            ),
-            **(
-                {"policy_errors": [_early_ends_record(found, "raised") for found in raised]} if raised else {}
-            ),
+            **{
+                key: [_early_ends_record(each, count) for each in found]
+                for key, (count, found) in early.items()
+                if found
+            },
             "policies": self.policies,
             "config": self.config,
             "versions": self.versions,
@@ -333,7 +333,9 @@ class ResultsFile:
                     f"{path} has schema {echo(repr(content.get('schema')))}; this version reads schema "
                     f"{SCHEMA}. Evaluate again, or read it with the version of openvima that wrote it."
                 )
-            return ResultsFile(_from_content(content), text, content)
+            rows = tuple(_row_from_record(record) for record in content["rows"])
+            described = (content["config"], content["versions"], content["policies"])
+            return ResultsFile(Results(rows, *described, content.get("actions_sha256", "")), text, content)
         except InputFileError as error:
             raise DatasetError(str(error)) from None
         except DatasetError:
@@ -348,13 +350,6 @@ class ResultsFile:
         """The digest that it states; empty without one."""
         stated = self.content.get("sha256", "")
         return stated if isinstance(stated, str) else ""
-
-
-def _from_content(content: Mapping[str, Any]) -> Results:
-    """Read the content of a file."""
-    rows = tuple(_row_from_record(record) for record in content["rows"])
-    described = (content["config"], content["versions"], content["policies"])
-    return Results(rows, *described, content.get("actions_sha256", ""))
 
 
 def _json_text(content: Mapping[str, object]) -> str:

@@ -32,7 +32,7 @@ from openvima.evaluation.rollout_policies import (
 )
 from openvima.evaluation.sources import object_record
 from openvima.input_files import names_of
-from openvima.multiprocess import Report, imap_unordered
+from openvima.multiprocess import Report, imap_with_engine
 from openvima.policies.base import Policy, require_torch
 from openvima.policies.loading import load_policy
 from openvima.policies.naming import PolicyRef
@@ -309,14 +309,10 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Ro
         jobs = [job for job in jobs if job not in chats]
         if not jobs:
             return
-    if config.engine == "processes":
-        yield from imap_unordered(play_batch, jobs, config.workers or 1)
-        return
-    from openvima.multiprocess import ray_imap_unordered
-
-    sent = {replace(job, batch=job.batch.with_whole_paths()): job for job in jobs}
-    workers = config.workers or (1 if config.address is None else None)
-    for job, played in ray_imap_unordered(play_batch, list(sent), workers, address=config.address):
+    whole = config.engine == "ray"  # its workers have other working directories
+    sent = {replace(job, batch=job.batch.with_whole_paths()) if whole else job: job for job in jobs}
+    found = imap_with_engine(config.engine, play_batch, list(sent), config.workers, address=config.address)
+    for job, played in found:
         yield sent[job], played
 
 
@@ -326,12 +322,8 @@ def _play_chats(jobs: Sequence[Job], num_threads: int) -> Iterator[tuple[Job, Ro
     Episodes of all batches overlap, so that the end of one leaves no request unused. Where it is stopped, the
     answers that are on their way are waited for, and kept.
     """
-    policies = {}
-    for job in jobs:
-        if job.batch.source not in policies:
-            policies[job.batch.source] = build_policy(
-                job.batch.source, boxes=job.batch.boxes, vlm=job.batch.vlm
-            )
+    batches = {job.batch.source: job.batch for job in jobs}
+    policies = {source: build_policy(source, boxes=one.boxes, vlm=one.vlm) for source, one in batches.items()}
     with ThreadPoolExecutor(num_threads) as pool:
         playing = [
             (
@@ -363,8 +355,6 @@ def _play_chat(job: Job, policy: VlmPolicy, seed: int) -> tuple[EpisodeOutcome, 
 
 def play_batch(job: Job, count: Callable[[int], None]) -> Rollouts:
     """Run one batch in a worker process, possibly on another machine."""
-    from openvima.evaluation.rollout import play
-
     batch = job.batch
     with one_thread(batch):
         recorder = ActionRecorder(load_rollout_policy(batch, job.fingerprint))

@@ -16,8 +16,10 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 Interval = tuple[float, float]
-Fit = Callable[[float], tuple[float, float]]
+Counts = Sequence[tuple[int, int]]  # (successes, episodes) of each task
+Fit = Callable[[float], list[tuple[float, float]]]
 
+_CONFIDENCE = 0.95
 _HALVINGS = 36  # of the range of multipliers; ends are then exact to about 1e-10
 
 
@@ -26,22 +28,38 @@ def quantile(confidence: float) -> float:
     return NormalDist().inv_cdf(0.5 + confidence / 2)
 
 
-def lower_end(estimate: float, fit: Fit, z: float) -> float:
-    """Find the lower end of a score interval.
+_Z = quantile(_CONFIDENCE)
+
+
+def _lower_end(estimate: float, least: float, played: Sequence[int], fit: Fit) -> float:
+    """Find the lower end of a score interval for an unweighted mean over tasks.
+
+    With one number fitted to each of k tasks and one constraint over all, k - 1 numbers follow the data and
+    make the fitted variances too small, by (k - 1) / k episodes of each task.
 
     Args:
-        estimate: The quantity's estimate without constraint; above the least possible value.
-        fit: Gives for a multiplier above 0 the quantity under the constrained fit, and the variance of its
-            estimate there. The larger the multiplier, the smaller the quantity.
-        z: Standard errors between the end and the estimate.
+        estimate: The mean without constraint.
+        least: The least possible one.
+        played: Episodes of each task.
+        fit: Gives for a multiplier above 0 the constrained fit: mean and variance of a single episode, for
+            each task. The larger the multiplier, the smaller the mean.
 
     Returns:
-        The value that lies `z` of its own standard errors below the estimate.
+        The value that lies `_Z` of its own standard errors below the estimate.
     """
+    if estimate <= least:
+        return least
+    num_tasks = len(played)
+
+    def constrained(multiplier: float) -> tuple[float, float]:
+        fitted = fit(multiplier)
+        mean = sum(value for value, _ in fitted) / num_tasks
+        spread = sum(v / (n - 1 + 1 / num_tasks) for (_, v), n in zip(fitted, played, strict=True))
+        return mean, spread / num_tasks**2
 
     def is_inside(multiplier: float) -> bool:
-        value, variance = fit(multiplier)
-        return (estimate - value) ** 2 <= z * z * variance
+        value, variance = constrained(multiplier)
+        return (estimate - value) ** 2 <= _Z * _Z * variance
 
     inside, outside = 0.0, 1.0
     while is_inside(outside):
@@ -49,23 +67,7 @@ def lower_end(estimate: float, fit: Fit, z: float) -> float:
     for _ in range(_HALVINGS):
         middle = (inside + outside) / 2
         inside, outside = (middle, outside) if is_inside(middle) else (inside, middle)
-    return fit(outside)[0]
-
-
-def mean_and_variance(fitted: Sequence[tuple[float, float]], played: Sequence[int]) -> tuple[float, float]:
-    """Unweighted mean over tasks, and the variance of its estimate.
-
-    With one number fitted to each of k tasks and one constraint over all, k - 1 numbers follow the data and
-    make the fitted variances too small, by (k - 1) / k episodes of each task.
-
-    Args:
-        fitted: Mean and variance of a single episode, for each task.
-        played: Episodes of each task.
-    """
-    num_tasks = len(played)
-    mean = sum(value for value, _ in fitted) / num_tasks
-    spread = sum(v / (n - 1 + 1 / num_tasks) for (_, v), n in zip(fitted, played, strict=True))
-    return mean, spread / num_tasks**2
+    return constrained(outside)[0]
 
 
 def wilson_interval(successes: int, episodes: int, confidence: float = 0.95) -> Interval:
@@ -98,8 +100,8 @@ def wilson_interval(successes: int, episodes: int, confidence: float = 0.95) -> 
     return low, high
 
 
-def mean_of_rates(counts: Sequence[tuple[int, int]], confidence: float = 0.95) -> tuple[float, Interval]:
-    """Unweighted mean of several success rates, with an interval.
+def mean_of_rates(counts: Counts) -> tuple[float, Interval]:
+    """Unweighted mean of several success rates, with a 95 % interval.
 
     The interval is Wilson's, carried over to a mean: it holds every mean that lies within z standard errors
     of the observed one, these taken from the rates that are most likely if that were the true mean. For one
@@ -107,7 +109,6 @@ def mean_of_rates(counts: Sequence[tuple[int, int]], confidence: float = 0.95) -
 
     Args:
         counts: (successes, episodes) of each task.
-        confidence: As for `wilson_interval`.
 
     Returns:
         The mean and its interval, as fractions.
@@ -116,24 +117,22 @@ def mean_of_rates(counts: Sequence[tuple[int, int]], confidence: float = 0.95) -
         own Wilson intervals in squares is simpler, but covers too rarely near 0 and 100 %: see
         docs/reports.md.
     """
-    z = quantile(confidence)
-    mean = sum(successes / episodes for successes, episodes in counts) / len(counts)
     failures = [(episodes - successes, episodes) for successes, episodes in counts]
-    return mean, (_lowest_mean(counts, z), 1 - _lowest_mean(failures, z))
+    return _mean_rate(counts), (_lowest_mean(counts), 1 - _lowest_mean(failures))
 
 
-def _lowest_mean(counts: Sequence[tuple[int, int]], z: float) -> float:
+def _mean_rate(counts: Counts) -> float:
+    return sum(successes / episodes for successes, episodes in counts) / len(counts)
+
+
+def _lowest_mean(counts: Counts) -> float:
     """Lower end of the interval of a mean."""
-    estimate = sum(successes / episodes for successes, episodes in counts) / len(counts)
-    if estimate <= 0:
-        return 0.0
-    played = [episodes for _, episodes in counts]
 
-    def fit(multiplier: float) -> tuple[float, float]:
+    def fit(multiplier: float) -> list[tuple[float, float]]:
         rates = [_likely_rate(*count, multiplier) for count in counts]
-        return mean_and_variance([(rate, rate * (1 - rate)) for rate in rates], played)
+        return [(rate, rate * (1 - rate)) for rate in rates]
 
-    return lower_end(estimate, fit, z)
+    return _lower_end(_mean_rate(counts), 0.0, [episodes for _, episodes in counts], fit)
 
 
 def _likely_rate(successes: int, episodes: int, multiplier: float) -> float:
@@ -190,16 +189,15 @@ class PairCounts:
         return (self.only_a - self.only_b) / self.episodes
 
 
-def mean_difference(counts: Sequence[PairCounts], confidence: float = 0.95) -> tuple[float, Interval]:
+def mean_difference(counts: Sequence[PairCounts]) -> tuple[float, Interval]:
     """Unweighted mean over tasks of the differences of two success rates on the same episodes.
 
-    For one task the interval is Tango's. For several it holds every mean difference that lies within z
+    For one task the 95 % interval is Tango's. For several it holds every mean difference that lies within z
     standard errors of the observed one, these taken from the probabilities that are most likely if that were
     the true one.
 
     Args:
         counts: Outcomes on each task.
-        confidence: Nominal coverage, between 0 and 1.
 
     Returns:
         The mean of a minus b, and its interval, as fractions.
@@ -212,9 +210,8 @@ def mean_difference(counts: Sequence[PairCounts], confidence: float = 0.95) -> t
     Source: T. Tango, "Equivalence test and confidence interval for the difference in proportions for the
         paired-sample design", 1998; for several tasks the same principle with one constraint over all.
     """
-    z = quantile(confidence)
-    difference = sum(count.difference for count in counts) / len(counts)
-    return difference, (_lowest_difference(counts, z), -_lowest_difference([c.swapped for c in counts], z))
+    swapped = [count.swapped for count in counts]
+    return _mean_of_differences(counts), (_lowest_difference(counts), -_lowest_difference(swapped))
 
 
 def mcnemar(only_a: int, only_b: int) -> tuple[float, float]:
@@ -248,18 +245,18 @@ def mcnemar(only_a: int, only_b: int) -> tuple[float, float]:
     return 2 * tail / everything, (2 * tail - ways) / everything
 
 
-def _lowest_difference(counts: Sequence[PairCounts], z: float) -> float:
+def _mean_of_differences(counts: Sequence[PairCounts]) -> float:
+    return sum(count.difference for count in counts) / len(counts)
+
+
+def _lowest_difference(counts: Sequence[PairCounts]) -> float:
     """Lower end of the interval of a mean difference."""
-    estimate = sum(count.difference for count in counts) / len(counts)
-    if estimate <= -1:
-        return -1.0
-    played = [count.episodes for count in counts]
 
-    def fit(multiplier: float) -> tuple[float, float]:
+    def fit(multiplier: float) -> list[tuple[float, float]]:
         likely = [_likely_pair(count, multiplier) for count in counts]
-        return mean_and_variance([(a - b, max(0.0, a + b - (a - b) ** 2)) for a, b in likely], played)
+        return [(a - b, max(0.0, a + b - (a - b) ** 2)) for a, b in likely]
 
-    return lower_end(estimate, fit, z)
+    return _lower_end(_mean_of_differences(counts), -1.0, [count.episodes for count in counts], fit)
 
 
 def _likely_pair(counts: PairCounts, multiplier: float) -> tuple[float, float]:
@@ -316,7 +313,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 _QUANTILE_HALVINGS = 60
-Counts = Sequence[tuple[int, int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,7 +336,7 @@ class SeedMean:
     training_sd: float | None
 
 
-def mean_over_seeds(counts: Sequence[Counts], confidence: float = 0.95) -> SeedMean:
+def mean_over_seeds(counts: Sequence[Counts]) -> SeedMean:
     """Average the success rates of several trainings.
 
     The interval spans two: Student's of the means of the seeds, whose variance holds both sources, and the
@@ -348,34 +344,28 @@ def mean_over_seeds(counts: Sequence[Counts], confidence: float = 0.95) -> SeedM
     With one seed it is the latter, and says nothing on other seeds.
 
     Args:
-        counts: For each seed (successes, episodes) of each task, tasks in the same order.
-        confidence: Nominal coverage, between 0 and 1.
+        counts: For each seed those of each task, tasks in the same order.
 
     Source: variance components of a one-way random-effects model, S. R. Searle et al., "Variance Components",
         1992; Student's interval, "Student", 1908. Seeds apart from test noise: X. Bouthillier et al.,
         "Accounting for variance in machine learning benchmarks", 2021.
     """
-    seeds = tuple(mean_of_rates(of_seed, confidence) for of_seed in counts)
+    seeds = tuple(map(mean_of_rates, counts))
     pooled = [(sum(s for s, _ in task), sum(n for _, n in task)) for task in zip(*counts, strict=True)]
-    mean, interval = mean_of_rates(pooled, confidence)
+    mean, interval = mean_of_rates(pooled)
     means = [seed for seed, _ in seeds]
     episode_variance = sum(map(_episode_variance, counts)) / len(counts)
     sd = _sd(means)
-    low, high = _spanning(interval, _student_interval(means, confidence))
     training_sd = None if sd is None else math.sqrt(max(0.0, sd * sd - episode_variance))
-    return SeedMean(
-        mean, (max(0.0, low), min(1.0, high)), seeds, sd, math.sqrt(episode_variance), training_sd
-    )
+    interval = _widen(interval, means, least=0.0)
+    return SeedMean(mean, interval, seeds, sd, math.sqrt(episode_variance), training_sd)
 
 
-def difference_over_seeds(
-    pairs: Sequence[Sequence[PairCounts]], confidence: float = 0.95
-) -> tuple[float, Interval]:
+def difference_over_seeds(pairs: Sequence[Sequence[PairCounts]]) -> tuple[float, Interval]:
     """Average the difference of two success rates over seeds, each pair evaluated on the same episodes.
 
     Args:
         pairs: For each seed the outcomes on each task, tasks in the same order.
-        confidence: Nominal coverage, between 0 and 1.
 
     Returns:
         The mean of a minus b, and its interval: that of `mean_difference` over all episodes, widened to
@@ -385,10 +375,8 @@ def difference_over_seeds(
         PairCounts(*(sum(getattr(p, name) for p in task) for name in PairCounts.__slots__))
         for task in zip(*pairs, strict=True)
     ]
-    difference, interval = mean_difference(pooled, confidence)
-    each = [sum(p.difference for p in of_seed) / len(of_seed) for of_seed in pairs]
-    low, high = _spanning(interval, _student_interval(each, confidence))
-    return difference, (max(-1.0, low), min(1.0, high))
+    difference, interval = mean_difference(pooled)
+    return difference, _widen(interval, list(map(_mean_of_differences, pairs)), least=-1.0)
 
 
 def student_quantile(confidence: float, degrees: int) -> float:
@@ -423,19 +411,14 @@ def _within(angle: float, degrees: int) -> float:
     return 2 / math.pi * (angle + total) if odd else total
 
 
-def _student_interval(values: Sequence[float], confidence: float) -> Interval | None:
+def _widen(interval: Interval, values: Sequence[float], *, least: float) -> Interval:
+    """Widen an interval to Student's of the values of several seeds, between `least` and 1."""
     sd = _sd(values)
     if sd is None:
-        return None
-    mean = sum(values) / len(values)
-    half = student_quantile(confidence, len(values) - 1) * sd / math.sqrt(len(values))
-    return mean - half, mean + half
-
-
-def _spanning(interval: Interval, other: Interval | None) -> Interval:
-    if other is None:
         return interval
-    return min(interval[0], other[0]), max(interval[1], other[1])
+    mean = sum(values) / len(values)
+    half = student_quantile(_CONFIDENCE, len(values) - 1) * sd / math.sqrt(len(values))
+    return max(least, min(interval[0], mean - half)), min(1.0, max(interval[1], mean + half))
 
 
 def _sd(values: Sequence[float]) -> float | None:

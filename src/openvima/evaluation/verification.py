@@ -97,8 +97,6 @@ def verify_results(
         AssetError: The results name a function as their assets; pass it as `assets`.
     """
     path = folder / FILE_NAME
-    if not path.is_file():
-        raise DatasetError(f"there is no {path}; give the folder of an evaluation.")
     file = ResultsFile.read(path)
     results = file.results
     try:

@@ -1,23 +1,57 @@
-"""Types and limits of config fields, checked before a network is built from a file."""
+"""Types and limits of the fields of configs and settings, which may come from a file."""
 
-import math
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from numbers import Integral, Real
+from pathlib import Path
 from reprlib import repr as short
 from types import NoneType, UnionType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, unknown_name
 
-# Largest whole numbers by name of the field; the largest published policy has 22 layers 768 wide.
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Smallest and largest allowed value of a number; None means no upper bound."""
+
+    low: float
+    high: float | None = None
+
+
+# Allowed type of values, and its name in messages.
+_TYPES = {
+    int: (Integral, "a whole number"),
+    float: (Real, "a number"),
+    bool: (bool, "true or false"),
+    str: (str, "text"),
+    Path: (Path, "a path (in YAML, quote digits)"),
+}
+# Largest whole numbers in networks by name of the field; the largest published policy has 22 layers 768 wide.
 _LIMITS = {"num_layers": 128, "num_blocks": 128, "depths": 128, "vocabulary_size": 1_000_000}
 MAX_WIDTH = 16_384  # of all other fields
 _MAX_LENGTH = 16  # of lists
 _MAX_FLOAT = 1e6
 
 
+def problems_of(config: object, prefix: str = "", *, of_network: bool = False) -> Iterator[str]:
+    """Yield a message for each invalid field, those of nested configs included.
+
+    Args:
+        config: A dataclass whose annotations define allowed values.
+        prefix: Prefix of field names.
+        of_network: Whether its numbers are limited as those of networks are.
+    """
+    for name, hint in get_type_hints(type(config), include_extras=True).items():
+        value = getattr(config, name)
+        if is_dataclass(value):
+            yield from problems_of(value, f"{prefix}{name}.", of_network=of_network)
+        elif problem := _problem(prefix + name, value, hint, of_network=of_network):
+            yield problem
+
+
 def check_limits(config: object, where: str) -> None:
-    """Check the fields of a config and of the configs in it.
+    """Check the config of a network, before it is built.
 
     Args:
         config: A dataclass.
@@ -26,51 +60,45 @@ def check_limits(config: object, where: str) -> None:
     Raises:
         ConfigError: A field has the wrong type or lies beyond its limit.
     """
-    for name, hint in get_type_hints(type(config)).items():
-        if is_dataclass(value := getattr(config, name)):
-            check_limits(value, f"{where}.{name}")
-        else:
-            check_field(hint, value, f"{where}.{name}")
+    for problem in problems_of(config, f"{where}.", of_network=True):
+        raise ConfigError(problem)
 
 
-def check_field(hint: Any, value: Any, where: str) -> None:
-    """Check one value against its annotation; configs inside configs are not checked.
+def options_of(hint: Any) -> tuple[Any, ...]:
+    """Return the types that an annotation allows."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
-    Raises:
-        ConfigError: It has the wrong type or lies beyond its limit.
-    """
-    options = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+
+def _problem(name: str, value: Any, hint: Any, *, of_network: bool) -> str | None:
+    options, limits = options_of(hint), None
     kind = options[0]
-    if is_dataclass(kind) or (value is None and NoneType in options):
-        return
+    if get_origin(kind) is Annotated:
+        kind, limits = get_args(kind)[:2]
+    if value is None and NoneType in options:
+        return None
+    if get_origin(kind) is Literal:
+        choices = get_args(kind)
+        return None if value in choices else unknown_name(name, value, map(str, choices))
     if get_origin(kind) is tuple:
         if not isinstance(value, list | tuple) or len(value) > _MAX_LENGTH:
-            raise ConfigError(
-                f"{where} is {short(value)}; it must be a list of at most {_MAX_LENGTH} numbers."
-            )
-        for item in value:
-            check_field(get_args(kind)[0], item, where)
-        return
-    allowed = _allowed(kind, value, where.rpartition(".")[2])
-    if allowed is not None:
-        raise ConfigError(f"{where} is {short(value)}; it must be {allowed}.")
-
-
-def _allowed(kind: Any, value: Any, name: str) -> str | None:
-    """Return what is allowed instead of a value; None if it is allowed."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if get_origin(kind) is Literal:
-        return None if value in get_args(kind) else " or ".join(map(repr, get_args(kind)))
-    if kind is bool:
-        return None if isinstance(value, bool) else "true or false"
-    if kind is int:
-        limit = _LIMITS.get(name, MAX_WIDTH)
-        fits = is_number and isinstance(value, int) and 0 <= value <= limit
-        return None if fits else f"a whole number between 0 and {limit}"
-    if kind is float:
-        fits = is_number and math.isfinite(value) and abs(value) <= _MAX_FLOAT
-        return None if fits else f"a number between {-_MAX_FLOAT:g} and {_MAX_FLOAT:g}"
-    return None
+            return f"{name} is {short(value)}; it must be a list of at most {_MAX_LENGTH} numbers."
+        found = (_problem(name, item, get_args(kind)[0], of_network=of_network) for item in value)
+        return next(filter(None, found), None)
+    if kind not in _TYPES:
+        return None
+    expected, called = _TYPES[kind]
+    if not isinstance(value, expected) or (isinstance(value, bool) and kind is not bool):
+        return f"{name} is {short(value)}; it must be {called}."
+    if of_network and kind is int:
+        limits = Range(0, _LIMITS.get(name.rpartition(".")[2], MAX_WIDTH))
+    elif of_network and kind is float:
+        limits = Range(-_MAX_FLOAT, _MAX_FLOAT)
+    if limits is None or (limits.low <= value and (limits.high is None or value <= limits.high)):
+        return None
+    allowed = f"at least {limits.low:g}"
+    if limits.high is not None:
+        allowed = f"between {limits.low:g} and {limits.high:g}"
+    return f"{name} is {short(value)}; it must be {allowed}."
 
 
 def build_config(kind: type, values: Any, where: str) -> Any:
@@ -95,7 +123,8 @@ def build_config(kind: type, values: Any, where: str) -> Any:
     if unknown:
         raise ConfigError(f"{where} has unknown fields {', '.join(unknown)}; allowed: {', '.join(names)}.")
     for name, value in values.items():
-        check_field(hints[name], value, f"{where}.{name}")
+        if problem := _problem(f"{where}.{name}", value, hints[name], of_network=True):
+            raise ConfigError(problem)
     arguments = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
     try:
         return kind(**arguments)

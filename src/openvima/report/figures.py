@@ -52,27 +52,15 @@ class RateCurve:
 
 
 @dataclass(frozen=True, slots=True)
-class RatePanel:
-    """Curves that share one pair of axes, such as those of a level.
-
-    Args:
-        title: Its title.
-        curves: Those of one name have one colour, and one row in the table.
-    """
-
-    title: str
-    curves: tuple[RateCurve, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class RateFigure:
-    """Panels over the same quantity.
+    """Panels over the same quantity, such as one of each level.
 
     Args:
         label: Short name of letters, digits and hyphens, unique in a page.
         caption: What is shown.
         quantity: The quantity with its unit: label of the horizontal axis.
-        panels: One chart each.
+        panels: Curves by the title of their chart; those of one name have one colour, and one row in the
+            table.
         ticks: Names of values of the quantity, where they are not plain numbers.
         logarithmic: Whether the horizontal axis is.
         named: Whether values are 0, 1, 2, … for the names in `ticks`, in any order: curves are not joined.
@@ -81,7 +69,7 @@ class RateFigure:
     label: str
     caption: str
     quantity: str
-    panels: tuple[RatePanel, ...]
+    panels: Mapping[str, tuple[RateCurve, ...]]
     ticks: Mapping[float, str] = field(default_factory=dict)
     logarithmic: bool = False
     named: bool = False
@@ -89,8 +77,13 @@ class RateFigure:
     @property
     def curves(self) -> dict[str, RateCurve]:
         """One curve of each name, measured ones first."""
-        all_curves = [curve for panel in self.panels for curve in panel.curves]
+        all_curves = [curve for curves in self.panels.values() for curve in curves]
         return {curve.name: curve for curve in sorted(all_curves, key=lambda curve: curve.published)}
+
+    @property
+    def values(self) -> list[float]:
+        """All values of the quantity, ascending."""
+        return sorted({p.x for curves in self.panels.values() for curve in curves for p in curve.points})
 
     def tick(self, x: float) -> str:
         """Name of a value of the quantity."""
@@ -99,19 +92,14 @@ class RateFigure:
 
 def rate_table(figure: RateFigure) -> Table:
     """Write the numbers of a figure as a table: a row for each curve of each panel."""
-    values = sorted({p.x for panel in figure.panels for curve in panel.curves for p in curve.points})
     lines = []
-    for panel in figure.panels:
-        for index, (name, published) in enumerate(
-            {curve.name: curve.published for curve in panel.curves}.items()
-        ):
-            points = {
-                point.x: point for curve in panel.curves if curve.name == name for point in curve.points
-            }
-            cells = [_cell(points[x]) if x in points else "–" for x in values]
+    for title, curves in figure.panels.items():
+        for index, (name, published) in enumerate({c.name: c.published for c in curves}.items()):
+            points = {point.x: point for curve in curves if curve.name == name for point in curve.points}
+            cells = [_cell(points[x]) if x in points else "–" for x in figure.values]
             shown = f"{name} (published)" if published else name
-            lines.append(Line(shown, (panel.title, *cells), starts_group=index == 0 and bool(lines)))
-    columns = ("policy", "level", *map(figure.tick, values))
+            lines.append(Line(shown, (title, *cells), starts_group=index == 0 and bool(lines)))
+    columns = ("policy", "level", *map(figure.tick, figure.values))
     caption = f"{figure.caption} Columns: {figure.quantity}. Rates in %, with 95 % intervals."
     return Table(figure.label, caption, columns, tuple(lines))
 
@@ -177,22 +165,23 @@ def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str
     return _themed(figure, f"level-{level}", f"Success rates at level {level}", colours.values())
 
 
-def rate_chart(rates: RateFigure, index: int, colours: Mapping[str, str]) -> str:
+def rate_chart(rates: RateFigure, title: str, name: str, colours: Mapping[str, str]) -> str:
     """Draw one panel of success rates over a quantity; published ones are dashed, with hollow dots.
 
     Args:
         rates: The figure.
-        index: Which of its panels.
+        title: That of one of its panels.
+        name: Put before the names of its elements; no other chart of the page may have it.
         colours: Name of each curve to the CSS variable of its colour.
 
     Returns:
         An `<svg>` element.
     """
-    panel = rates.panels[index]
+    curves = rates.panels[title]
     figure, axes = _panel(3.6 if rates.named else 2.6)
-    for number, curve in enumerate(panel.curves):
+    for number, curve in enumerate(curves):
         colour = _series(colours[curve.name])
-        shift = _DODGE * (number - (len(panel.curves) - 1) / 2) if rates.named else 0.0
+        shift = _DODGE * (number - (len(curves) - 1) / 2) if rates.named else 0.0
         style: dict[str, Any] = {"linewidth": 1.8, "markersize": 4.5}
         if curve.published:
             style = {"linestyle": (0, (3, 2)), "linewidth": 1.2, "markerfacecolor": "none", "markersize": 4}
@@ -206,15 +195,13 @@ def rate_chart(rates: RateFigure, index: int, colours: Mapping[str, str]) -> str
             axes.vlines(x, *_percent(point.interval or (0, 0)), color=colour, linewidth=2.4, alpha=0.4)
     if rates.logarithmic:
         axes.set_xscale("log")
-    ticks = sorted({p.x for each in rates.panels for curve in each.curves for p in curve.points})
     tilt: Any = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if rates.named else {}
-    axes.set_xticks(ticks, [rates.tick(x) for x in ticks], **tilt)
+    axes.set_xticks(rates.values, list(map(rates.tick, rates.values)), **tilt)
     axes.set_xticks([], minor=True)
     axes.set_ylim(-3, 103)
     axes.set_yticks(*_PERCENT_TICKS)
     axes.set_xlabel(rates.quantity)
-    title = f"{rates.caption} {panel.title}"
-    return _themed(figure, f"{rates.label}-{index}", title, [colours[c.name] for c in panel.curves])
+    return _themed(figure, name, f"{rates.caption} {title}", [colours[curve.name] for curve in curves])
 
 
 def curve_chart(
@@ -310,12 +297,11 @@ def _themed(figure: Any, name: str, title: str, variables: Iterable[str]) -> str
 _COLOURS = tuple(f"--series-{name}" for name in (1, 2, 3, 4, 5, 6, "untrained", "random", "oracle"))
 
 
-def rate_figure_html(figure: RateFigure, colours: Mapping[str, str] | None = None) -> str:
+def rate_figure_html(figure: RateFigure) -> str:
     """Draw a figure: legend, one chart a panel, and its numbers in a table to unfold.
 
     Args:
         figure: The figure.
-        colours: CSS variables of curves that have a colour already, such as "--series-1".
 
     Returns:
         An HTML fragment for a page with the package's style sheet.
@@ -323,14 +309,15 @@ def rate_figure_html(figure: RateFigure, colours: Mapping[str, str] | None = Non
     Raises:
         MissingExtraError: matplotlib or Jinja is not installed.
     """
-    known = {name: colour for name, colour in (colours or {}).items() if name in figure.curves}
-    free = cycle([colour for colour in _COLOURS if colour not in known.values()] or _COLOURS)
-    known |= {name: next(free) for name in figure.curves if name not in known}
+    colours = dict(zip(figure.curves, cycle(_COLOURS), strict=False))
     return render_page(
         "report/rate_figure",
         figure=figure,
-        colours=known,
-        charts=[rate_chart(figure, index, known) for index in range(len(figure.panels))],
+        colours=colours,
+        charts=[
+            rate_chart(figure, title, f"{figure.label}-{number}", colours)
+            for number, title in enumerate(figure.panels)
+        ],
         table=rate_table(figure),
     )
 

@@ -1,7 +1,7 @@
 """The tables of an evaluation: means by level, family and task, ablations, differences, failures."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from openvima.evaluation.comparison import (
     can_be_compared,
     compare_pairs,
 )
-from openvima.evaluation.results import LevelMean, Results
+from openvima.evaluation.results import Results
 from openvima.evaluation.statistics import Interval, mean_of_rates
 from openvima.policies.naming import ORACLE
 from openvima.report.published import (
@@ -106,7 +106,7 @@ def family_table(results: Results, *, published: bool = True) -> Table:
     lines = []
     for level in results.levels():
         for index, (family, tasks) in enumerate(_tasks(results, level).items()):
-            cells = [_mean(results, policy, level, tasks) for policy in policies]
+            cells = [_mean(results, policy, level, tasks=tasks) for policy in policies]
             rate = published_rate(level, tasks) if published else None
             elsewhere = ["–" if rate is None else f"{rate:.1f}"] if published else []
             name = f"{family_name(family)} ({len(tasks)})"
@@ -135,8 +135,13 @@ def _families(task: str) -> tuple[str, ...]:
         return ()
 
 
-def _mean(results: Results, policy: str, level: str, tasks: list[str]) -> Estimate | str:
-    rows = [row for task in tasks if (row := results.row(policy, task, level))]
+def _mean(
+    results: Results, policy: str, level: str, ablation: str = "", *, tasks: Sequence[str] = ()
+) -> Estimate | str:
+    """Mean over tasks, by default all of the level; with their number where some are lacking."""
+    tasks = tasks or results.tasks(level)
+    wanted = (policy, level, ablation)
+    rows = [r for r in results.rows if (r.policy, r.level, r.ablation) == wanted and r.task in tasks]
     if not rows:
         return "–"
     mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
@@ -149,7 +154,6 @@ def family_name(family: str) -> str:
     return family.replace("_", " ").replace("one shot", "one-shot")
 
 
-_Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
 _CONFIRMED = "Measured outcomes are confirmed by replaying the recorded actions; who acted is declared."
 _UNCONFIRMED = "Outcomes are not confirmed by replay, as `openvima verify-results` does."
 _NOISE_MARK, _WEAK_MARK = "≈", "?"
@@ -170,13 +174,11 @@ def paper_tables(
         published: Whether to add published level means of the same tasks, unless prompts or tasks differ.
         confirmed: Whether all outcomes were confirmed by replay, which captions then say.
     """
-    means = results.means()
     published = published and is_comparable(results)
-    by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
     chosen = [
-        _mean_table(results, means, published=published),
+        _mean_table(results, published=published),
         family_table(results, published=published),
-        *by_policy,
+        *[_task_table(results, policy) for policy in results.policy_names()],
         published_task_table(results) if published else None,
         *ablation_tables(results),
         *map(_difference_table, comparisons),
@@ -189,7 +191,7 @@ def paper_tables(
 
 def compact_tables(results: Results, *, published: bool = True) -> list[Table]:
     """Means by level alone, the best policy of each level in bold; the oracle, an upper bound, is none."""
-    table = _mean_table(results, results.means(), published=published and is_comparable(results))
+    table = _mean_table(results, published=published and is_comparable(results))
     rivals = [n for n in results.policy_names() if results.policies.get(n, {}).get("kind") != ORACLE]
     for column in range(len(results.levels())):
         measured = [line.cells[column] for line in table.lines if line.name in rivals]
@@ -207,13 +209,10 @@ def _emphasise(line: Line, column: int, best: float | None, rivals: Sequence[str
     return replace(line, cells=tuple(cells))
 
 
-def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
+def _mean_table(results: Results, *, published: bool) -> Table:
     levels = results.levels()
     lines = [
-        Line(
-            policy,
-            tuple(_mean_cell(means.get((policy, "", level)), len(results.tasks(level))) for level in levels),
-        )
+        Line(policy, tuple(_mean(results, policy, level) for level in levels))
         for policy in results.policy_names()
     ]
     sizes = ", ".join(f"{len(results.tasks(level))} at {level}" for level in levels)
@@ -235,7 +234,7 @@ def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
 
 def result_table(results: Results) -> Table:
     """Success rates of all policies by level and task, with the mean of each level."""
-    policies, means = results.policy_names(), results.means()
+    policies = results.policy_names()
     lines: list[Line] = []
     for level in results.levels():
         tasks = results.tasks(level)
@@ -243,8 +242,7 @@ def result_table(results: Results) -> Table:
             rows = [results.row(policy, task, level) for policy in policies]
             cells = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
             lines.append(Line(level, (task, *cells), starts_group=bool(lines) and task == tasks[0]))
-        own = [_mean_cell(means.get((policy, "", level)), len(tasks)) for policy in policies]
-        lines.append(Line(level, ("mean", *own)))
+        lines.append(Line(level, ("mean", *(_mean(results, policy, level) for policy in policies))))
         if horizon := oracle_horizon_means(results, level):
             cells = [Estimate(*mean) if mean else "–" for mean in horizon]
             lines.append(Line(level, ("mean within the oracle's steps", *cells)))
@@ -256,32 +254,29 @@ def result_table(results: Results) -> Table:
 def ablation_tables(results: Results) -> list[Table]:
     """Level means of each policy that was evaluated with input ablations, plain and under each of them."""
     ablated = dict.fromkeys(row.policy for row in results.rows if row.ablation)
-    return [_ablation_table(results, results.means(), policy) for policy in ablated]
+    return [_ablation_table(results, policy) for policy in ablated]
 
 
-def _task_table(results: Results, means: _Means, policy: str) -> Table:
-    levels = [level for level in results.levels() if any(r.level == level for r in _plain(results, policy))]
-    tasks = list(dict.fromkeys(row.task for row in _plain(results, policy)))
-    lines = []
-    for task in tasks:
-        rows = [results.row(policy, task, level) for level in levels]
-        lines.append(Line(task, tuple(Estimate(row.rate, row.interval) if row else "–" for row in rows)))
-    cells = tuple(_mean_cell(means.get((policy, "", level)), 0) for level in levels)
-    lines.append(Line("mean", cells, starts_group=True))
+def _task_table(results: Results, policy: str) -> Table:
+    rows = [row for row in results.rows if (row.policy, row.ablation) == (policy, "")]
+    levels = [level for level in results.levels() if any(row.level == level for row in rows)]
+    tasks = list(dict.fromkeys(row.task for row in rows))
+    cells = {(row.task, row.level): Estimate(row.rate, row.interval) for row in rows}
+    lines = [Line(task, tuple(cells.get((task, level), "–") for level in levels)) for task in tasks]
+    played = {level: [task for task in tasks if (task, level) in cells] for level in levels}
+    means = (_mean(results, policy, level, tasks=own) for level, own in played.items())
+    lines.append(Line("mean", tuple(means), starts_group=True))
     caption = f"Success rates of {policy} (%), with 95 % intervals. {_made_of(results, policy)}"
     return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
 
 
-def _ablation_table(results: Results, means: _Means, policy: str) -> Table:
+def _ablation_table(results: Results, policy: str) -> Table:
     levels = results.levels()
     ablations = dict.fromkeys(row.ablation for row in results.rows if row.policy == policy)
     lines = [
         Line(
             ablation_name(ablation) if ablation else "none",
-            tuple(
-                _mean_cell(means.get((policy, ablation, level)), len(results.tasks(level)))
-                for level in levels
-            ),
+            tuple(_mean(results, policy, level, ablation) for level in levels),
         )
         for ablation in ablations
     ]
@@ -319,18 +314,6 @@ def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
         f"{difference.p_holm:.2g}",
     )
     return Line(difference.task or f"mean of {len(difference.pairs)}", cells, starts_group)
-
-
-def _plain(results: Results, policy: str) -> list:
-    return [row for row in results.rows if (row.policy, row.ablation) == (policy, "")]
-
-
-def _mean_cell(mean: LevelMean | None, num_tasks: int) -> Estimate | str:
-    """A mean, with the number of its tasks where it is not that of the level."""
-    if mean is None:
-        return "–"
-    fewer = f"{len(mean.tasks)} of {num_tasks} tasks" if len(mean.tasks) < num_tasks else ""
-    return Estimate(mean.mean, mean.interval, mark=fewer)
 
 
 def _made_of(results: Results, policy: str | None = None) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from openvima.errors import cut
-from openvima.evaluation.ablations import INPUT_ABLATIONS
+from openvima.evaluation.ablations import INPUT_ABLATIONS, names_in
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import DECLARED, Results
 from openvima.evaluation.sources import TRAINED_KINDS
@@ -61,7 +61,7 @@ def ablation_name(ablation: str) -> str:
 
 def ablation_descriptions(ablations: Iterable[str]) -> dict[str, str]:
     """One sentence on each input ablation by its name as words, without rates and each of several apart."""
-    names = dict.fromkeys(part.partition(":")[0] for ablation in ablations for part in ablation.split("+"))
+    names = dict.fromkeys(name for ablation in ablations for name in names_in(ablation))
     return {
         ablation_name(name): INPUT_ABLATIONS[name].description
         if name in INPUT_ABLATIONS

@@ -16,7 +16,7 @@ from openvima.evaluation.statistics import (
 from openvima.html import render_page
 from openvima.input_files import read_json
 from openvima.report import text
-from openvima.report.figures import RateCurve, RateFigure, RatePanel, RatePoint, rate_figure_html
+from openvima.report.figures import RateCurve, RateFigure, RatePoint, rate_figure_html
 from openvima.report.published import RELIABILITY
 from openvima.report.text import ablation_name
 from openvima.studies.plan import COST_FILE, Plan
@@ -203,7 +203,7 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
     """
     values = list(dict.fromkeys([p.x for p in points] + [p.x for p in study.published]))
     named = any(isinstance(value, str) for value in values)
-    panels = []
+    panels = {}
     for level in [""] if study.x_axis == "level" else dict.fromkeys(point.level for point in points):
         curves: dict[tuple[str, bool], list[RatePoint]] = {}
         for point in points:
@@ -216,16 +216,15 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
             if level in ("", point.level):
                 found = RatePoint(_number(point.x, values, named), point.rate, mark=point.mark)
                 curves.setdefault((point.series, True), []).append(found)
-        of_level = (
+        panels[level or "All levels"] = tuple(
             RateCurve(name, tuple(sorted(of_name, key=lambda point: point.x)), published)
             for (name, published), of_name in curves.items()
         )
-        panels.append(RatePanel(level or "All levels", tuple(of_level)))
     return RateFigure(
         label="study",
         caption=study.question,
         quantity=study.quantity,
-        panels=tuple(panels),
+        panels=panels,
         ticks={float(index): str(value) for index, value in enumerate(values)} if named else study.ticks,
         logarithmic=study.logarithmic,
         named=named,

@@ -1,7 +1,7 @@
 """Running a study: stage after stage, each of which resumes after any kill."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,9 +13,9 @@ from openvima.data.manifest import is_finished
 from openvima.data.subsets import SubsetConfig, sample
 from openvima.errors import ConfigError, InputFileError, differences
 from openvima.evaluation.results import Results
-from openvima.evaluation.runner import evaluate_prepared, prepare
+from openvima.evaluation.runner import evaluate, prepare
 from openvima.input_files import as_path, read_json
-from openvima.multiprocess import Report, check_workers, imap_unordered
+from openvima.multiprocess import Report, check_workers, engine_problems, imap_with_engine
 from openvima.policies.base import require_torch
 from openvima.report.videos import require_extra
 from openvima.studies.plan import COST_FILE, Evaluation, Plan, Subset, Training, plan_study, record_of
@@ -49,23 +49,13 @@ class Execution:
     def __post_init__(self) -> None:
         if self.workers is not None:
             check_workers(self.workers)
-        if self.address is not None and self.engine != "ray":
-            raise ConfigError(f"address is {self.address!r}, but only the engine ray takes one.")
+        if problems := list(engine_problems(self.engine, self.address)):
+            raise ConfigError(*problems)
 
     @property
     def is_serial(self) -> bool:
         """Whether all work is done in this process."""
         return self.engine == "processes" and self.workers in (None, 1)
-
-    def imap(self, job: Callable[..., Any], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
-        """Apply a job to every item."""
-        if self.engine == "processes":
-            yield from imap_unordered(job, items, self.workers or 1)
-            return
-        from openvima.multiprocess import ray_imap_unordered
-
-        workers = self.workers or (1 if self.address is None else None)
-        yield from ray_imap_unordered(job, items, workers, address=self.address)
 
 
 DEFAULT_EXECUTION = Execution()
@@ -206,12 +196,7 @@ class _Runner:
     def _generate(self, demonstrations: Demonstrations, out: Path) -> None:
         if is_finished(out):
             return
-        config = replace(
-            _generate_config(demonstrations, out),
-            workers=self.execution.workers,
-            engine=self.execution.engine,
-            address=self.execution.address,
-        )
+        config = replace(_generate_config(demonstrations, out), **asdict(self.execution))
         generate(config, lambda done, total, _: self._say(f"generating, {done:,} of {total:,}"))
 
     def _sample(self, subset: Subset) -> None:
@@ -235,19 +220,14 @@ class _Runner:
                 )
                 self._finish(_described(training))
             return
-        for training, _ in self.execution.imap(train_one, missing):
+        how = self.execution
+        for training, _ in imap_with_engine(how.engine, train_one, missing, how.workers, address=how.address):
             self._finish(_described(training))
 
     def _evaluate(self, evaluation: Evaluation) -> None:
-        config = replace(
-            evaluation.config,
-            workers=self.execution.workers,
-            engine=self.execution.engine,
-            address=self.execution.address,
-        )
+        config = replace(evaluation.config, **asdict(self.execution))
         name = f"evaluating {evaluation.run.label}, seed {evaluation.seed}"
-        with folder_lock(config.out):
-            evaluate_prepared(prepare(config), lambda d, t, _: self._say(f"{name}: {d:,} of {t:,} episodes"))
+        evaluate(config, lambda d, t, _: self._say(f"{name}: {d:,} of {t:,} episodes"))
 
 
 def train_one(training: Training, count: Callable[[int], None]) -> None:

@@ -7,15 +7,14 @@ from typing import Annotated, Any, Literal, Self
 
 from openvima.errors import ConfigError, echo, unknown_name
 from openvima.input_files import settle
+from openvima.policies.config_fields import Range, problems_of
 from openvima.policies.presets import PRESETS, own_policies
 from openvima.training.validation import (
     Count,
     Probability,
-    Range,
     Steps,
     from_settings,
     path_settings,
-    problems_of,
 )
 
 PRETRAINING_STEPS = 400  # of presets with an appearance embedding

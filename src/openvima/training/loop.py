@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,18 +19,19 @@ from typing import Any, Protocol
 import torch
 from torch import nn
 
+from openvima.atomic_io import folder_lock
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, Terminated
 from openvima.multiprocess import Report
+from openvima.policies.base import torch_threads
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
-from openvima.training.parallel import Parallel, load_named_state, named_state
+from openvima.training.parallel import Parallel, join_processes, load_named_state, named_state
 from openvima.training.run_folder import (
     METRICS_FILE,
     SESSIONS_FILE,
     TIMINGS_FILE,
     RunFolder,
-    TrainedState,
     index_hash,
     provenance,
 )
@@ -88,6 +89,23 @@ def end_on_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextmanager
+def open_run(config: RunConfig) -> Iterator[Parallel]:
+    """Join the processes of a run; the first of them holds the lock of its folder.
+
+    Raises:
+        ConfigError: There is no such device.
+        FolderLockedError: Another run writes to the folder.
+    """
+    with (
+        torch_threads(config.runtime.threads),
+        join_processes(config.runtime.device) as parallel,
+        end_on_sigterm(),  # not while processes join, a wait that no handler interrupts
+        folder_lock(config.out) if parallel.is_first else nullcontext(),
+    ):
+        yield parallel
 
 
 @contextmanager
@@ -260,7 +278,7 @@ class Trainer:
     def _run_stage(self, stage: Stage, num_steps: int) -> None:
         optimizer = _optimizer(self.learner, stage, self.config.optimizer.weight_decay)
         if self.progress.step:
-            self._load_optimizer(optimizer)
+            load_named_state(self.learner, optimizer, self.run.optimizer_state())
         self._last = (self.progress.step, time.monotonic())
         with note_sigterm() as is_terminated:
             self._take_steps(stage, optimizer, num_steps, is_terminated)
@@ -361,9 +379,8 @@ class Trainer:
         if validates and is_last_stage and (best is None or score >= best - error):
             best = score if best is None else max(score, best)
             self.progress = replace(self.progress, best_score=best, best_checkpoint=name)
-        state = self._state(optimizer)
         if self.parallel.is_first:
-            self.run.save(name, self.learner, state, self.progress)
+            self.run.save(name, self.learner, named_state(self.learner, optimizer), self.progress)
             every = self._rollout_every
             if self._rollout and every and is_last_stage and self.progress.step % every == 0:
                 scores = self._rollout(self.run.checkpoints / name)
@@ -397,12 +414,6 @@ class Trainer:
             numbers = {name: value for name, value in metrics.items() if isinstance(value, int | float)}
             for tracker in self._trackers:
                 tracker.add(stage.name, numbers, self._done())
-
-    def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
-        return TrainedState(self.learner.state_dict(), named_state(self.learner, optimizer))
-
-    def _load_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
-        load_named_state(self.learner, optimizer, self.run.optimizer_state())
 
     def _here(self) -> dict[str, int]:
         return {"stage": self.progress.stage, "step": self.progress.step}

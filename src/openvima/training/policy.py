@@ -17,7 +17,6 @@ from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
-from openvima.policies.base import torch_threads
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.augmentation.prompts import MOTION_TEXT
@@ -32,14 +31,14 @@ from openvima.training.loop import (
     Rollout,
     Stage,
     Trainer,
-    end_on_sigterm,
     num_steps,
+    open_run,
 )
-from openvima.training.parallel import Parallel, compile_layers, join_processes
+from openvima.training.parallel import Parallel, compile_layers
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
 from openvima.training.recipes import command_going_on
-from openvima.training.run_folder import held_out_demonstrations, run_lock
+from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
     alternative_source,
     check_scenes,
@@ -96,13 +95,7 @@ def train(
     boxes = None
     if config.loader.boxes is not None:
         boxes = plugged_boxes(config.loader.boxes, fraction=config.loader.detected_fraction)
-    runtime = config.runtime
-    with (
-        torch_threads(runtime.threads),
-        join_processes(runtime.device) as parallel,
-        end_on_sigterm(),  # not while processes join, a wait that no handler interrupts
-        run_lock(config.out, is_first=parallel.is_first),
-    ):
+    with open_run(config) as parallel:
         with_captions = config.pretraining.attribute_loss_weight > 0
         texts = training_texts(dataset, config.augmentation, with_captions=with_captions)
         learner = build_learner(config, texts)

@@ -17,7 +17,6 @@ import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,7 +28,6 @@ import yaml
 import openvima
 from openvima.atomic_io import (
     atomic_write_file,
-    folder_lock,
     is_lock_file,
     naming,
     remove_stale,
@@ -57,15 +55,6 @@ _PARTIAL = ".partial"
 _STEPS = "training.schedule.steps"
 
 
-def run_lock(path: Path, *, is_first: bool) -> AbstractContextManager[None]:
-    """Return the lock of a run folder; of several processes of a run the first holds it.
-
-    Raises:
-        FolderLockedError: Another run writes to the folder.
-    """
-    return folder_lock(path) if is_first else nullcontext()
-
-
 @dataclass(frozen=True, slots=True)
 class Progress:
     """Progress of a run.
@@ -81,19 +70,6 @@ class Progress:
     step: int = 0
     best_score: float | None = None
     best_checkpoint: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class TrainedState:
-    """Content of a checkpoint.
-
-    Args:
-        weights: Name to tensor.
-        optimizer: Name of a parameter to its optimizer state.
-    """
-
-    weights: Mapping[str, torch.Tensor]
-    optimizer: Mapping[str, Mapping[str, torch.Tensor]]
 
 
 class RunFolder:
@@ -150,13 +126,19 @@ class RunFolder:
         found = (path for path in self.checkpoints.iterdir() if path.is_dir())
         return max(found, key=checkpoint_order, default=None)
 
-    def save(self, name: str, learner: Learner, state: TrainedState, progress: Progress) -> None:
+    def save(
+        self,
+        name: str,
+        learner: Learner,
+        optimizer: Mapping[str, Mapping[str, torch.Tensor]],
+        progress: Progress,
+    ) -> None:
         """Write a checkpoint, and delete others except the best and permanent ones.
 
         Args:
             name: Folder name, STAGE-STEP.
             learner: Writes its weights.
-            state: Weights and optimizer state.
+            optimizer: State of the optimizer, by name of the parameter.
             progress: Progress of the run.
         """
         final = self.checkpoints / name
@@ -164,10 +146,10 @@ class RunFolder:
         shutil.rmtree(partial, ignore_errors=True)
         with naming(final, partial):
             partial.mkdir()
-            learner.write(partial, state.weights)
+            learner.write(partial, learner.state_dict())
             tensors = {
                 f"{parameter}|{name}": tensor.detach().cpu().contiguous()
-                for parameter, values in state.optimizer.items()
+                for parameter, values in optimizer.items()
                 for name, tensor in values.items()
             }
             write_safetensors(tensors, partial / OPTIMIZER_FILE)

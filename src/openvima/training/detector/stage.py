@@ -15,7 +15,6 @@ from openvima.detector.frames import Frame, FrameSampler, augment_frame, held_ou
 from openvima.detector.network import Instances, MaskRCNN
 from openvima.errors import ConfigError, DatasetError
 from openvima.multiprocess import Report
-from openvima.policies.base import torch_threads
 from openvima.policies.naming import WEIGHTS_FILE
 from openvima.training.batches import BatchOrder
 from openvima.training.detector.config import DetectorTrainingConfig
@@ -24,13 +23,13 @@ from openvima.training.loop import (
     Metrics,
     PlannedStage,
     Trainer,
-    end_on_sigterm,
     num_steps,
+    open_run,
     step_generator,
     step_seed,
 )
-from openvima.training.parallel import Parallel, compile_layers, join_processes
-from openvima.training.run_folder import held_out_demonstrations, run_lock
+from openvima.training.parallel import Parallel, compile_layers
+from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import check_scenes, open_demonstrations
 
 
@@ -149,13 +148,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
             f"validation; a batch of {loader.batch_size} frames needs {loader.batch_size // 2} and 1. "
             "Generate more, lower loader.batch_size, or raise loader.validation_fraction."
         )
-    runtime = config.runtime
-    with (
-        torch_threads(runtime.threads),
-        join_processes(runtime.device) as parallel,
-        end_on_sigterm(),  # not while processes join, a wait that no handler interrupts
-        run_lock(config.out, is_first=parallel.is_first),
-    ):
+    with open_run(config) as parallel:
         if parallel.num_ranks > 1:
             raise ConfigError("a detector trains in one process; start it without torchrun.")
         learner = DetectorLearner(_network(config), sampled=config.proposals_per_frame)
@@ -163,7 +156,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
         origin = {"held_out": found} if found else None
         trainer = Trainer(config, dataset, learner, parallel, report=report, demonstrations=origin)
         learner.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
-        if runtime.compile:
+        if config.runtime.compile:
             compile_layers(learner)
 
         def make() -> DetectorStage:

@@ -17,6 +17,7 @@ from openvima.training.augmentation.crops import draw_channel_mixing
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.pairs import AttributeLabels, Pairs
 
+_CHUNK = 256  # pairs that are encoded at a time in validation
 LossAndMetrics = tuple[torch.Tensor, dict[str, torch.Tensor]]
 
 
@@ -50,41 +51,22 @@ def contrastive_loss(
     Source: InfoNCE (van den Oord et al. 2018), symmetric as in CLIP.
     """
     mixing = draw_channel_mixing(generator).to(pairs.scene_crops.device)
-    if pairs.second_view is not None:
-        return _two_view_loss(encoder, pairs, mixing, temperature, attributes, attribute_weight, parallel)
-    features = _encode(encoder, torch.stack([pairs.prompt_crops, pairs.scene_crops]), mixing, parallel)
-    masks = torch.stack([pairs.prompt_masks, pairs.scene_masks]).transpose(1, 2)
-    prompt, scene = encoder.embed_appearance(features, masks)
-    loss, accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
-    return loss, {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
-
-
-def _two_view_loss(
-    encoder: ObjectEncoder,
-    pairs: Pairs,
-    mixing: torch.Tensor,
-    temperature: float,
-    attributes: Attributes | None,
-    attribute_weight: float,
-    parallel: Parallel,
-) -> LossAndMetrics:
     view = pairs.second_view
-    assert view is not None
-    crops = torch.stack([pairs.prompt_crops, pairs.scene_crops, view.crops])
-    features = _encode(encoder, crops, mixing, parallel)
-    masks = torch.stack([pairs.prompt_masks, pairs.scene_masks, view.masks]).transpose(1, 2)
-    prompt, scene, second = encoder.embed_appearance(features, masks)
+    others = [] if view is None else [view]
+    crops = [pairs.prompt_crops, pairs.scene_crops, *(other.crops for other in others)]
+    features = _encode(encoder, torch.stack(crops), mixing, parallel)
+    seen = [pairs.prompt_masks, pairs.scene_masks, *(other.masks for other in others)]
+    masks = torch.stack(seen).transpose(1, 2)
+    prompt, scene, *second = encoder.embed_appearance(features, masks)
+    loss, accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
+    metrics = {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
+    if view is None:
+        return loss, metrics
     rows = view.masks.any(dim=1)
     is_same = pairs.appearances[rows, None] == pairs.appearances[None, rows]
-    prompt_loss, prompt_accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
-    view_loss, view_accuracy = info_nce(second[rows], scene[rows], is_same, temperature=temperature)
-    loss = (prompt_loss + view_loss) / 2
-    metrics = {
-        "loss/contrastive": prompt_loss.detach(),
-        "loss/second_view": view_loss.detach(),
-        "contrastive_accuracy": prompt_accuracy,
-        "second_view_accuracy": view_accuracy,
-    }
+    view_loss, accuracy = info_nce(second[0][rows], scene[rows], is_same, temperature=temperature)
+    loss = (loss + view_loss) / 2
+    metrics |= {"loss/second_view": view_loss.detach(), "second_view_accuracy": accuracy}
     if encoder.config.rotation_bins:
         of_rotations = rotation_loss(encoder, features, masks, view.rotations)
         is_correct = is_rotation_correct(encoder, features, masks, view.rotations)
@@ -137,11 +119,16 @@ def info_nce(
     return loss, accuracy
 
 
+def _chunks(pairs: Pairs) -> list[Pairs]:
+    """Divide held-out pairs, as crops of all would take too much memory at once."""
+    rows = torch.arange(len(pairs.scenes), device=pairs.scenes.device).split(_CHUNK)
+    return list(map(pairs.select, rows))
+
+
 @torch.no_grad()
-def retrieval_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256) -> float:
+def retrieval_accuracy(encoder: ObjectEncoder, pairs: Pairs) -> float:
     """Fraction of prompt images whose nearest object of the scene is a match."""
-    rows = torch.arange(len(pairs.scenes), device=pairs.scenes.device).split(chunk)
-    parts = [pairs.select(row) for row in rows]
+    parts = _chunks(pairs)
     prompt = torch.cat([embed(encoder, p.prompt_crops, p.prompt_masks) for p in parts])
     scene = torch.cat([embed(encoder, p.scene_crops, p.scene_masks) for p in parts])
     is_other_scene = pairs.scenes[:, None] != pairs.scenes[None, :]
@@ -189,11 +176,10 @@ def rotation_loss(
 
 
 @torch.no_grad()
-def rotation_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256) -> float:
+def rotation_accuracy(encoder: ObjectEncoder, pairs: Pairs) -> float:
     """Fraction of rotations to the second view estimated within 15 degrees; NaN if there is none."""
     is_correct = []
-    for rows in torch.arange(len(pairs.scenes), device=pairs.scenes.device).split(chunk):
-        part = pairs.select(rows)
+    for part in _chunks(pairs):
         view = part.second_view
         assert view is not None
         features = encoder.encode_images(torch.stack([part.scene_crops, view.crops])).transpose(1, 2)
@@ -274,9 +260,7 @@ def attribute_loss(
 
 
 @torch.no_grad()
-def attribute_accuracy(
-    encoder: ObjectEncoder, attributes: Attributes, pairs: Pairs, *, chunk: int = 256
-) -> dict[str, float]:
+def attribute_accuracy(encoder: ObjectEncoder, attributes: Attributes, pairs: Pairs) -> dict[str, float]:
     """How often the most similar other object of the scene is alike, by name of the attribute.
 
     Only prompt images count for which the scene has another object that is alike and one that differs;
@@ -284,9 +268,8 @@ def attribute_accuracy(
     """
     labels = pairs.attributes
     assert labels is not None
-    rows = torch.arange(len(pairs.scenes), device=pairs.scenes.device).split(chunk)
     projected = []
-    for part in map(pairs.select, rows):
+    for part in _chunks(pairs):
         assert part.attributes is not None
         features = encoder.encode_images(torch.stack([part.prompt_crops, part.scene_crops])).transpose(1, 2)
         masks = torch.stack([part.prompt_masks, part.scene_masks]).transpose(1, 2)
