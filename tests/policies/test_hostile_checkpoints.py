@@ -84,7 +84,7 @@ def test_a_config_of_more_than_plain_values_is_refused(saved, text: str, message
         ("decoder.width", 2**40, "between 0 and 16384"),
         ("prompt.vocabulary_size", 10**12, "between 0 and 1000000"),
         ("decoder.num_layers", "many", "whole number"),
-        ("decoder.dropout", float("nan"), "a number between"),
+        ("decoder.dropout", float("nan"), "dropout is nan; it must be between"),
         ("prompt.train_words", "yes", "true or false"),
         ("prompt.text.num_heads", 0, "describes no network|does not fit"),
         ("images.crop.width", [1] * 900, "whole number"),

@@ -95,9 +95,9 @@ def _problem(name: str, value: Any, hint: Any, *, of_network: bool) -> str | Non
         limits = Range(-_MAX_FLOAT, _MAX_FLOAT)
     if limits is None or (limits.low <= value and (limits.high is None or value <= limits.high)):
         return None
-    allowed = f"at least {limits.low:g}"
+    allowed = f"at least {limits.low}"
     if limits.high is not None:
-        allowed = f"between {limits.low:g} and {limits.high:g}"
+        allowed = f"between {limits.low} and {limits.high}"
     return f"{name} is {short(value)}; it must be {allowed}."
 
 
