@@ -243,7 +243,6 @@ def _with_convolutions(config: PolicyConfig, given: str, **sizes: int) -> Policy
     return replace(config, images=replace(images, crop=replace(images.crop, **sizes)))
 
 
-# In the order in which they are made: later ones see the parts of earlier ones.
 def with_points(config: PolicyConfig, value: bool) -> PolicyConfig:
     """Return the same network, which reads positions from objects or not; see `TokenPolicyConfig.points`.
 
@@ -255,6 +254,7 @@ def with_points(config: PolicyConfig, value: bool) -> PolicyConfig:
     return replace(config, points=value)
 
 
+# In the order in which they are made: later ones see the parts of earlier ones.
 SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "text_encoder": with_text_encoder,
     "tuned_layers": with_tuned_layers,
