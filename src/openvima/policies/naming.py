@@ -70,7 +70,7 @@ class BundledPolicy:
 
 BUNDLED: dict[str, BundledPolicy] = {
     SMALL: BundledPolicy(_TRAINED / SMALL, "demonstrations of the 13 training tasks, training partition"),
-    VIMA: BundledPolicy(_TRAINED / VIMA, "demonstrations of the 13 training tasks, 40% with random appearance"),
+    VIMA: BundledPolicy(_TRAINED / VIMA, "demonstrations of the 13 training tasks, 40% of random appearance"),
 }
 
 

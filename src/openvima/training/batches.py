@@ -89,7 +89,7 @@ class BatchMaker:
         seed: Of the run; every example of every batch has its own generator.
         largest: Maximum size of a part.
         alternatives: Other caches of the same demonstrations, each with the probability of using it instead
-            where it has the demonstration; see `alternative_source`.
+            where it has the demonstration; see `training.source.alternative_source`.
         distractor_prob: Probability of inserting distractors from another demonstration, for those that allow
             it; see `with_distractors`.
     """

@@ -270,7 +270,7 @@ def training_texts(
 
     Args:
         dataset: The demonstrations; of these only the prompts are read.
-        augmentation: Settings; an inverse-dynamics prompt and novel nouns bring words of their own.
+        augmentation: Settings, some of which bring words of their own.
         with_captions: Also yield the words of captions of attributes.
 
     Raises:

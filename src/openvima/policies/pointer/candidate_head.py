@@ -99,9 +99,9 @@ class CandidatePointerHead(nn.Module):
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Cross-entropy of both pointers, also by appearance alone, and of the yaw; Huber loss of the offset.
 
-        Every candidate at the demonstrated place is right: the loss is that of their total probability. Where
-        there is none, the object that the demonstration names is, and the offset has to lead from there to
-        the place. If none is named, the nearest grid point is right; metrics leave out such a step.
+        The loss is that of the total probability of all right candidates, see `PlaceCandidates.right`. From a
+        named object that is not at the demonstrated place the offset has to lead there. Metrics leave out a
+        step for which only a grid point is right.
         """
         candidates, config = self.candidates(inputs), self.config
         # The pick is teacher-forced: the place is that of the object that the demonstration picked. Slots of

@@ -125,9 +125,10 @@ class PlaceCandidates:
     def right(self, targets: ActionTargets, goal_BT2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Determine which candidates are right.
 
-        Where the demonstration names an object, that one is, and so are candidates at the demonstrated place,
-        except other objects in view and places where those are: the middle of a container's box may be
-        farther from what was put into it than another object is.
+        Where the demonstration names an object, that one is, and so are candidates at the demonstrated place
+        that are nearer to it than to another object in view: the middle of a container's box may be farther
+        from what was put into it than another object is. Where it names none, candidates at the place are,
+        and without any the nearest point of the grid.
 
         Args:
             targets: Demonstrated actions.
@@ -141,9 +142,6 @@ class PlaceCandidates:
         is_named_BT = targets.place_BT >= 0
         distance_BTC = (self.positions_BTC2 - goal_BT2[:, :, None]).norm(dim=-1)
         count = masks_BTC.shape[-1]
-        # A place is right if something is or was there. If the oracle named an object, only what is nearer to
-        # it than to others counts, and the object itself always does; with neither, the nearest point of the
-        # grid.
         near_BTC = (distance_BTC < COPIED_WITHIN_M) & masks_BTC & ~is_grid_C
         near_BTC &= ~is_named_BT[..., None] | self._nearest_to(targets.place_BT)
         nearest_BT = distance_BTC.masked_fill(~is_grid_C, torch.inf).argmin(-1)

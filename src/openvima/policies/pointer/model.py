@@ -121,9 +121,6 @@ class Pointer(PolicyNetwork):
         features_VSF = features_KF[prompts.crop_index_VS]
         is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
         appearance_SA = self.embed_appearance(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
-        # Three numberings meet here: positions of a prompt (L), its objects in reading order (M), and the
-        # objects of all prompts (S). `order` leads from M to L, `row` from M to S; where `exists` is false
-        # both repeat.
         order_BM = _images_first(is_image_BL)
         exists_BM = is_image_BL.gather(1, order_BM)
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)

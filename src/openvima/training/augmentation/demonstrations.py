@@ -137,7 +137,7 @@ _OCCUPIED_M = 0.1  # a place is taken where an object is nearer
 
 
 def leftmost_first(episode: PreprocessedEpisode) -> PreprocessedEpisode:
-    """Let each step's label be the leftmost of the actions that could be next; what was done stays.
+    """Let each step's label be the leftmost in the pictures of the actions that could be next.
 
     Where goals may be met in any order, the oracle takes one that cannot be foreseen. A network whose parts
     of an action are independent then picks one object and puts it where another belongs.
