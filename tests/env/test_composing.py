@@ -18,7 +18,6 @@ from openvima import SceneObject, compose
 from openvima.catalog import load_assets
 from openvima.data.user_demonstrations import check_recordable
 from openvima.env import TabletopEnv, make_vec
-from openvima.env.composition import Composition, parse_goals
 from openvima.errors import DatasetError, InputFileError, OpenVimaError, SceneError, UnknownNameError
 from openvima.perception.objects import observe_prompt_image
 from openvima.render.rasteriser import Rasteriser
@@ -26,6 +25,7 @@ from openvima.render.raycast import Hit, first_hit
 from openvima.scene import AtPose, InZone, ObjectImage, PhotoImage, Scene, SceneImage
 from openvima.scene.action import pose_after
 from openvima.studio.browser_session import clicked_action
+from openvima.studio.composition import Composition, parse_goals
 from openvima.tasks import sample_episode
 from task_cases import REPRESENTATIVE_TASKS, full_repr, random_action
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from openvima.catalog import load_assets
-from openvima.env.composition import Composition
 from openvima.env.episode_file import load_episode, save_episode
 from openvima.errors import ActionError, EpisodeError
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, load_own_rollout_policy
@@ -14,6 +13,7 @@ from openvima.evaluation.session import EpisodeSession, first_difference, play
 from openvima.policies import RandomPolicy
 from openvima.policies.naming import SMALL
 from openvima.scene import Action
+from openvima.studio.composition import Composition
 from openvima.tasks import sample_episode
 
 EPISODE = sample_episode("rearrange", seed=0)  # the oracle takes two steps

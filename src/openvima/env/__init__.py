@@ -7,8 +7,7 @@ from openvima.env.registration import make, register_environments
 from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
-    from openvima.env.composed_objects import SceneObject
-    from openvima.env.composing import compose
+    from openvima.env.composing import SceneObject, compose
     from openvima.env.episode_file import load_episode, save_episode
     from openvima.env.tabletop import TabletopEnv, VideoFrame
     from openvima.env.vector import make_vec, stack_actions
@@ -28,7 +27,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "SceneObject": "composed_objects",
+    "SceneObject": "composing",
     "VideoFrame": "tabletop",
     "TabletopEnv": "tabletop",
     "compose": "composing",

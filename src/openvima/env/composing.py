@@ -1,38 +1,22 @@
-"""Composed episodes: scenes, prompts, photos and goals of users."""
+"""Composed episodes: scenes, prompts, photos and goals of users, checked and placed at rest."""
 
 import inspect
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import re
+import reprlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any  # of whatever type a user gives; checked here
 
 import numpy as np
 from PIL import Image
 
-from openvima.catalog import Assets, Pool, load_assets, object_spec
+from openvima.catalog import OBJECT_SETS, Assets, Pool, load_assets, object_spec, texture_spec
 from openvima.catalog.objects import FULL_SYMMETRY, NO_SYMMETRY
-from openvima.env.composed_objects import (
-    FIELDS,
-    MAX_ANGLE_DEG,
-    WORKSPACE,
-    ObjectLike,
-    SceneObject,
-    add_object,
-    check_inside,
-    checked_appearance,
-    entries,
-    handles_hint,
-    known_object,
-    number,
-    outline,
-    pair,
-    put,
-    scene_object,
-    scene_objects,
-    shown,
-)
-from openvima.errors import InputFileError, SceneError, unknown_name
+from openvima.errors import InputFileError, SceneError, UnknownNameError, echo, unknown_name
 from openvima.input_files import decode_png, read_png
 from openvima.perception.objects import MAX_OBJECTS
 from openvima.perception.preprocessing import image_names
@@ -40,6 +24,8 @@ from openvima.render.rasteriser import PHOTO_WHITE
 from openvima.scene import (
     COMPOSED,
     END_EFFECTORS,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
     AtPose,
     EndEffector,
     Episode,
@@ -61,7 +47,279 @@ from openvima.scene.goal import is_condition
 from openvima.scene.prompt import PHOTO_SIDE
 from openvima.tasks.placing import TOLERANCE, TOLERANCE_DEG, rotation_goal
 from openvima.tasks.sweep_table import MAGNIFICATION
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import CELL_M, TableSampler
+
+Handles = Mapping[str, Placement]
+
+
+def shown(value: object) -> str:
+    """Return a value for an error, in 80 characters at most."""
+    return echo(reprlib.repr(value), 80)
+
+
+def entries(value: object, label: str) -> Sequence[Any]:
+    """Return a list or tuple.
+
+    Raises:
+        SceneError: It is none.
+    """
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+        raise SceneError(f"{label} is {shown(value)}; give a list.")
+    return value
+
+
+def number(value: Any, label: str, low: float, high: float) -> float:
+    """Return a finite number within limits.
+
+    Raises:
+        SceneError: It is none, or outside.
+    """
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not low <= value <= high:  # NaN lies nowhere
+        raise SceneError(f"{label} is {shown(value)}; give a number from {low:g} to {high:g}.")
+    return float(value)
+
+
+def pair(value: Any, label: str) -> tuple[float, float]:
+    """Return x and y in metres.
+
+    Raises:
+        SceneError: These are not two finite numbers.
+    """
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes) or len(value) != 2:
+        raise SceneError(f"{label} is {shown(value)}; give x and y in metres, as in [0.45, -0.25].")
+    x, y = (number(coordinate, label, -1e6, 1e6) for coordinate in value)
+    return x, y
+
+
+def known_object(handle: object, handles: Handles, label: str) -> Placement:
+    """Return the object of a handle or an index.
+
+    Raises:
+        SceneError: The scene has no such object.
+    """
+    if type(handle) is int and 0 <= handle < len(handles):
+        return list(handles.values())[handle]
+    if isinstance(handle, str) and handle in handles:
+        return handles[handle]
+    raise SceneError(f"{label}: {unknown_name('object', handle, handles, handles_hint(handles))}")
+
+
+def handles_hint(handles: Handles) -> str:
+    """Return a sentence with all handles."""
+    return f"The scene has {echo(', '.join(handles))}."
+
+
+SCALES = (0.5, 2.0)
+MAX_ANGLE_DEG = 3600
+WORKSPACE = (
+    f"x must lie in {WORKSPACE_LOW[0]} … {WORKSPACE_HIGH[0]} m "
+    f"and y in {WORKSPACE_LOW[1]} … {WORKSPACE_HIGH[1]} m"
+)
+_FIXED_OBJECTS = frozenset(
+    {*OBJECT_SETS["B_all"], *OBJECT_SETS["bounds"], *OBJECT_SETS["constraint"], "stand"}
+)
+_SLACK_M = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class SceneObject:
+    """An object of a composed scene.
+
+    Args:
+        object: Display name in the catalogue, such as "heart".
+        texture: Display name in the catalogue, such as "red swirl".
+        position: x, y of its link frame in metres.
+        yaw_deg: Heading in degrees, counter-clockwise seen from above.
+        name: Handle for prompt and goals; by default "a", "b", … in the order of the objects.
+        scale: Factor on its size in the catalogue, 0.5 … 2.
+        fixed: Whether it is fixed to the table; by default if it is a base, as in the tasks.
+    """
+
+    object: str
+    texture: str
+    position: tuple[float, float]
+    yaw_deg: float = 0.0
+    name: str = ""
+    scale: float = 1.0
+    fixed: bool | None = None
+
+
+def default_names() -> Iterator[str]:
+    """Yield the handles of objects that have none: a to z, then object26 and so on."""
+    yield from ascii_lowercase
+    yield from map("object{}".format, itertools.count(len(ascii_lowercase)))
+
+
+def is_fixed_by_default(object_name: str) -> bool:
+    """Return whether an object is fixed to the table unless it is said otherwise, as bases are."""
+    return object_name in _FIXED_OBJECTS or object_spec(object_name).container
+
+
+ObjectLike = SceneObject | Mapping[str, Any] | Sequence[Any]
+FIELDS = tuple(field.name for field in fields(SceneObject))
+
+
+def scene_objects(given: object) -> list[SceneObject]:
+    """Read the objects, each with its handle.
+
+    Raises:
+        SceneError: An object is malformed, or two have one name.
+        UnknownNameError: The catalogue has no such object or texture.
+    """
+    if isinstance(given, Mapping):
+        named = [scene_object(value, f"object {shown(name)}", name) for name, value in given.items()]
+    else:
+        pairs = zip(default_names(), entries(given, "objects"), strict=False)
+        named = [
+            scene_object(value, f"object {n} ({label!r})", label) for n, (label, value) in enumerate(pairs)
+        ]
+    if not 1 <= len(named) <= MAX_OBJECTS:
+        raise SceneError(f"there are {len(named)} objects; a scene has 1 to {MAX_OBJECTS}.")
+    names = [each.name for each in named]
+    for n, name in enumerate(names):
+        if not re.fullmatch(r"\w{1,40}", name):
+            raise SceneError(
+                f"object {n} is named {shown(name)}; use 1 to 40 letters, digits and underscores."
+            )
+        if name in names[:n]:
+            raise SceneError(
+                f"objects {names.index(name)} and {n} are both named {name!r}; names are unique."
+            )
+    return named
+
+
+def scene_object(given: object, label: str, default_name: object) -> SceneObject:
+    """Read one object in any of its forms and check all its fields.
+
+    Args:
+        given: A `SceneObject`, a mapping of its fields, or `(object, texture, (x, y)[, yaw_deg])`.
+        label: Name of the object in errors.
+        default_name: Its handle if it has none of its own.
+
+    Raises:
+        SceneError: It is malformed.
+        UnknownNameError: The catalogue has no such object or texture.
+    """
+    if isinstance(given, SceneObject):
+        values: dict[str, Any] = {name: getattr(given, name) for name in FIELDS}
+    elif isinstance(given, Mapping):
+        values = dict(given)
+        if unknown := [key for key in values if key not in FIELDS]:
+            raise SceneError(f"{label}: {unknown_name('field', unknown[0], FIELDS)}")
+    else:
+        parts = entries(given, label)
+        values = dict(zip(FIELDS[:4], parts, strict=False))
+        if not 3 <= len(parts) <= 4:
+            raise SceneError(f"{label} has {len(parts)} entries; give (object, texture, (x, y)[, yaw_deg]).")
+    if missing := [name for name in FIELDS[:3] if name not in values]:
+        raise SceneError(f"{label} has no {missing[0]}; it needs {', '.join(FIELDS[:3])}.")
+    if not isinstance(name := values.pop("name", "") or default_name, str):
+        raise SceneError(f"{label}: name is {shown(name)}; give text.")
+    x, y = pair(values.pop("position"), f"{label}: position")
+    yaw_deg = number(values.pop("yaw_deg", 0.0), f"{label}: yaw_deg", -MAX_ANGLE_DEG, MAX_ANGLE_DEG)
+    scale = number(values.pop("scale", 1.0), f"{label}: scale", *SCALES)
+    if not isinstance(fixed := values.pop("fixed", None), bool | None):
+        raise SceneError(f"{label}: fixed is {shown(fixed)}; give true or false.")
+    object_name, texture = checked_appearance(values["object"], values["texture"], label)
+    return SceneObject(object_name, texture, (x, y), yaw_deg, name, scale, fixed)
+
+
+def checked_appearance(object_name: object, texture: object, label: str) -> tuple[str, str]:
+    """Check the names of an object and its texture.
+
+    Raises:
+        UnknownNameError: The catalogue has no such object or texture.
+        SceneError: A name is no text.
+    """
+    if not isinstance(object_name, str) or not isinstance(texture, str):
+        raise SceneError(f"{label} is {shown(object_name)} of texture {shown(texture)}; give two names.")
+    try:
+        return object_spec(object_name).name, texture_spec(texture).name
+    except UnknownNameError as error:
+        raise type(error)(f"{label}: {error}") from None
+
+
+def add_object(table: TableSampler, given: SceneObject, handles: Handles) -> Placement:
+    """Place an object at rest on the table, inside the workspace and clear of all others.
+
+    Raises:
+        SceneError: It is outside the workspace or overlaps another object.
+    """
+    new = put(table, given)
+    check_inside(new, table.assets, described(given.name, new))
+    covered = table.covered(new)
+    for name, other in handles.items():
+        area_m2 = float((covered & table.covered(other)).sum()) * CELL_M**2
+        if area_m2:
+            apart_m = _reach_m(new, table.assets) + _reach_m(other, table.assets)
+            raise SceneError(
+                f"{described(given.name, new)} at {_position_text(new)} overlaps {described(name, other)} at "
+                f"{_position_text(other)} by {1e4 * area_m2:.1f} cm² of the table; 0 is allowed, and "
+                f"{apart_m:.2f} m between their positions always suffice."
+            )
+    return new
+
+
+def put(table: TableSampler, given: SceneObject, *, on_top: bool = False) -> Placement:
+    """Place an object at rest on the table, or on top of the objects below."""
+    return table.add(
+        given.object,
+        given.texture,
+        size=object_spec(given.object).size_max,
+        pose=Pose.planar(*given.position, math.radians(given.yaw_deg)),
+        fixed=is_fixed_by_default(given.object) if given.fixed is None else given.fixed,
+        scale=(given.scale, given.scale, given.scale),
+        on_top=on_top,
+    )
+
+
+def check_inside(placement: Placement, assets: Assets, label: str) -> None:
+    """Check that position and outline are in the workspace.
+
+    Raises:
+        SceneError: They are not.
+    """
+    if not in_workspace(placement.pose):
+        raise SceneError(f"{label} is at {_position_text(placement)}; {WORKSPACE}.")
+    low, high = _extent(placement, assets)
+    for axis, name in enumerate("xy"):
+        for edge in (low[axis], high[axis]):
+            if not WORKSPACE_LOW[axis] - _SLACK_M <= edge <= WORKSPACE_HIGH[axis] + _SLACK_M:
+                raise SceneError(
+                    f"{label} at {_position_text(placement)} reaches {name} = {edge:.3f} m with its edge; "
+                    f"{WORKSPACE}."
+                )
+
+
+def _extent(placement: Placement, assets: Assets) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest x and y of an object's mesh, metres."""
+    corners = _outline(placement, assets)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def _outline(placement: Placement, assets: Assets) -> np.ndarray:
+    """Return the corners of an object's mesh on the table, shape (N, 2), metres."""
+    geometry = assets.geometry(placement.object, placement.size, placement.scale)
+    return placement.pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
+
+
+def _reach_m(placement: Placement, assets: Assets) -> float:
+    """Largest planar distance of an object's mesh from its position."""
+    offsets = _outline(placement, assets) - (placement.pose.x, placement.pose.y)
+    return float(np.hypot(*offsets.T).max())
+
+
+def described(name: str, placement: Placement) -> str:
+    """Return "object 'a' (red swirl heart)" for an error."""
+    return f"object {name!r} ({placement.texture} {placement.object})"
+
+
+def _position_text(placement: Placement) -> str:
+    return f"({placement.pose.x:.3g}, {placement.pose.y:.3g})"
+
 
 MAX_PNG_BYTES = 32 * 2**20
 MAX_PNG_SIDE = 4096  # pixels
@@ -93,25 +351,19 @@ def photo_from_bytes(content: bytes) -> PhotoImage:
 
 
 def _photo(picture: Image.Image, label: str) -> PhotoImage:
-    """Cut a picture to its object and resize it."""
+    """Cut a picture to its object and resize it so that its longer side is `PHOTO_SIDE`."""
     paper = Image.new("RGBA", picture.size, "white")
     pixels = np.asarray(Image.alpha_composite(paper, picture).convert("RGB"))
     is_object = (pixels < PHOTO_WHITE).any(axis=-1)
     if not is_object.any():
         raise InputFileError(f"{label} is all white; it must show an object on white.")
     rows, columns = np.flatnonzero(is_object.any(axis=-1)), np.flatnonzero(is_object.any(axis=0))
-    return _fitted(Image.fromarray(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]))
-
-
-def _fitted(picture: Image.Image) -> PhotoImage:
-    """Resize a picture so that its longer side is `PHOTO_SIDE`."""
-    scale = PHOTO_SIDE / max(picture.size)
-    width, height = (max(1, round(side * scale)) for side in picture.size)
+    cut = Image.fromarray(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+    scale = PHOTO_SIDE / max(cut.size)
+    width, height = (max(1, round(side * scale)) for side in cut.size)
     how = Image.Resampling.BOX if scale < 1 else Image.Resampling.NEAREST
-    return PhotoImage(width, height, picture.resize((width, height), how).tobytes())
+    return PhotoImage(width, height, cut.resize((width, height), how).tobytes())
 
-
-Handles = Mapping[str, Placement]
 
 # The angles of the catalogue are those of the benchmark, which differ from the shapes or are unset for these.
 _SYMMETRY_RAD = {
@@ -218,8 +470,7 @@ def _swept_into(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     if abs(math.remainder(b.pose.yaw_rad, math.pi / 2)) > 1e-6:
         yaw_deg = math.degrees(b.pose.yaw_rad)
         raise SceneError(f"the {b.object} has a yaw of {yaw_deg:.1f} degrees; it must be a multiple of 90.")
-    corners = outline(b, assets)
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = _extent(b, assets)
     (x, y), (size_x, size_y) = ((low + high) / 2).tolist(), np.subtract(high, low).tolist()
     return InZone(a.id, Zone(x, y, size_x, size_y), relative_to=b.id)
 
@@ -238,7 +489,6 @@ _GOALS: dict[str, Callable[..., Goal]] = {
 
 
 MAX_PROMPT_CHARS = 1000
-SMALL_BLOCK = "small block"
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +501,7 @@ class ImageMaker:
         photo: Reads a PNG file.
     """
 
-    handles: Mapping[str, Placement]
+    handles: Handles
     table: TableSampler
     photo: Callable[[str], PhotoImage]
 
@@ -311,7 +561,7 @@ class ImageMaker:
 
 
 def _object_image(placement: Placement) -> ObjectImage:
-    return ObjectImage(placement, MAGNIFICATION if placement.object == SMALL_BLOCK else 1.0)
+    return ObjectImage(placement, MAGNIFICATION if placement.object == "small block" else 1.0)
 
 
 def _checked_text(text: object) -> str:

@@ -19,8 +19,7 @@ import yaml
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog import LEVELS, Assets, load_assets, object_spec, texture_spec
-from openvima.env.composed_objects import WORKSPACE, shown
-from openvima.env.composing import MAX_STEPS, composed, read_photo
+from openvima.env.composing import MAX_STEPS, WORKSPACE, composed, read_photo, shown
 from openvima.errors import InputFileError, OpenVimaError, SceneError, echo, unknown_name
 from openvima.input_files import as_path, read_json, read_yaml
 from openvima.perception.objects import MAX_OBJECTS

@@ -10,12 +10,12 @@ import viser
 
 from openvima.catalog import OBJECTS, TEXTURES
 from openvima.env.composing import photo_from_bytes
-from openvima.env.composition import Composition, shelf
 from openvima.env.episode_file import load_episode, save_episode
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
 from openvima.studio.browser_session import BrowserSession, hit_of, move
+from openvima.studio.composition import Composition, shelf
 
 _FIRST = Composition((), "Put the {a} into the {b}.", goals=(("in", "a", "b"),))
 _FIRST_OBJECTS = (("block", "red"), ("bowl", "green"))

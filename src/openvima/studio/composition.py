@@ -11,8 +11,15 @@ import yaml
 
 from openvima.catalog import OBJECTS, object_spec
 from openvima.catalog.geometry import Assets
-from openvima.env.composed_objects import FIELDS, FIXED_OBJECTS, SCALES, SceneObject, scene_objects
-from openvima.env.composing import compose
+from openvima.env.composing import (
+    FIELDS,
+    SCALES,
+    SceneObject,
+    compose,
+    default_names,
+    is_fixed_by_default,
+    scene_objects,
+)
 from openvima.errors import SceneError, brief_repr
 from openvima.scene import (
     WORKSPACE_HIGH,
@@ -27,7 +34,6 @@ from openvima.scene import (
     PromptFill,
 )
 
-_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _DECIMALS = 6  # of positions and angles that `compose` was given, which come back exactly
 
 
@@ -75,8 +81,7 @@ def _handles(placements: Sequence[Placement], fills: Sequence[tuple[str, PromptF
         if shown is not None:
             names.setdefault(shown, slot)
     slots = {slot for slot, _ in fills}
-    labels = [*_LETTERS, *(f"object{n}" for n in range(len(_LETTERS), len(_LETTERS) + len(placements)))]
-    free = iter([label for label in labels if label not in slots])
+    free = (name for name in default_names() if name not in slots)
     return {p.id: names.get(p.id) or next(free) for p in placements}
 
 
@@ -96,14 +101,14 @@ def _image(fill: PromptFill) -> Any:
 
 def _object(placement: Placement) -> Any:
     """An object as `compose` takes it, in its short form if that says all."""
-    spec, pose = object_spec(placement.object), placement.pose
+    pose = placement.pose
     position = round(pose.x, _DECIMALS), round(pose.y, _DECIMALS)
     yaw_deg = round(math.degrees(pose.yaw_rad), _DECIMALS)
-    sizes = zip(placement.size, placement.scale, spec.size_max, strict=True)
+    sizes = zip(placement.size, placement.scale, object_spec(placement.object).size_max, strict=True)
     factors = [size * scale / largest for size, scale, largest in sizes if largest]  # some are flat
     scale = round(min(max(sum(factors) / len(factors), SCALES[0]), SCALES[1]), 3)
     extra: dict[str, Any] = {} if scale == 1 else {"scale": scale}
-    if placement.fixed != (placement.object in FIXED_OBJECTS or spec.container):
+    if placement.fixed != is_fixed_by_default(placement.object):
         extra["fixed"] = placement.fixed
     if extra:
         named = {"object": placement.object, "texture": placement.texture, "position": position}
@@ -226,10 +231,7 @@ class Composition:
             UnknownNameError: The catalogue has no such object or texture.
         """
         taken = {each.name for each in self.objects} | {*self.images}
-        letters = "abcdefghijklmnopqrstuvwxyz"
-        name = next(
-            n for n in itertools.chain(letters, map("object{}".format, itertools.count())) if n not in taken
-        )
+        name = next(each for each in default_names() if each not in taken)
         reason = SceneError("there is no room on the table.")
         for place in _positions() if position is None else [_rounded(position)]:
             new = replace(self, objects=(*self.objects, SceneObject(object_name, texture, place, name=name)))

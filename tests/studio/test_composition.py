@@ -3,9 +3,9 @@
 import pytest
 
 import openvima
-from openvima.env.composition import compose_values
 from openvima.errors import SceneError
 from openvima.scene import Episode
+from openvima.studio.composition import compose_values
 from openvima.tasks import sample_episode
 
 OBJECTS = {
