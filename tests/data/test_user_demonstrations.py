@@ -62,7 +62,7 @@ def test_sampled_and_composed_successes_make_one_data_set(tmp_path: Path) -> Non
 
 
 def test_a_changed_pose_of_a_composed_demonstration_does_not_replay(tmp_path: Path) -> None:
-    from openvima.data.replay import find_difference
+    from openvima.data.verification import find_difference
     from openvima.env import TabletopEnv
 
     demo = demonstrate(scene(), clicked(scene(), random.Random(0)))

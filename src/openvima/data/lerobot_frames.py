@@ -106,15 +106,8 @@ class FrameLayout:
         Returns:
             Arrays of T rows.
         """
-        is_last = np.arange(demo.num_steps) == demo.num_steps - 1
-        success = is_last & demo.outcome.success
-        return {
-            "observation.state": self._states(demo),
-            "action": np.array([_action_row(demo, step) for step in range(demo.num_steps)], np.float32),
-            "next.reward": success.astype(np.float32),
-            "next.done": is_last,
-            "next.success": success,
-        }
+        actions = np.array([_action_row(demo, step) for step in range(demo.num_steps)], np.float32)
+        return _values(self._states(demo), actions, success=demo.outcome.success)
 
     def pictures(self, demo: Demonstration) -> dict[str, np.ndarray]:
         """Return the pictures of one episode.
@@ -207,6 +200,17 @@ def _within_bounds(values: np.ndarray) -> np.ndarray:
     return np.clip(values / max(float(np.linalg.norm(values)), 1e-6), -1, 1).astype(np.float32)
 
 
+def _values(states: np.ndarray, actions: np.ndarray, *, success: bool) -> dict[str, np.ndarray]:
+    is_last = np.arange(len(actions)) == len(actions) - 1
+    return {
+        "observation.state": states,
+        "action": actions,
+        "next.reward": (is_last & success).astype(np.float32),
+        "next.done": is_last,
+        "next.success": is_last & success,
+    }
+
+
 def _feature(dtype: str, names: tuple[str, ...] = ()) -> Feature:
     return {"dtype": dtype, "shape": [len(names) or 1], "names": list(names) or None}
 
@@ -262,15 +266,7 @@ class DenseLayout(FrameLayout):
 
     def values(self, demo: DenseTrajectory) -> dict[str, np.ndarray]:  # type: ignore[override]  # of its own kind
         """Return what the frames of one trajectory hold besides images and counters, arrays of T rows."""
-        is_last = np.arange(demo.num_steps) == demo.num_steps - 1
-        success = is_last & demo.success
-        return {
-            "observation.state": demo.states,
-            "action": demo.commands,
-            "next.reward": success.astype(np.float32),
-            "next.done": is_last,
-            "next.success": success,
-        }
+        return _values(demo.states, demo.commands, success=demo.success)
 
     def frame(self, observation: Mapping[str, Any], prompt: RenderedPrompt) -> dict[str, Any]:
         """Return an observation of the environment in the form in which LeRobot's environments return it."""

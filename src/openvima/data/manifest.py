@@ -1,6 +1,7 @@
 """What lies beside the shards: the index of episodes, and the manifest with counts, checksums and origin."""
 
 import hashlib
+import itertools
 import json
 import re
 from collections import Counter
@@ -102,15 +103,13 @@ def finish_folder(
 
 
 def split_index(index: pa.Table) -> dict[str, pa.Table]:
-    """Return the rows of an index by shard."""
-    if index.num_rows == 0:
-        return {}
+    """Return the rows of an index by shard; those of a shard follow each other."""
     shards = index.column("shard").combine_chunks().dictionary_encode()
-    codes = shards.indices.to_numpy()
-    order = np.argsort(codes, kind="stable")
-    starts = np.searchsorted(codes[order], np.arange(1, len(shards.dictionary)))
-    names = shards.dictionary.to_pylist()
-    return {name: index.take(rows) for name, rows in zip(names, np.split(order, starts), strict=True)}
+    starts = np.flatnonzero(np.diff(shards.indices.to_numpy(), prepend=-1)).tolist()
+    return {
+        shards[start].as_py(): index.slice(start, end - start)
+        for start, end in itertools.pairwise([*starts, index.num_rows])
+    }
 
 
 def summarise_shard(path: Path) -> ShardSummary:

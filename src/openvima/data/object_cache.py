@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import pairwise
 from math import prod
 from operator import attrgetter
 from pathlib import Path
@@ -20,7 +19,7 @@ import pyarrow as pa
 from xxhash import xxh3_64
 
 from openvima.atomic_io import NO_SPACE, atomic_write, folder_lock
-from openvima.data.manifest import CACHE_FOLDER, joint_hash
+from openvima.data.manifest import CACHE_FOLDER, joint_hash, split_index
 from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empty_episode, preprocess
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
@@ -473,15 +472,8 @@ def _cache_folder(dataset: Dataset, kind: InputKind, folder: str | Path | None, 
 def _index_by_shard(dataset: Dataset) -> dict[str, pa.Table]:
     """Return the whole index of each shard that holds episodes of a data set."""
     whole = dataset if dataset.tasks is None else Dataset(dataset.path)
-    shards = whole.index.column("shard").combine_chunks().dictionary_encode()
-    # Episodes of a shard follow each other.
-    starts = np.flatnonzero(np.diff(shards.indices.to_numpy(), prepend=-1)).tolist()
-    parts = {
-        shards[start].as_py(): whole.index.slice(start, end - start)
-        for start, end in pairwise([*starts, whole.index.num_rows])
-    }
     wanted = set(dataset.shard_names())
-    return {name: part for name, part in parts.items() if name in wanted}
+    return {name: part for name, part in split_index(whole.index).items() if name in wanted}
 
 
 def _open_files(

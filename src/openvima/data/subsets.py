@@ -1,4 +1,4 @@
-"""Data sets derived from others: sample, split and merge.
+"""Data sets derived from others: sample, split and merge; where they may lie, and how they are written.
 
 Episodes are selected by a hash of their identity, never by their position: the selection is the same for any
 order of the episodes, on every machine, and with or without images.
@@ -7,33 +7,82 @@ order of the episodes, on every machine, and with or without images.
 import hashlib
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
 
-from openvima.atomic_io import atomic_folder, folder_lock
-from openvima.data.derived import ShardPart, check_out, identify_source, number_shards, write_shards
+from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import finish_folder
+from openvima.data.manifest import (
+    BROKEN_NAME,
+    CACHE_FOLDER,
+    FAILED_FOLDER,
+    INDEX_NAME,
+    MANIFEST_NAME,
+    finish_folder,
+)
 from openvima.data.planning import LARGEST_SHARD
 from openvima.data.reader import Dataset, select_tasks
+from openvima.data.shard import ShardWriter
 from openvima.env.config import EnvConfig
 from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.input_files import as_path, names_of, settle
-from openvima.multiprocess import Report
+from openvima.multiprocess import Report, imap_unordered
 from openvima.tasks.prompts import MULTIMODAL
-
-__all__ = ["MergeConfig", "Splits", "SubsetConfig", "merge", "parse_splits", "sample", "split"]
 
 Duplicates = Literal["refuse", "skip"]
 
 _SPLIT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _ROUNDING = 1e-6  # tolerance of the sum of fractions
 _NUM_NAMED = 3  # duplicates that a message names
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
+
+
+def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:
+    """Refuse a folder that holds something, or that lies where it would harm a source.
+
+    Args:
+        out: The folder to write.
+        sources: The data sets to read.
+        force: Whether a data set that is there may be replaced.
+
+    Raises:
+        DatasetError: Another folder must be given.
+    """
+    place = out.resolve()
+    for source in sources:
+        there = source.resolve()
+        if place == there or place in there.parents:
+            raise DatasetError(f"{out} holds the source {source}, which must stay. Give another folder.")
+        if there in place.parents:
+            raise DatasetError(f"{out} lies in the source {source}, which must stay as it is. Give another.")
+    if out.exists() and not out.is_dir():
+        raise DatasetError(f"{out} is a file. Give the name of a folder.")
+    if not out.exists() or all(map(is_lock_file, out.iterdir())):
+        return
+    if not force:
+        raise DatasetError(f"{out} is not empty. Give another folder, or --force to replace it.")
+    if not _holds_data_sets_only(out):
+        raise DatasetError(f"{out} holds other things than data sets, so --force does not replace it.")
+
+
+def _holds_data_sets_only(folder: Path) -> bool:
+    """Whether a folder is a data set, or holds some, and nothing besides."""
+    entries = [entry for entry in folder.iterdir() if not is_lock_file(entry)]
+    if (folder / MANIFEST_NAME).is_file():
+        return all(entry.suffix == ".arrow" or entry.name in _NAMES for entry in entries)
+    return all((entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in entries)
+
+
+def identify_source(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what identifies a source, wherever it lies: its content, and the settings that made it."""
+    return {key: manifest[key] for key in ("content_hash", "command", "config", "versions")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +314,78 @@ def _hash_episodes(index: pa.Table, purpose: str, seed: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ShardPart:
+    """Episodes of one data set that become a shard.
+
+    Args:
+        info: What all its rows have in common; `number_shards` gives it its number.
+        source: Folder of the data set that holds the rows.
+        checksum: Of that data set's manifest.
+        episodes: Numbers of the rows in the data set, in order.
+        path: The file, once the shard has a number.
+    """
+
+    info: ShardInfo
+    source: Path
+    checksum: str
+    episodes: Sequence[int]
+    path: Path = Path()
+
+
+def number_shards(folder: Path, parts: Iterable[ShardPart]) -> list[ShardPart]:
+    """Give shards their files in a folder; those of each task and level are numbered from 0."""
+    numbers, shards = Counter[tuple[str, str]](), []
+    for part in parts:
+        key = part.info.task, part.info.level
+        info = replace(part.info, number=numbers[key])
+        numbers[key] += 1
+        shards.append(replace(part, info=info, path=folder / info.file_name))
+    return shards
+
+
+def write_shards(shards: Sequence[ShardPart], num_workers: int, report: Report | None) -> None:
+    """Write shards in several processes.
+
+    Args:
+        shards: What to write.
+        num_workers: Number of processes.
+        report: Called with episodes done, episodes in all, and a note.
+
+    Raises:
+        DatasetError: What is read is damaged.
+    """
+    total = sum(len(shard.episodes) for shard in shards)
+    count = None if report is None else (lambda done: report(done, total, ""))
+    for _ in imap_unordered(write_shard, shards, num_workers, report=count):
+        pass  # a shard's result is its file
+
+
+def write_shard(shard: ShardPart, count: Callable[[int], None]) -> None:
+    """Write one shard; episodes are read, checked and written one by one.
+
+    Args:
+        shard: What to write.
+        count: Called with the number of episodes written so far.
+
+    Raises:
+        DatasetError: What is read is damaged.
+    """
+    dataset = _open_unchanged(shard.source, shard.checksum)
+    with ShardWriter(shard.path, shard.info) as writer:
+        for number, episode_index in enumerate(shard.episodes, start=1):
+            writer.copy(dataset.batch(episode_index))
+            count(number)
+
+
+@lru_cache(maxsize=2)
+def _open_unchanged(folder: Path, checksum: str) -> Dataset:
+    dataset = Dataset(folder)
+    if dataset.manifest["checksum"] != checksum:
+        raise DatasetError(f"{folder} was changed while it was read. Repeat the command.")
+    return dataset
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Subset:
     """One data set to write: its folder, which episodes it has, and what its manifest says."""
 
@@ -305,7 +426,7 @@ def _group(dataset: Dataset, episodes: Sequence[int]) -> list[ShardPart]:
         key, common = commons[name]
         groups.setdefault(key, (common, []))[1].append(episode_index)
     return [
-        ShardPart(info, dataset, members[start : start + LARGEST_SHARD])
+        ShardPart(info, dataset.path, dataset.manifest["checksum"], members[start : start + LARGEST_SHARD])
         for _, (info, members) in sorted(groups.items())
         for start in range(0, len(members), LARGEST_SHARD)
     ]
@@ -362,7 +483,8 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
     parts = _find_shards(datasets, config.tasks)
     if not parts:
         raise DatasetError("the sources hold no episodes, so there is nothing to merge.")
-    parts = _skip_duplicates(parts, refuse=config.duplicates == "refuse")
+    indices = {dataset.path: dataset.index for dataset in datasets}
+    parts = _skip_duplicates(parts, indices, refuse=config.duplicates == "refuse")
     settings = {
         "sources": [identify_source(dataset.manifest) for dataset in datasets],
         "tasks": None if config.tasks is None else sorted(config.tasks),
@@ -408,12 +530,15 @@ def _find_shards(datasets: Sequence[Dataset], tasks: Sequence[str] | None) -> li
                 # Of duplicates the first is kept: rather one with images than one without.
                 first_seed = int(seeds[episodes[0]])
                 order = (info.task, info.level, info.domain, first_seed, not info.images, sha256)
-                found.append((order, ShardPart(info, dataset, episodes.tolist())))
+                checksum = dataset.manifest["checksum"]
+                found.append((order, ShardPart(info, dataset.path, checksum, episodes.tolist())))
     return [part for _, part in sorted(found, key=lambda entry: entry[0])]
 
 
-def _skip_duplicates(parts: Sequence[ShardPart], *, refuse: bool) -> list[ShardPart]:
-    """Keep the first of all episodes of one name and setup.
+def _skip_duplicates(
+    parts: Sequence[ShardPart], indices: Mapping[Path, pa.Table], *, refuse: bool
+) -> list[ShardPart]:
+    """Keep the first of all episodes of one name and setup; `indices` are those of the sources.
 
     Where only the prompts or task options of two setups differ, episodes of equal content count as of one.
 
@@ -427,16 +552,16 @@ def _skip_duplicates(parts: Sequence[ShardPart], *, refuse: bool) -> list[ShardP
         setup = part.info.env_config
         common = replace(setup, prompts=MULTIMODAL, task_options="")
         names = ("task", "level", "domain", "seed", "content_hash")
-        rows = part.dataset.index.select(names).take(part.episodes).to_pylist()
+        rows = indices[part.source].select(names).take(part.episodes).to_pylist()
         episodes = []
         for episode_index, row in zip(part.episodes, rows, strict=True):
             content = common, row.pop("content_hash")
             key = *row.values(), setup_of_content.setdefault(content, setup)
             if key not in folders:
-                folders[key] = part.dataset.path
+                folders[key] = part.source
                 episodes.append(episode_index)
             else:
-                where = " and ".join(dict.fromkeys(map(str, (folders[key], part.dataset.path))))
+                where = " and ".join(dict.fromkeys(map(str, (folders[key], part.source))))
                 repeats.append("{task} {level} {domain} seed {seed}".format(**row) + f" in {where}")
         total += len(rows)
         if episodes:

@@ -14,11 +14,11 @@ import pytest
 
 import openvima
 from openvima.cli.main import main
-from openvima.data import Dataset, Demonstration, GenerateConfig, generate, lerobot_files
+from openvima.data import Dataset, Demonstration, GenerateConfig, generate, lerobot
 from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.lerobot_frames import DenseLayout, dense_trajectory
 from openvima.data.records import rollout_oracle
-from openvima.data.replay import find_difference
+from openvima.data.verification import find_difference
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import DatasetError
 
@@ -261,8 +261,8 @@ def test_large_exports_are_spread_over_several_files(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     data = store([made_up(seed, num_steps=4, num_images=0) for seed in range(5)])
-    monkeypatch.setattr(lerobot_files, "EPISODES_PER_FILE", 2)
-    monkeypatch.setattr(lerobot_files, "MAX_FRAMES", 8)
+    monkeypatch.setattr(lerobot, "EPISODES_PER_FILE", 2)
+    monkeypatch.setattr(lerobot, "MAX_FRAMES", 8)
     export = export_lerobot(LerobotConfig(data, tmp_path / "out"))
     for pattern in ("data", "meta/episodes"):
         tables = [pq.read_table(file) for file in sorted((export / pattern).rglob("*.parquet"))]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openvima.data import Demonstration
-from openvima.data.lerobot_files import (
+from openvima.data.lerobot import (
     DATA_PATH,
     QUANTILES,
     NumberedVideo,
