@@ -13,7 +13,7 @@ import pytest
 from openvima.catalog import Pool, load_assets, packs, registration
 from openvima.catalog.packs import recorded_assets
 from openvima.cli.main import main
-from openvima.data import Dataset, GenerateConfig, generate, replay, rerender
+from openvima.data import Dataset, GenerateConfig, generate, rerender, verification
 from openvima.data.verification import VerifyConfig, verify
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import AssetError, ConfigError, UnknownNameError
@@ -41,7 +41,7 @@ def forget() -> None:
     """Undo what the functions did, as another process would find it."""
     packs._packs.clear()
     os.environ.pop(packs._LOADED_VARIABLE, None)
-    for cached in (rerender._rasteriser, replay._make_env):
+    for cached in (rerender._rasteriser, verification._make_env):
         cached.cache_clear()
     for table in (registration.REGISTERED_OBJECTS, registration.REGISTERED_TEXTURES):
         for name in [name for name in table if name.startswith("test ")]:
