@@ -87,7 +87,7 @@ def _problem(name: str, value: Any, hint: Any, *, of_network: bool) -> str | Non
     if kind not in _TYPES:
         return None
     expected, called = _TYPES[kind]
-    if not isinstance(value, expected) or (isinstance(value, bool) and kind is not bool):
+    if value is None or not isinstance(value, expected) or (isinstance(value, bool) and kind is not bool):
         return f"{name} is {short(value)}; it must be {called}."
     if of_network and kind is int:
         limits = Range(0, _LIMITS.get(name.rpartition(".")[2], MAX_WIDTH))
