@@ -314,9 +314,8 @@ def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
         second, first = divmod(zlib.adler32(row, checksum), 1 << 16)
         checksum = (second + len(repeated) * first + high) % 65521 << 16 | (first + low) % 65521
     data += [packer.flush(), checksum.to_bytes(4, "big")]
-    head = struct.pack(
-        ">IIBBBBB", enlarge * width, enlarge * height, 8, 2, 0, 0, 0
-    )  # eight bits of red, green and blue
+    size = enlarge * width, enlarge * height
+    head = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)  # eight bits of red, green and blue
     chunks = ((b"IHDR", head), (b"IDAT", b"".join(data)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -92,14 +92,14 @@ class RateFigure:
 
 def rate_table(figure: RateFigure) -> Table:
     """Write the numbers of a figure as a table: a row for each curve of each panel."""
-    lines = []
+    lines, values = [], figure.values
     for title, curves in figure.panels.items():
         for index, (name, published) in enumerate({c.name: c.published for c in curves}.items()):
             points = {point.x: point for curve in curves if curve.name == name for point in curve.points}
-            cells = [_cell(points[x]) if x in points else "–" for x in figure.values]
+            cells = [_cell(points[x]) if x in points else "–" for x in values]
             shown = f"{name} (published)" if published else name
             lines.append(Line(shown, (title, *cells), starts_group=index == 0 and bool(lines)))
-    columns = ("policy", "level", *map(figure.tick, figure.values))
+    columns = ("policy", "level", *map(figure.tick, values))
     caption = f"{figure.caption} Columns: {figure.quantity}. Rates in %, with 95 % intervals."
     return Table(figure.label, caption, columns, tuple(lines))
 

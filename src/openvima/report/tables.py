@@ -140,8 +140,7 @@ def _mean(
 ) -> Estimate | str:
     """Mean over tasks, by default all of the level; with their number where some are lacking."""
     tasks = tasks or results.tasks(level)
-    wanted = (policy, level, ablation)
-    rows = [r for r in results.rows if (r.policy, r.level, r.ablation) == wanted and r.task in tasks]
+    rows = [row for task in tasks if (row := results.row(policy, task, level, ablation))]
     if not rows:
         return "–"
     mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])

@@ -49,8 +49,8 @@ class Execution:
     def __post_init__(self) -> None:
         if self.workers is not None:
             check_workers(self.workers)
-        if problems := list(engine_problems(self.engine, self.address)):
-            raise ConfigError(*problems)
+        for problem in engine_problems(self.engine, self.address):
+            raise ConfigError(problem)
 
     @property
     def is_serial(self) -> bool:
