@@ -1,11 +1,12 @@
 """The papers' table from trainings of this package: VIMA, its baselines and MIDAS in size nano.
 
-    openvima generate --tasks <the 13 of training> --episodes 4000 --workers 2 --out train
+    openvima generate --tasks all --episodes 4000 --workers 2 --out train
     python experiments/papers/papers.py --data train --out papers --only vima,midas
 
 Each run is one `openvima train` with its default recipe and one `openvima evaluate`; repeating the command
-resumes. NAME.json in --out is its record: options, costs, learning curve, successes by task and level. The
-table of all records there is written to --out/table.md. Runs of equal steps, on the same demonstrations.
+resumes. Options that are not this script's are given to every training, such as --schedule.steps 3000.
+NAME.json in --out is the record of a run: options, costs, learning curve, successes by task and level. The
+table of all records there is written to --out/table.md.
 """
 
 import argparse
@@ -32,6 +33,10 @@ RUNS: dict[str, tuple[str, tuple[str, ...]]] = {
         "VIMA, no random appearance",
         ("--preset", "vima-nano", "--loader.rerendered-prob", "0"),
     ),
+    "vima-baselines": (
+        "VIMA, recipe of the baselines",
+        ("--preset", "vima-nano", "--recipe", "papers-frames"),
+    ),
     "gato": ("VIMA-Gato", ("--preset", "gato-nano")),
     "flamingo": ("VIMA-Flamingo", ("--preset", "flamingo-nano")),
     "gpt": ("VIMA-GPT", ("--preset", "gpt-nano")),
@@ -50,23 +55,21 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of demonstrations")
     parser.add_argument("--out", type=Path, required=True, help="folder of runs, evaluations and records")
     parser.add_argument("--only", default=",".join(RUNS), help="names, separated by commas")
-    parser.add_argument("--steps", type=int, help="steps of each run; default: those of the recipe")
     parser.add_argument("--episodes", type=int, default=100, help="episodes per task and level")
     parser.add_argument("--seed", type=int, default=4_000_000, help="first seed of the evaluation")
-    given = parser.parse_args()
+    given, for_all = parser.parse_known_args()
     if unknown := [name for name in given.only.split(",") if name not in RUNS]:
         parser.error(f"there is no run {unknown[0]!r}; allowed: {', '.join(RUNS)}.")
     for name in given.only.split(","):
         what, options = RUNS[name]
-        steps = ("--schedule.steps", f"{given.steps}") if given.steps else ()
         run, scores = given.out / name / "run", given.out / name / "evaluation"
         common = ("--data", os.fspath(given.data), "--runtime.no-tensorboard")
-        openvima("train", *common, *options, *steps, "--out", os.fspath(run))
+        openvima("train", *common, *options, *for_all, "--out", os.fspath(run))
         counts = ("--episodes", f"{given.episodes}", "--seed", f"{given.seed}", "--workers", "2")
         openvima(
             *("evaluate", "--policy", f"{name}={run}", *counts, "--no-report", "--out", os.fspath(scores))
         )
-        record = record_of(what, run, scores, options=[*options, *steps])
+        record = record_of(what, run, scores, options=[*options, *for_all])
         atomic_write_file(given.out / f"{name}.json", json.dumps(record, indent=1) + "\n")
     records = [json.loads(path.read_text("utf-8")) for path in sorted(given.out.glob("*.json"))]
     atomic_write_file(given.out / "table.md", table(records))
