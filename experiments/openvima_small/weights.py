@@ -15,16 +15,9 @@ from openvima.data import Dataset
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import load_network, read_info, write_checkpoint
-from openvima.policies.naming import WEIGHTS_FILE
+from openvima.policies.naming import CONFIG_FILE, METRICS_FILE, WEIGHTS_FILE
 from openvima.policies.t5 import tokenizer_for
-from openvima.training.run_folder import (
-    CONFIG_FILE,
-    METRICS_FILE,
-    SESSIONS_FILE,
-    TIMINGS_FILE,
-    read_costs,
-    whole_lines,
-)
+from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, read_costs, whole_lines
 from openvima.training.validation import flatten
 from training_data import appearance_record, appearance_text
 

@@ -21,8 +21,8 @@ from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.build import policy_size
 from openvima.policies.checkpoint import read_info
-from openvima.policies.naming import find_checkpoint
-from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, read_costs, whole_lines
+from openvima.policies.naming import METRICS_FILE, find_checkpoint
+from openvima.training.run_folder import SESSIONS_FILE, read_costs, whole_lines
 
 LEVELS = ("L1", "L2", "L3", "L4")
 # Name of a run to what it is, and its options.

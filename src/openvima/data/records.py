@@ -1,12 +1,13 @@
 """A demonstration: observations, actions and outcome of one rollout; its columns, as shards store them."""
 
+import contextlib
 import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -204,8 +205,12 @@ def package_versions() -> dict[str, str]:
 
 @lru_cache
 def versions_of(*packages: str) -> Mapping[str, str]:
-    """Return the versions of this package and of others, looked up once."""
-    return MappingProxyType({"openvima": __version__, **{name: version(name) for name in packages}})
+    """Return the versions of this package and of others that are installed, looked up once."""
+    found = {"openvima": __version__}
+    for name in packages:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return MappingProxyType(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

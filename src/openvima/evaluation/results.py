@@ -8,12 +8,11 @@ import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from openvima import __version__
 from openvima.atomic_io import atomic_write_file
+from openvima.data.records import versions_of
 from openvima.env.registration import ENVIRONMENT_VERSION
 from openvima.errors import MAX_CHARACTERS, DatasetError, InputFileError, brief_repr, cut, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
@@ -417,9 +416,6 @@ def _rounded(value: float) -> float:
     return round(value, 6)
 
 
-_PACKAGES = ("numpy", "numba", "mujoco", "gymnasium")
-
-
 def versions(*, with_torch: bool) -> dict[str, str]:
     """List the versions that can change the outcome of an episode.
 
@@ -429,14 +425,8 @@ def versions(*, with_torch: bool) -> dict[str, str]:
     Returns:
         Package name to version, without importing any of them.
     """
-    found = {
-        "openvima": __version__,
+    return {
+        **versions_of("numpy", "numba", "mujoco", "gymnasium", *(["torch"] if with_torch else [])),
         "environments": f"v{ENVIRONMENT_VERSION}",
         "python": platform.python_version(),
     }
-    for package in (*_PACKAGES, *(("torch",) if with_torch else ())):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found

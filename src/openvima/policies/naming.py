@@ -14,6 +14,7 @@ from openvima.user_code import is_code
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.yaml"
+METRICS_FILE = "metrics.jsonl"  # of a training, a line a step
 TOKENIZER_FOLDER = "tokenizer"
 CHECKPOINTS_FOLDER = "checkpoints"
 BEST_FILE = "best.txt"  # in the checkpoints folder; contains the name of the best one

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.errors import DatasetError
+from openvima.policies.naming import METRICS_FILE
 
 Curve = Sequence[tuple[float, float]]
 
-METRICS_FILE = "metrics.jsonl"
 _KINDS = (  # part of a metric's name, and whether it is a fraction
     ("loss", False),
     ("accuracy", True),

@@ -16,8 +16,7 @@ from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
 from openvima.multiprocess import Report, imap_unordered
-from openvima.policies.naming import BUNDLED, ORACLE, PolicyRef
-from openvima.report.curves import METRICS_FILE
+from openvima.policies.naming import BUNDLED, METRICS_FILE, ORACLE, PolicyRef
 from openvima.report.page import default_command, write_report
 from openvima.report.text import Confirmation
 from openvima.video.encoder import Clip, load_clips, png, save_clips

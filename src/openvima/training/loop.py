@@ -24,17 +24,11 @@ from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, Terminated
 from openvima.multiprocess import Report
 from openvima.policies.base import torch_threads
+from openvima.policies.naming import METRICS_FILE
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
 from openvima.training.parallel import Parallel, join_processes, load_named_state, named_state
-from openvima.training.run_folder import (
-    METRICS_FILE,
-    SESSIONS_FILE,
-    TIMINGS_FILE,
-    RunFolder,
-    index_hash,
-    provenance,
-)
+from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, RunFolder, index_hash, provenance
 from openvima.training.trackers import Tracker, open_trackers
 from openvima.video.encoder import Animation
 

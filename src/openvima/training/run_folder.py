@@ -18,7 +18,6 @@ import subprocess
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +36,21 @@ from openvima.atomic_io import (
 )
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset
+from openvima.data.records import versions_of
 from openvima.errors import ConfigError, InputFileError, differences
 from openvima.input_files import read_json, read_yaml
-from openvima.policies.naming import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_order
+from openvima.policies.naming import (
+    BEST_FILE,
+    CHECKPOINTS_FOLDER,
+    CONFIG_FILE,
+    METRICS_FILE,
+    checkpoint_order,
+)
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.learner import Learner
 from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER
 from openvima.training.validation import flatten
 
-CONFIG_FILE = "config.yaml"
-METRICS_FILE = "metrics.jsonl"
 TIMINGS_FILE = "timings_log.jsonl"
 SESSIONS_FILE = "sessions_log.jsonl"
 OPTIMIZER_FILE = "optimizer.safetensors"
@@ -286,14 +290,11 @@ def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
             continue
 
 
-_PACKAGES = ("torch", "numpy", "pyarrow", "safetensors", "transformers")
-
-
 def provenance(dataset: Dataset) -> dict[str, Any]:
     """Return versions, the git commit of the package if it is in a checkout, and digests of the data."""
     content = (dataset.path / MANIFEST_NAME).read_bytes()
     return {
-        "versions": {"openvima": openvima.__version__, **_versions()},
+        "versions": dict(versions_of("torch", "numpy", "pyarrow", "safetensors", "transformers")),
         "git": git_state(Path(openvima.__file__).parent),
         "data": {
             "content_hash": dataset.manifest["content_hash"],
@@ -346,16 +347,6 @@ def git_state(folder: Path) -> dict[str, Any] | None:
     if commit is None or ask("ls-files", "--error-unmatch", ".") is None:  # installed inside a checkout
         return None
     return {"commit": commit, "changed": bool(ask("status", "--porcelain", "--untracked-files=no"))}
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 _TIMES = ("seconds_since_start", "cpu_seconds_since_start")
