@@ -1,10 +1,13 @@
-"""Imports on first use, packages that are not always installed, and too little memory for them."""
+"""Imports on first use, optional packages, too little memory for them, and versions."""
 
+import contextlib
 import re
 import sys
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from importlib import import_module
-from types import ModuleType
+from importlib.metadata import PackageNotFoundError, version
+from types import MappingProxyType, ModuleType
 
 from openvima.errors import MissingExtraError, echo
 
@@ -77,3 +80,15 @@ def import_extra(module: str, message: str) -> ModuleType:
         if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
             raise MissingExtraError(message) from error
         raise MissingExtraError(f"{module} cannot be imported ({echo(str(error))}); {message}") from error
+
+
+@lru_cache
+def versions_of(*packages: str) -> Mapping[str, str]:
+    """Return the versions of this package and of others that are installed, looked up once."""
+    from openvima import __version__  # the package imports this module first
+
+    found = {"openvima": __version__}
+    for name in packages:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return MappingProxyType(found)

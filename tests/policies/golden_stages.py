@@ -170,14 +170,19 @@ def _sequence_stages(
     inputs: Inputs,
 ) -> Arrays:
     """Decode the whole sequence with its masked positions, which the network itself leaves out."""
-    decoder = network.decoder
+    decoder, known_BL = network.decoder, torch.ones_like(mask_BL)
     with watched(network) as calls:
-        _, cache = decoder(network.init_cache(prompt), tokens_BLD, mask_BL)
-    known_BL, mask = torch.ones_like(mask_BL), cache.mask_BS.numpy()
+        if isinstance(decoder, PrefixDecoder):
+            separator_B1D = decoder.separator.expand(len(tokens_BLD), 1, -1)
+            tokens_BLD = torch.cat([prompt.tokens_BLD, separator_B1D, tokens_BLD], dim=1)
+            mask_BL = torch.cat([prompt.mask_BL, known_BL[:, :1], mask_BL], dim=1)
+            known_BL = torch.cat([_within_prompts(prompt, inputs), known_BL[:, :1], known_BL], dim=1)
+            before = decoder._empty_cache(tokens_BLD, mask_BL)
+        else:
+            before = network.init_cache(prompt)
+        _, cache = decoder(before, tokens_BLD, mask_BL)
+    mask = cache.mask_BS.numpy()
     if isinstance(decoder, PrefixDecoder):
-        separator_B1D = decoder.separator.expand(len(tokens_BLD), 1, -1)
-        tokens_BLD = torch.cat([prompt.tokens_BLD, separator_B1D, tokens_BLD], dim=1)
-        known_BL = torch.cat([_within_prompts(prompt, inputs), known_BL[:, :1], known_BL], dim=1)
         mask = mask[:, None]
     result = {
         "seq.tokens": only(time_first(tokens_BLD), known_BL.T),

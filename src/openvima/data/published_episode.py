@@ -18,9 +18,10 @@ from PIL import Image
 
 from openvima.catalog import OBJECTS
 from openvima.data.published_sources import FRAME_FOLDERS, PICKLES
-from openvima.data.records import Demonstration, versions_of
+from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
 from openvima.errors import DatasetError, unknown_name
+from openvima.imports import versions_of
 from openvima.render import channels_first
 from openvima.render.camera import TOP, project
 from openvima.scene import (

@@ -1,23 +1,19 @@
 """A demonstration: observations, actions and outcome of one rollout; its columns, as shards store them."""
 
-import contextlib
 import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xxhash
 
-from openvima import __version__
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.errors import brief_repr
 from openvima.html import notebook_html
+from openvima.imports import versions_of
 from openvima.scene import (
     ACTION_SHAPES,
     END_EFFECTORS,
@@ -201,16 +197,6 @@ def _stack(observations: Sequence[Mapping[str, Any]], key: str) -> dict[str, np.
 def package_versions() -> dict[str, str]:
     """Return the versions of all packages that decide the bytes of a demonstration."""
     return dict(versions_of("mujoco", "numba", "numpy", "pyarrow"))
-
-
-@lru_cache
-def versions_of(*packages: str) -> Mapping[str, str]:
-    """Return the versions of this package and of others that are installed, looked up once."""
-    found = {"openvima": __version__}
-    for name in packages:
-        with contextlib.suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return MappingProxyType(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
-from openvima.data.records import versions_of
 from openvima.env.registration import ENVIRONMENT_VERSION
 from openvima.errors import MAX_CHARACTERS, DatasetError, InputFileError, brief_repr, cut, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
 from openvima.html import notebook_html
+from openvima.imports import versions_of
 from openvima.input_files import as_path, read_text
 
 SCHEMA = 1

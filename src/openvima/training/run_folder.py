@@ -36,8 +36,8 @@ from openvima.atomic_io import (
 )
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset
-from openvima.data.records import versions_of
 from openvima.errors import ConfigError, InputFileError, differences
+from openvima.imports import versions_of
 from openvima.input_files import read_json, read_yaml
 from openvima.policies.naming import (
     BEST_FILE,
