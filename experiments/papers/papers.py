@@ -80,7 +80,8 @@ def record_of(what: str, run: Path, scores: Path, *, options: list[str]) -> dict
     """Return the record of one training and its evaluation, as plain JSON values."""
     results = json.loads((scores / "results.json").read_text("utf-8"))
     curve = [values for _, values in whole_lines(run / METRICS_FILE) if "validation_loss" in values]
-    keys = ("step", "validation_loss", "validation_accuracy", "validation_pick_accuracy")
+    shares = (f"validation_{part}_accuracy" for part in ("object", "pick", "place", "rotation"))
+    keys = ("step", "validation_loss", *shares)
     costs = read_costs(run)
     return {
         "what": what,
