@@ -182,11 +182,9 @@ def _sequence_stages(
             before = network.init_cache(prompt)
         _, cache = decoder(before, tokens_BLD, mask_BL)
     mask = cache.mask_BS.numpy()
-    if isinstance(decoder, PrefixDecoder):
-        mask = mask[:, None]
     result = {
         "seq.tokens": only(time_first(tokens_BLD), known_BL.T),
-        "seq.mask": mask,
+        "seq.mask": mask[:, None] if isinstance(decoder, PrefixDecoder) else mask,
         "seq.position_ids": calls.input("decoder.positions").numpy(),
     }
     for layer in range(len(decoder.self_blocks)):

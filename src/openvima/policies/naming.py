@@ -14,7 +14,7 @@ from openvima.user_code import is_code
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.yaml"
-METRICS_FILE = "metrics.jsonl"  # of a training, a line a step
+METRICS_FILE = "metrics.jsonl"  # in the folder of a run
 TOKENIZER_FOLDER = "tokenizer"
 CHECKPOINTS_FOLDER = "checkpoints"
 BEST_FILE = "best.txt"  # in the checkpoints folder; contains the name of the best one

@@ -277,6 +277,7 @@ class PrefixDecoder(CausalDecoder):
         separator_B1D = self.separator.expand(len(prompt_BPD), 1, -1)
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
+        # Nothing attends to what is masked, most of it padding, so none of it is computed.
         return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP, mask_BP)[1]
 
     def align(self) -> None:
