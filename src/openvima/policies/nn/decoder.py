@@ -149,6 +149,8 @@ class CausalDecoder(nn.Module):
         tokens_BLD: torch.Tensor,
         mask_BL: torch.Tensor,
         valid_BL: torch.Tensor | None = None,
+        *,
+        only_cache: bool = False,
     ) -> tuple[torch.Tensor, KVCache]:
         """Decode the next tokens.
 
@@ -157,6 +159,7 @@ class CausalDecoder(nn.Module):
             tokens_BLD: Tokens in temporal order.
             mask_BL: Which of them may be attended to, bool. Masked tokens still get an output.
             valid_BL: Which get an output, bool, those of the mask among them; all by default.
+            only_cache: Leave out the last block but for its keys and values; the outputs mean nothing then.
 
         Returns:
             Outputs, shape (B, L, D), zero where not valid, and the cache after them. A token attends to the
@@ -177,6 +180,9 @@ class CausalDecoder(nn.Module):
         past = []
         for layer, block in enumerate(self.self_blocks):
             x_ND = self._cross_attend(layer, x_ND, unpadder, cache, prompt_bias_B11P)
+            if only_cache and layer == len(self.self_blocks) - 1:
+                past.append(cast(SelfBlock, block).project(x_ND, unpadder, cache.past[layer])[1:])
+                break
             x_ND, keys_values = block(x_ND, unpadder, cache.past[layer], self_bias_B1LS)
             past.append(keys_values)
         mask_BS = torch.cat([cache.mask_BS, mask_BL], dim=1)
@@ -278,7 +284,7 @@ class PrefixDecoder(CausalDecoder):
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
         # Nothing attends to what is masked, most of it padding, so none of it is computed.
-        return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP, mask_BP)[1]
+        return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP, mask_BP, only_cache=True)[1]
 
     def align(self) -> None:
         """Do so in the first block, whose attention reaches the history as well."""
@@ -372,16 +378,22 @@ class SelfBlock(nn.Module):
         Returns:
             Outputs, and the keys and values of all positions.
         """
-        # (B, L, 3·D) -> (3, B, H, L, K)
-        padded = unpadder.pad(self.query_key_value(x_ND)).unflatten(-1, (3, self.num_heads, -1))
-        query, key, value = padded.permute(2, 0, 3, 1, 4)
-        key, value = torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
+        query, key, value = self.project(x_ND, unpadder, past)
         dropout = self.attention_dropout if self.training else 0.0
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias_B1LS, dropout_p=dropout)
         attended = self.dropout(self.attention_out(unpadder.unpad(mixed.transpose(1, 2).flatten(2))))
         attended = self.norm_attention(x_ND + attended)
         hidden = self.narrow(F.gelu(self.widen(attended)) * self.gate(attended))
         return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
+
+    def project(
+        self, x_ND: torch.Tensor, unpadder: Unpadder, past: KeysValues
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the queries of new tokens, and the keys and values of all."""
+        # (B, L, 3·D) -> (3, B, H, L, K)
+        padded = unpadder.pad(self.query_key_value(x_ND)).unflatten(-1, (3, self.num_heads, -1))
+        query, key, value = padded.permute(2, 0, 3, 1, 4)
+        return query, torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
 
 
 def _align(query_DD: torch.Tensor, key_DD: torch.Tensor) -> None:
