@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 import torch
 
-from openvima.errors import PolicyError, PromptError, ShapeError
 from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import (
     GROUND_TRUTH,
@@ -21,11 +20,9 @@ from openvima.perception.objects import (
     ObjectExtractor,
     ObjectViews,
     end_effector_of,
-    part_of,
     whole_frames,
 )
 from openvima.policies.batch import WORD, HistoryBatch, InputLayout, PromptBatch
-from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
@@ -107,17 +104,9 @@ class NaiveProcessor:
         )
 
     def encode_prompt(self, prompt: RenderedPrompt) -> PromptInput:
-        """Turn a prompt into words and images.
-
-        Raises:
-            PromptError: It is empty, a word is unknown, or placeholders and images do not match.
-            PolicyError: An image lacks a view.
-            ShapeError: An image has another shape or dtype.
-        """
+        """Turn a prompt into words and images."""
         places: list[tuple[int, int, int, bool]] = []  # word, entry, part, counts
         sequence = prompt.sequence()
-        if not sequence:
-            raise PromptError("the prompt is empty; it must hold at least one word or image.")
         images = [self._see_prompt_image(piece) for piece in sequence if isinstance(piece, PromptImage)]
         slots = _widest(images)
         if self.layout == "views":
@@ -147,24 +136,9 @@ class NaiveProcessor:
         """Return the processor of one episode's observations."""
         return NaiveEpisode(self)
 
-    def see_frames(self, rgb: Mapping[str, np.ndarray]) -> ObjectViews:
-        """Take both frames whole, at the size that the network takes.
-
-        Raises:
-            PolicyError: A view is missing.
-            ShapeError: A frame has another shape or dtype.
-        """
-        frames = whole_frames(rgb)
-        if frames.crops.shape[-2:] != self.image_size:
-            height, width = (2 * length for length in self.image_size)
-            raise ShapeError(
-                f"the frames are {rgb[VIEWS[0]].shape}; this policy takes those of (3, {height}, {width})."
-            )
-        return frames
-
     def _see_prompt_image(self, image: PromptImage) -> ObjectViews:
         if self.layout == "frames":
-            return self.see_frames(image.rgb)
+            return whole_frames(image.rgb)
         objects = self.extractor.in_prompt_image(image)
         return objects if self.layout == "objects" else objects.compact()
 
@@ -198,36 +172,17 @@ class NaiveEpisode:
         Args:
             observation: `rgb` and `segm`, each view name to array, and `ee`, the index of the end effector.
                 `segm` only where objects are found by it.
-
-        Raises:
-            PolicyError: A part or a view is missing, there is no such end effector, or no object is in view.
-                With a token for each view the last is allowed after the first step. Or there are too many.
-            ShapeError: An image has another shape or dtype.
         """
         layout, end_effector = self._processor.layout, end_effector_of(observation)
         if layout == "frames":
-            frames = self._processor.see_frames(part_of(observation, "rgb"))
+            frames = whole_frames(observation["rgb"])
             centre = frames.positions()
             return StepInput(frames, centre, centre, end_effector)
         objects = self._processor.extractor.in_observation(observation)
-        if not len(objects) and not self._num_slots:
-            raise PolicyError(
-                "the observation shows no object; there is nothing to act on. Look at its segmentation, "
-                "or at what the detector finds and at min_score."
-            )
-        self._check_count(len(objects))
         if layout == "views":
             self._num_slots = max(self._num_slots, len(objects))
             objects = objects.compact().pad(self._num_slots)
         return StepInput(objects, objects.positions(), objects.grasp_points(), end_effector)
-
-    def _check_count(self, count: int) -> None:
-        """Refuse what no history has room for; a long history may have less."""
-        limit = MAX_POSITIONS // (len(VIEWS) if self._processor.layout == "views" else 1) - 1
-        if count > limit:
-            raise PolicyError(
-                f"the observation shows {count} objects; this policy takes {limit}. Raise its min_score."
-            )
 
 
 def _widest(images: Sequence[ObjectViews]) -> list[int]:
@@ -256,18 +211,16 @@ def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -
         named[row, :size] = False if prompt.names_texture is None else prompt.names_texture
         first += len(prompt.objects)
     objects = [prompt.objects for prompt in prompts]
-    return PromptBatch(
-        torch.from_numpy(words),
-        torch.from_numpy(images),
-        torch.from_numpy(mask),
-        torch.from_numpy(named),
-        torch.from_numpy(np.concatenate(list(crops), axis=1)),
-        torch.from_numpy(np.concatenate([each.boxes for each in objects], axis=1)),
-        torch.from_numpy(np.concatenate([each.masks for each in objects], axis=1)),
-        torch.from_numpy(np.concatenate([each.positions() for each in objects])),
-        torch.from_numpy(np.concatenate([prompt.numbers for prompt in prompts])),
-        torch.from_numpy(np.concatenate([prompt.in_scene for prompt in prompts])),
+    arrays = (
+        *(words, images, mask, named),
+        np.concatenate(list(crops), axis=1),
+        np.concatenate([each.boxes for each in objects], axis=1),
+        np.concatenate([each.masks for each in objects], axis=1),
+        np.concatenate([each.positions() for each in objects]),
+        np.concatenate([prompt.numbers for prompt in prompts]),
+        np.concatenate([prompt.in_scene for prompt in prompts]),
     )
+    return PromptBatch(*map(torch.from_numpy, arrays))
 
 
 def batch_histories(
@@ -301,4 +254,4 @@ def batch_histories(
             end_effector[b, t] = step.end_effector
             exists[b, t] = True
     arrays = (numbers, boxes, masks, counts, positions, grasps, end_effector, exists)
-    return HistoryBatch(*(torch.from_numpy(array) for array in arrays))
+    return HistoryBatch(*map(torch.from_numpy, arrays))

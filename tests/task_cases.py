@@ -50,7 +50,12 @@ def roles_with_twins(problem: Problem) -> tuple[Placement, Placement, Placement,
 
 def judge_step(problem: Problem, moved: dict[int, Pose]) -> Outcome:
     """Outcome of a first step that leaves these objects there."""
-    return advance(problem, begin(problem), problem.scene.with_poses(moved))[1]
+    return judged(problem, moved)[1]
+
+
+def moves(problem: Problem) -> list[dict[int, Pose]]:
+    """One step for each goal, in order."""
+    return [{goal.object_id: goal.target} for goal in problem.goals if isinstance(goal, AtPose)]
 
 
 def beside(problem: Problem, anchor: Pose, distance_m: float, *, moved_id: int) -> Pose:
@@ -170,6 +175,17 @@ def random_action(rng: np.random.Generator, scene: Scene) -> dict[str, np.ndarra
         for i, pose in enumerate(zip(points, turns.astype(np.float32), strict=True))
         for name, value in zip(("position", "rotation"), pose, strict=True)
     }
+
+
+def frozen(value: Any) -> Any:
+    """A nested observation, info or result as something that `==` compares byte by byte."""
+    if isinstance(value, dict):
+        return {key: frozen(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [frozen(entry) for entry in value]
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        return value.shape, value.dtype.str, value.tobytes()
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def full_repr(value: Any) -> str:

@@ -45,21 +45,26 @@ def collision_points(geometry):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_a_mesh_is_well_formed(name):
-    mesh = build(name).visual
+def test_a_mesh_is_well_formed_and_small_and_its_body_touches_the_floor(name):
+    geometry = build(name)
+    mesh = geometry.visual
     assert mesh.vertices.shape == mesh.normals.shape == (*mesh.uvs.shape[:2], 3)
     assert all(array.dtype == np.float64 for array in (mesh.vertices, mesh.normals, mesh.uvs))
     assert np.linalg.norm(mesh.normals, axis=2) == pytest.approx(1.0)
     assert mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
-    assert np.linalg.norm(face_normals(mesh), axis=1).min() > 0
+    assert len(mesh.vertices) <= (600 if name in ("bowl", "pan") else 210)
 
-
-@pytest.mark.parametrize("name", ALL)
-def test_corners_run_counter_clockwise_seen_from_outside(name):
-    mesh = build(name).visual
-    normals = face_normals(mesh)
+    normals = face_normals(mesh)  # corners run counter-clockwise seen from outside
+    assert np.linalg.norm(normals, axis=1).min() > 0
     assert np.einsum("fi,fki->fk", normals, mesh.normals).min() > 0
     assert np.einsum("fi,fi->f", mesh.vertices[:, 0], normals).sum() / 6 > 0  # the enclosed volume
+
+    if not geometry.collision:
+        assert name in ("line", "three-sided rectangle")
+        return
+    margin = HULL_MARGIN if isinstance(geometry.collision[0], CollisionHull) else 0.0
+    lowest = geometry.rest_z_m + collision_points(geometry)[:, 2].min()
+    assert lowest == pytest.approx(FLOOR_Z + margin, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", [*KIT, "frame", "bowl", "disk"])
@@ -72,23 +77,7 @@ def test_a_mesh_has_no_gaps(name):
     assert edges == {(end, start) for start, end in edges}
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_meshes_are_small_enough_to_draw_quickly(name):
-    assert len(build(name).visual.vertices) <= (600 if name in ("bowl", "pan") else 210)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_hulls_and_boxes_touch_the_floor_at_the_rest_height(name):
-    geometry = build(name)
-    if not geometry.collision:
-        assert name in ("line", "three-sided rectangle")
-        return
-    margin = HULL_MARGIN if isinstance(geometry.collision[0], CollisionHull) else 0.0
-    lowest = geometry.rest_z_m + collision_points(geometry)[:, 2].min()
-    assert lowest == pytest.approx(FLOOR_Z + margin, abs=1e-9)
-
-
-@pytest.mark.parametrize("name", KIT)
+@pytest.mark.parametrize("name", ["letter G", "ring"])
 def test_kit_objects_and_their_hulls_scale_together(name):
     plain, tall = build(name), build(name, (1.2, 0.8, 2.0))
     assert tall.visual.vertices == pytest.approx(plain.visual.vertices * (1.2, 0.8, 2.0))
@@ -131,12 +120,6 @@ def test_a_long_line_never_repeats_its_texture():
     assert uvs.min() >= 0 and uvs.max() <= 1
 
 
-def test_containers_follow_the_sampled_size():
-    vertices = build_geometry("container", (0.16, 0.15, 0.05)).visual.vertices
-    assert vertices[..., 0].max() == pytest.approx(0.081)
-    assert vertices[..., 1].max() == pytest.approx(0.076)
-
-
 def test_unusable_sizes_and_objects_are_refused():
     with pytest.raises(AssetError, match="first 3 lengths must be above 0"):
         build_geometry("block", (0.07, 0.07, 0.0))
@@ -146,14 +129,11 @@ def test_unusable_sizes_and_objects_are_refused():
         build_geometry("rign", (0.1, 0.1, 0.1))
 
 
-def records(catalogue):
-    return {record["name"]: record for record in catalogue["objects"]}
-
-
 @pytest.mark.parametrize("name", [name for name in ALL if name != "container"])
-def test_measures_are_those_of_the_benchmark_within_3_mm(catalogue, name):
-    record = records(catalogue)[name]
-    ours = build(name).visual.vertices.reshape(-1, 3)
+def test_measures_are_those_of_the_benchmark_within_3_mm_and_5_percent(catalogue, name):
+    (record,) = [record for record in catalogue["objects"] if record["name"] == name]
+    mesh = build(name).visual
+    ours = mesh.vertices.reshape(-1, 3)
     theirs_low, theirs_high = np.array(record["bounds_min"]), np.array(record["bounds_max"])
     if name == "bowl":  # which the benchmark draws beside its origin
         middle = (theirs_low + theirs_high)[:2] / 2
@@ -163,15 +143,10 @@ def test_measures_are_those_of_the_benchmark_within_3_mm(catalogue, name):
         theirs_low[2] = -0.005
     assert ours.min(axis=0) == pytest.approx(theirs_low, abs=0.003)
     assert ours.max(axis=0) == pytest.approx(theirs_high, abs=0.003)
-
-
-@pytest.mark.parametrize("name", [*KIT, "frame", "pallet"])
-def test_top_areas_are_those_of_the_benchmark_within_5_percent(catalogue, name):
-    mesh = build(name).visual
-    normals = face_normals(mesh)
-    top = (mesh.vertices[..., 2] > mesh.vertices[..., 2].max() - 1e-6).all(axis=1) & (normals[:, 2] > 0)
-    area = normals[top, 2].sum() / 2
-    assert area == pytest.approx(records(catalogue)[name]["top_area"], rel=0.05)
+    if name in (*KIT, "frame", "pallet"):
+        normals = face_normals(mesh)
+        top = (mesh.vertices[..., 2] > ours[:, 2].max() - 1e-6).all(axis=1) & (normals[:, 2] > 0)
+        assert normals[top, 2].sum() / 2 == pytest.approx(record["top_area"], rel=0.05)
 
 
 SQUARE = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)])
@@ -180,10 +155,6 @@ SQUARE = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)])
 def areas(loops, triangles):
     points = np.concatenate(loops)
     return [signed_area(points[triangle]) for triangle in triangles]
-
-
-def test_a_square_becomes_two_triangles():
-    assert len(triangulate([SQUARE])) == 2
 
 
 def test_triangles_of_an_outline_with_two_holes_cover_the_rest():
@@ -203,12 +174,9 @@ def test_triangles_of_any_star_shaped_outline_cover_it(radii):
     assert sum(covered) == pytest.approx(signed_area(loop))
 
 
-def test_a_loop_that_runs_the_wrong_way_round_is_refused():
+def test_a_loop_that_runs_the_wrong_way_round_and_a_hole_outside_its_outline_are_refused():
     with pytest.raises(ShapeError, match="the first must be positive"):
         triangulate([SQUARE[::-1]])
-
-
-def test_a_hole_outside_its_outline_is_refused():
     surrounding = np.array([(-1.0, -1.0), (-1.0, 5.0), (5.0, 5.0), (5.0, -1.0)])
     with pytest.raises(ShapeError):
         triangulate([SQUARE, surrounding])
@@ -268,13 +236,8 @@ def test_a_block_dropped_onto_a_ring_does_not_fall_through(assets) -> None:
     assert dropped(assets, "small block", "ring", (0.0, 0.0), 0.06).z > 0.04
 
 
-@pytest.mark.parametrize("rod_y", [-0.18, 0.0, 0.18])
-def test_a_disk_dropped_over_a_rod_slides_down_to_the_plate(rod_y) -> None:
-    pose = dropped(load_assets(), "disk", "stand", (0.003, rod_y), 0.13)
+@pytest.mark.parametrize(("y", "height_m"), [(-0.18, 0.13), (0.0, 0.13), (0.09, 0.06)])
+def test_a_disk_dropped_over_a_rod_or_between_two_slides_down_to_the_plate(y, height_m) -> None:
+    pose = dropped(load_assets(), "disk", "stand", (0.003, y), height_m)
     assert pose.z == pytest.approx(0.005 + 0.015, abs=0.002)
-    assert abs(pose.y - rod_y) < 0.02
-
-
-def test_a_disk_dropped_between_two_rods_stays_between_them() -> None:
-    pose = dropped(load_assets(), "disk", "stand", (0.0, 0.09), 0.06)
-    assert pose.z == pytest.approx(0.005 + 0.015, abs=0.002)
+    assert abs(pose.y - y) < 0.02

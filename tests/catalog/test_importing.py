@@ -73,15 +73,6 @@ def test_an_import_holds_every_file_and_needs_the_checkout_no_more(checkout):
     assert assets.geometry("cross", SIZE).visual.vertices.shape == (4, 3, 3)
 
 
-def test_an_import_equals_its_checkout(checkout):
-    import_pack(checkout)
-    ours, theirs = load_assets("original"), load_assets(checkout)
-    assert ours is not theirs
-    assert ours.geometry("heart", SIZE).visual.vertices.tobytes() == (
-        theirs.geometry("heart", SIZE).visual.vertices.tobytes()
-    )
-
-
 def test_missing_and_damaged_files_are_named_and_the_rest_is_imported(checkout):
     in_pack(checkout, "kitting/cross.obj").unlink()
     in_pack(checkout, "textures/granite.png").write_bytes(png(100)[:-20])

@@ -196,15 +196,6 @@ def test_bodies_of_boxes_have_their_extents_and_rest_height(geometry, low, high,
     assert geometry.rest_z_m == pytest.approx(rest_z_m)
 
 
-def test_faces_of_boxes_point_outwards() -> None:
-    visual = container((0.15, 0.15, 0.05)).visual
-    edges = visual.vertices[:, 1:] - visual.vertices[:, :1]
-    turned = np.cross(edges[:, 0], edges[:, 1])
-    assert (np.einsum("fi,fi->f", turned, visual.normals[:, 0]) > 0).all()
-    cube = block((2.0, 2.0, 2.0)).visual
-    assert (np.einsum("fci,fci->fc", cube.vertices, cube.normals) == 1).all()
-
-
 def test_the_top_of_a_box_shows_the_lower_right_sixteenth_of_its_texture() -> None:
     cube = block((2.0, 2.0, 2.0)).visual
     top = (cube.normals == (0, 0, 1)).all(axis=(1, 2))

@@ -38,7 +38,7 @@ def test_a_sampled_episode_is_equal_after_saving_and_loading(task: str, tmp_path
         assert openvima.load_episode(openvima.save_episode(episode, tmp_path / f"e{suffix}")) == episode
 
 
-@pytest.mark.parametrize("task", ["rotate", "novel_adj", "rearrange_then_restore", "sweep_without_exceeding"])
+@pytest.mark.parametrize("task", ["rearrange_then_restore", "sweep_without_exceeding"])
 def test_a_loaded_episode_is_played_bit_for_bit_alike(task: str, tmp_path: Path) -> None:
     episode = sample_episode(task, seed=3)
     loaded = openvima.load_episode(openvima.save_episode(episode, tmp_path / "episode.yaml"))
@@ -118,22 +118,6 @@ def test_any_text_is_equal_after_saving_and_loading(suffix: str, tmp_path: Path)
         assert loaded == episode, repr(text)
 
 
-def test_photos_outside_the_folder_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "inside").mkdir()
-    Image.new("RGB", (8, 5), "red").save(tmp_path / "block.png")
-    (tmp_path / "inside" / "link.png").symlink_to(tmp_path / "block.png")
-    for name in ("../block.png", str(tmp_path / "block.png"), "link.png"):
-        file = tmp_path / "inside" / "scene.yaml"
-        file.write_text(HAND_WRITTEN.replace("block.png", name), encoding="utf-8")
-        with pytest.raises(InputFileError, match=r"scene\.yaml: image 'photo': .* inside the folder"):
-            openvima.load_episode(file)
-
-
-def saved(task: str, folder: Path) -> dict:
-    path = openvima.save_episode(sample_episode(task, seed=0), folder / "saved.yaml")
-    return yaml.safe_load(path.read_text(encoding="utf-8"))
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -155,9 +139,8 @@ def test_files_that_are_no_episodes_are_refused(tmp_path: Path, content: bytes) 
     assert_refused(tmp_path, content)
 
 
-@pytest.mark.parametrize("task", ["rotate", "follow_motion", "sweep_without_touching"])
 @pytest.mark.parametrize("wrong", [float("nan"), 1e308, 10**30, "x" * 5000, {"x": 1}, [[0.0] * 9] * 300])
-def test_episodes_with_an_impossible_value_are_refused(tmp_path: Path, task: str, wrong: object) -> None:
+def test_episodes_with_an_impossible_value_are_refused(tmp_path: Path, wrong: object) -> None:
     for *path, last in (
         ("seed",),
         ("max_steps",),
@@ -165,7 +148,8 @@ def test_episodes_with_an_impossible_value_are_refused(tmp_path: Path, task: str
         ("problem", "scene", "placements", 0, "object"),
         ("problem", "scene", "placements", 0, "import"),
     ):
-        values = holder = saved(task, tmp_path)
+        saved = openvima.save_episode(sample_episode("follow_motion", seed=0), tmp_path / "saved.yaml")
+        values = holder = yaml.safe_load(saved.read_text(encoding="utf-8"))
         for key in path:
             holder = holder[key]
         holder[last] = wrong
@@ -173,9 +157,17 @@ def test_episodes_with_an_impossible_value_are_refused(tmp_path: Path, task: str
 
 
 @pytest.mark.parametrize(
-    "name", ["../outside.png", "link.png", "pipe.png", "folder.png", "cut.png", "/dev/zero.png"]
+    ("name", "message"),
+    [
+        ("../outside.png", "inside the folder"),
+        ("link.png", "inside the folder"),
+        ("/dev/zero.png", "inside the folder"),
+        ("pipe.png", ""),
+        ("folder.png", ""),
+        ("cut.png", ""),
+    ],
 )
-def test_photos_that_must_not_be_read_are_refused(tmp_path: Path, name: str) -> None:
+def test_photos_that_must_not_be_read_are_refused(tmp_path: Path, name: str, message: str) -> None:
     inside = tmp_path / "inside"
     inside.mkdir()
     Image.new("RGB", (9, 9), "red").save(tmp_path / "outside.png")
@@ -183,13 +175,15 @@ def test_photos_that_must_not_be_read_are_refused(tmp_path: Path, name: str) -> 
     os.mkfifo(inside / "pipe.png")
     (inside / "folder.png").mkdir()
     (inside / "cut.png").write_bytes((tmp_path / "outside.png").read_bytes()[:40])
-    assert_refused(inside, HAND_WRITTEN.replace("block.png", name).encode())
+    error = assert_refused(inside, HAND_WRITTEN.replace("block.png", name).encode())
+    assert "scene.yaml: image 'photo': " in error and message in error
 
 
-def assert_refused(folder: Path, content: bytes) -> None:
+def assert_refused(folder: Path, content: bytes) -> str:
     Image.new("RGB", (9, 9), "red").save(folder / "block.png")
     path = folder / "scene.yaml"
     path.write_bytes(content)
     with pytest.raises(OpenVimaError) as caught:
         openvima.load_episode(path)
     assert len(str(caught.value)) < 1000 and "\n" not in str(caught.value)
+    return str(caught.value)

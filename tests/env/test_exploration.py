@@ -94,19 +94,6 @@ def test_smooth_exploration_raises_nothing_and_stays_in_the_space(task: str, epi
         assert explore(env, seed, steps=100) == [], seed
 
 
-@pytest.mark.parametrize("task", ["rotate", "sweep_without_touching"])
-def test_one_command_repeated_into_a_corner_stops_there(task: str) -> None:
-    for first in ([0, 0, 0, 0, 0], [0, 0, 0.05, 0, 0], [0, 0, -0.05, 0, 0]):
-        for command in ([0.05, 0.05, 0, 0, 0], [0.05, -0.05, 0, 0.2, 1], [0.05, 0.05, -0.05, 0, 1]):
-            env = make(task)
-            env.reset(seed=0)
-            for each in (*[first] * 10, *[command] * 30):
-                observation, _, terminated, truncated, _ = env.step(np.float32(each))
-                assert observation in env.observation_space
-                if terminated or truncated:
-                    break
-
-
 SINKING_M = 0.002  # by which the lowest corner may be below the floor: contacts are springs
 FARTHEST_M = 3.0  # from the robot; nothing slides that far
 NUM_RESETS = 400

@@ -58,6 +58,9 @@ def test_an_observation_holds_what_was_asked_for() -> None:
     assert info["joints"].tobytes() == seen["joints"].tobytes() == HOME.astype(np.float32).tobytes()
     depth_alone = TabletopEnv("rotate", modalities=("depth",))
     assert list(depth_alone.reset(seed=3)[0]) == ["depth", "ee"]
+    for wrong, complaint in ((("rgb", "depht"), "depth"), ("lidar", "lidar")):
+        with pytest.raises(ConfigError, match=complaint):
+            TabletopEnv("rotate", modalities=wrong)
 
 
 def test_joints_are_where_the_path_of_the_last_step_ended() -> None:
@@ -67,15 +70,6 @@ def test_joints_are_where_the_path_of_the_last_step_ended() -> None:
     assert env.observation_space.contains(seen)
     assert env.joints.tobytes() == info["joints"].tobytes() == env.joint_path[-1].tobytes()
     assert not np.array_equal(env.joint_path[0], env.joints)
-
-
-@pytest.mark.parametrize(
-    ("modalities", "complaint"),
-    [(("rgb", "depht"), "depth"), ("lidar", "lidar")],
-)
-def test_other_modalities_are_refused(modalities, complaint) -> None:
-    with pytest.raises(ConfigError, match=complaint):
-        openvima.make("rotate", modalities=modalities)
 
 
 def test_vector_environments_collect_depth_and_joints() -> None:

@@ -1,6 +1,5 @@
 """Episodes prepared ahead."""
 
-import zlib
 from typing import Any  # infos are nested dictionaries
 
 import numpy as np
@@ -11,7 +10,7 @@ from openvima.env import TabletopEnv, stack_actions
 from openvima.errors import ConfigError, SamplingError
 from openvima.scene import RenderedPrompt
 from openvima.tasks import sample_episode
-from task_cases import full_repr, random_action
+from task_cases import frozen, random_action
 
 # Scenes as prompts, several frames, a spatula, clutter, instructions in a row.
 SLOW_TASKS = [
@@ -20,19 +19,8 @@ SLOW_TASKS = [
 ]
 
 
-def digest(value: Any) -> Any:
-    """The bytes of all arrays, and the full text of all else."""
-    if isinstance(value, dict):
-        return {key: digest(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [digest(entry) for entry in value]
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        return value.shape, value.dtype.str, zlib.crc32(value.tobytes())
-    return full_repr(value.tolist() if isinstance(value, np.ndarray) else value)
-
-
 def images_of(prompt: RenderedPrompt) -> list[Any]:
-    return [digest([image.rgb, image.segm, image.objects]) for image in prompt.images.values()]
+    return [frozen((image.rgb, image.segm, image.objects)) for image in prompt.images.values()]
 
 
 def start_of(env: TabletopEnv, **arguments: Any) -> Any:
@@ -40,7 +28,7 @@ def start_of(env: TabletopEnv, **arguments: Any) -> Any:
     start = env.reset(**arguments)
     drawn = env.np_random.bit_generator.state
     action = env.oracle_decision().action if env.control == "primitives" else env.oracle_command()
-    return digest([start, images_of(env.prompt), drawn, env.episode, env.step(action)])
+    return frozen([start, images_of(env.prompt), drawn, env.episode, env.step(action)])
 
 
 @pytest.mark.parametrize("task", ["rotate", *SLOW_TASKS])
@@ -100,7 +88,7 @@ def test_an_episode_is_prepared_while_another_is_running() -> None:
         each.reset(seed=3)
     env.prepare(5)
     action = env.oracle_decision().action
-    assert digest(env.step(action)) == digest(expected.step(action))
+    assert frozen(env.step(action)) == frozen(expected.step(action))
 
 
 def test_what_cannot_be_prepared_raises_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,14 +115,14 @@ def test_workers_that_prepare_play_the_episodes_of_one_process(seeds: range | No
         envs = openvima.make_vec(tasks, num_workers=num_workers, seeds=seeds)
         rng, seen = np.random.default_rng(0), []
         for seed in (1, [7, 8, None], None):
-            seen.append(digest(envs.reset(seed=seed)))
+            seen.append(frozen(envs.reset(seed=seed)))
             for step in range(8):
                 if num_workers and step % 2:
                     envs.call("prepare")  # besides what workers do on their own
                 if step == 4:
                     envs.set_attr("prompts", "text" if seed is None else "mixed")
                 actions = [random_action(rng, scene) for scene in envs.get_attr("scene")]
-                seen.append(digest(envs.step(stack_actions(actions))))
+                seen.append(frozen(envs.step(stack_actions(actions))))
                 seen.append([images_of(prompt) for prompt in envs.get_attr("prompt")])
         envs.close()
         return seen

@@ -1,15 +1,17 @@
-"""Scenes and prompts: what is drawn where, with which id and colour."""
+"""Scenes and prompts: what is drawn where, with which id and colour; and the page that shows everything."""
 
+import html
 import io
+import re
 
 import numpy as np
 import pytest
 
-from openvima.catalog import OBJECTS
+from openvima.catalog import OBJECTS, TEXTURES
 from openvima.catalog.bodies import block
 from openvima.catalog.packs import load_assets
 from openvima.catalog.procedural import ProceduralAssets
-from openvima.errors import ConfigError, ShapeError
+from openvima.errors import AssetError, ConfigError, ShapeError
 from openvima.render import (
     CAMERAS,
     CELL_M,
@@ -23,6 +25,7 @@ from openvima.render import (
     project,
     stamp,
 )
+from openvima.render.gallery import write_gallery
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
 from sim_cases import COLOURS, BoxAssets
 
@@ -31,6 +34,9 @@ BLOCK = (0.07, 0.07, 0.07)
 
 def boxed(object_id: int, x: float, y: float, yaw_rad: float = 0.0, texture: str = "red") -> Placement:
     return Placement(object_id, "block", texture, BLOCK, Pose.planar(x, y, yaw_rad, z=0.034))
+
+
+TWO_BLOCKS = Scene((boxed(5, 0.43, -0.21, 0.7), boxed(6, 0.6, 0.3, 2.0, "blue")))
 
 
 @pytest.fixture
@@ -51,7 +57,9 @@ def test_the_bare_table_shows_floor_and_sheet(rasteriser, view) -> None:
     assert set(np.unique(image.segm)) == {0, 1}
     assert set(np.unique(image.rgb[:, image.segm == 0])) == {239}
     assert set(np.unique(image.rgb[:, image.segm == 1])) == {47}
+    assert image.height.dtype == np.float32
     np.testing.assert_allclose(image.height, np.where(image.segm == 1, 0.0, -0.001), atol=1e-7)
+    assert rasteriser.scene(Scene(()))[view].height is None
 
 
 def test_faces_of_a_red_box_are_lit_by_their_direction(rasteriser) -> None:
@@ -64,39 +72,9 @@ def test_faces_of_a_red_box_are_lit_by_their_direction(rasteriser) -> None:
     np.testing.assert_array_equal(at(images["front"].rgb, "front", towards_viewer), np.floor(0.6 * red))
 
 
-def test_light_does_not_turn_with_the_body(rasteriser) -> None:
-    turned = Scene((boxed(5, 0.5, 0.1, np.pi / 2),))
-    image = rasteriser.scene(turned)["front"]
-    np.testing.assert_array_equal(
-        at(image.rgb, "front", (0.535, 0.1, 0.034)), np.floor(0.6 * np.array(COLOURS["red"]))
-    )
-
-
-@pytest.mark.parametrize("view", VIEWS)
-def test_the_nearer_body_hides_the_farther_one_in_either_order(rasteriser, view) -> None:
-    low = boxed(5, 0.5, 0.0, texture="blue")
-    high = low.at(low.pose.moved(dz=0.07))
-    for first, second in ((5, 6), (6, 5)):
-        bodies = {first: low, second: high}
-        placements = tuple(
-            Placement(i, "block", bodies[i].texture, BLOCK, bodies[i].pose) for i in sorted(bodies)
-        )
-        segm = rasteriser.scene(Scene(placements))[view].segm
-        assert at(segm, view, (0.5, 0.0, 0.139)) == second
-
-
-@pytest.mark.parametrize("view", VIEWS)
-def test_heights_are_those_of_the_surfaces_seen(rasteriser, view) -> None:
-    image = rasteriser.scene(Scene((boxed(5, 0.5, 0.1),)), height=True)[view]
-    assert image.height.dtype == np.float32
-    assert at(image.height, view, (0.5, 0.1, 0.069)) == pytest.approx(0.069, abs=1e-6)
-    assert image.height[image.segm == 5].max() <= 0.069 + 1e-6
-    assert rasteriser.scene(Scene(()))[view].height is None
-
-
 @pytest.mark.parametrize("factor", [2, 3])
 def test_an_enlarged_image_contains_the_plain_one(rasteriser, factor) -> None:
-    scene = Scene((boxed(5, 0.43, -0.21, 0.7), boxed(6, 0.6, 0.3, 2.0, "blue")))
+    scene = TWO_BLOCKS
     plain, large = rasteriser.scene(scene), rasteriser.scene(scene, enlarge=factor)
     for view in VIEWS:
         assert large[view].rgb.shape == (3, 128 * factor, 256 * factor)
@@ -118,7 +96,7 @@ def test_further_bodies_are_drawn_with_their_own_id_and_colour(rasteriser) -> No
 
 
 def test_images_do_not_depend_on_what_was_drawn_before(rasteriser) -> None:
-    scene = Scene((boxed(5, 0.43, -0.21, 0.7), boxed(6, 0.6, 0.3, 2.0, "blue")))
+    scene = TWO_BLOCKS
     first = rasteriser.scene(scene, height=True)
     rasteriser.scene(Scene((boxed(5, 0.5, 0.0),)), height=True)
     rasteriser.scene(scene, enlarge=2)
@@ -189,23 +167,11 @@ def test_unfit_ids_textures_and_factors_are_refused(rasteriser) -> None:
         rasteriser.scene(Scene(()), enlarge=0)
 
 
-@pytest.mark.parametrize("name", [name for name in OBJECTS if name not in ("stand", "disk")])
-def test_every_object_of_the_default_pack_is_seen_in_both_views(name) -> None:
-    assets = ProceduralAssets()
-    size = OBJECTS[name].size_max
-    pose = Pose.planar(0.5, 0.0, 0.3, z=assets.geometry(name, size).rest_z_m)
-    images = Rasteriser(assets).scene(Scene((Placement(5, name, "red", size, pose),)))
-    for view in VIEWS:
-        assert (images[view].segm == 5).sum() > 20
-
-
 ASSETS = BoxAssets()
 
 
-def boxed_of_labels(
-    object_id: int, pose: Pose, size: tuple[float, float, float] = (0.1, 0.05, 0.02)
-) -> Placement:
-    return Placement(object_id, "block", "red", size, pose)
+def boxed_of_labels(object_id: int, pose: Pose) -> Placement:
+    return Placement(object_id, "block", "red", (0.1, 0.05, 0.02), pose)
 
 
 def test_cells_whose_centre_lies_on_the_object_carry_its_id() -> None:
@@ -219,21 +185,8 @@ def test_cells_whose_centre_lies_on_the_object_carry_its_id() -> None:
     inside = (np.abs(local[..., 0]) <= 0.05) & (np.abs(local[..., 1]) <= 0.025)
     np.testing.assert_array_equal(labels == 7, inside)
     assert abs(inside.sum() * CELL_M**2 - 0.1 * 0.05) < 1e-4
-
-
-def test_centres_of_the_corner_cells_lie_half_a_cell_inside_the_table() -> None:
-    first, last = cell_centres(np.array([0, 319]), np.array([0, 159]))
-    np.testing.assert_allclose(first, (0.25 + CELL_M / 2, -0.5 + CELL_M / 2))
-    np.testing.assert_allclose(last, (0.75 - CELL_M / 2, 0.5 - CELL_M / 2))
-
-
-def test_the_higher_surface_counts_in_either_order() -> None:
-    low = boxed_of_labels(5, Pose.planar(0.5, 0.0, z=0.01))
-    high = boxed_of_labels(6, Pose.planar(0.5, 0.0, z=0.03), (0.03, 0.03, 0.02))
-    one, other = label_raster((low, high), ASSETS), label_raster((high, low), ASSETS)
-    np.testing.assert_array_equal(one, other)
-    assert one[160, 80] == 6
-    assert set(np.unique(one)) == {0, 5, 6}
+    np.testing.assert_allclose(centres[0, 0], (0.25 + CELL_M / 2, -0.5 + CELL_M / 2))
+    np.testing.assert_allclose(centres[-1, -1], (0.75 - CELL_M / 2, 0.5 - CELL_M / 2))
 
 
 def test_stamping_one_by_one_gives_the_raster_of_all() -> None:
@@ -247,23 +200,6 @@ def test_stamping_one_by_one_gives_the_raster_of_all() -> None:
     np.testing.assert_array_equal(heights > 0, labels > 0)
 
 
-def test_tilted_bodies_show_what_faces_up() -> None:
-    half_turn_about_x = Pose((0.5, 0.0, 0.05), (1.0, 0.0, 0.0, 0.0))
-    labels = label_raster([boxed_of_labels(5, half_turn_about_x)], ASSETS)
-    assert (labels == 5).sum() == (
-        label_raster([boxed_of_labels(5, Pose.planar(0.5, 0.0, z=0.05))], ASSETS) == 5
-    ).sum()
-
-
-def test_what_is_above_the_ceiling_or_below_the_sheet_or_off_the_table_does_not_count() -> None:
-    placements = [
-        boxed_of_labels(5, Pose.planar(0.4, 0.0, z=0.295)),
-        boxed_of_labels(6, Pose.planar(0.6, 0.0, z=-0.02)),
-        boxed_of_labels(7, Pose.planar(1.2, 0.0, z=0.01)),
-    ]
-    assert not label_raster(placements, ASSETS).any()
-
-
 def test_an_object_keeps_vertices_normals_and_texture() -> None:
     trimesh = pytest.importorskip("trimesh")
     from openvima.render.gltf import object_glb
@@ -275,3 +211,41 @@ def test_an_object_keeps_vertices_normals_and_texture() -> None:
     assert np.allclose(mesh.triangles, drawn.vertices)
     assert np.allclose(mesh.vertex_normals[mesh.faces], drawn.normals, atol=1e-6)
     assert np.array_equal(np.asarray(mesh.visual.material.baseColorTexture), assets.texture("red swirl"))
+
+
+def cards(page) -> dict[str, str]:
+    text = html.unescape(page.read_text(encoding="utf-8"))
+    return dict(re.findall(r'<article class="card"><h3>([^<]+)</h3>(.*?)</article>', text, flags=re.DOTALL))
+
+
+@pytest.mark.slow
+def test_the_page_has_a_card_with_two_pictures_for_every_object_and_texture(tmp_path) -> None:
+    seen = []
+    page, problems = write_gallery(tmp_path, load_assets(), report=lambda *now: seen.append(now[:2]))
+    assert problems == () and page == tmp_path / "index.html"
+    found = cards(page)
+    assert list(found) == [*OBJECTS, *TEXTURES, "gray"]
+    assert {card.count("data:image/png") for card in found.values()} == {2}
+    assert "9.0 × 10.3 × 3.3 cm" in found["letter A"]
+    assert seen[-1] == (len(OBJECTS) + len(TEXTURES) + 1,) * 2
+
+
+class _Incomplete(ProceduralAssets):
+    """A pack without stripes and hearts."""
+
+    def texture(self, texture_name: str):
+        if "stripe" in texture_name:
+            raise AssetError(f"{texture_name} is missing")
+        return super().texture(texture_name)
+
+    def geometry(self, object_name, size, scale=(1.0, 1.0, 1.0)):
+        if object_name == "heart":
+            raise AssetError("kitting/heart.obj is missing")
+        return super().geometry(object_name, size, scale)
+
+
+@pytest.mark.slow
+def test_what_a_pack_lacks_is_reported_and_the_rest_is_shown(tmp_path) -> None:
+    page, problems = write_gallery(tmp_path, _Incomplete())
+    assert "kitting/heart.obj is missing" in problems and "red and blue stripe is missing" in problems
+    assert "heart is missing" in cards(page)["heart"] and "data:" in cards(page)["star"]

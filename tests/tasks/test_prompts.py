@@ -40,20 +40,18 @@ def test_all_tasks_but_those_with_scenes_alone_have_a_text_form() -> None:
     assert all(has_text_form(task) for task in WITH_TEXT)
 
 
-@pytest.mark.parametrize("prompts", ["text", "text,paraphrased"])
 @pytest.mark.parametrize("task", WITH_TEXT)
-def test_a_reader_of_the_text_finds_the_goal_objects(task: str, prompts: str) -> None:
+def test_a_reader_of_the_text_finds_the_goal_objects(task: str) -> None:
     for level in task_spec(task).levels:
-        episodes = [sample_episode(task, level=level, seed=s, prompts=prompts) for s in range(NUM_EPISODES)]
+        episodes = [
+            sample_episode(task, level=level, seed=seed, prompts=("text", "text,paraphrased")[seed % 2])
+            for seed in range(NUM_EPISODES)
+        ]
         clear = [episode for episode in episodes if not episode.problem.prompt.is_ambiguous]
         assert clear and all(map(is_understood, clear))
         assert (len(clear) < NUM_EPISODES) == (task in COMPARING)
+        assert not any(is_understood(e) for e in episodes if e.problem.prompt.is_ambiguous)
         assert not any(isinstance(fill, ObjectImage) for e in episodes for _, fill in e.problem.prompt.images)
-
-
-def test_the_reader_is_lost_where_the_text_is_ambiguous() -> None:
-    episodes = [sample_episode("novel_adj", seed=seed, prompts="text") for seed in range(NUM_EPISODES)]
-    assert not any(is_understood(e) for e in episodes if e.problem.prompt.is_ambiguous)
 
 
 @pytest.mark.parametrize("task", ["rotate", "novel_adj", "rearrange", "follow_motion"])
@@ -69,14 +67,14 @@ def test_nothing_but_the_prompt_depends_on_its_form(task: str) -> None:
 
 def test_mixed_prompts_describe_half_of_the_images_and_synonyms_choose_the_same() -> None:
     counts = Counter[bool]()
-    for seed in range(60):
+    for seed in range(30):
         all_images, mixed, synonyms = (
             dict(sample_episode("novel_noun", seed=seed, prompts=p).problem.prompt.images)
             for p in ("multimodal", "mixed", "mixed,paraphrased")
         )
         assert mixed == synonyms
         counts.update(name in mixed for name in all_images)
-    assert 40 <= counts[True] <= 80
+    assert 20 <= counts[True] <= 40
 
 
 def test_synonyms_are_used_about_half_of_the_time() -> None:
@@ -120,17 +118,14 @@ def test_descriptions_get_the_article_that_their_sentence_needs(template: str, t
     assert text_of(prompt_of(template, a="heart", b="bowl")) == text
 
 
-def test_the_name_of_a_letter_is_no_article() -> None:
-    prompt = prompt_of("Reverse the order of {a} {b}.", a="letter A", b="bowl")
-    assert text_of(prompt) == "Reverse the order of the red letter A the red bowl."
-
-
 def test_shapes_alone_are_introduced_by_name() -> None:
     text = "This is a wug {gray_1}. This is a dax {gray_2}. Put a wug into a dax."
     prompt = prompt_of(text, gray_1="L-shaped block", gray_2="pan")
     assert text_of(prompt) == "This is a wug: an L-shaped block. This is a dax: a pan. Put a wug into a dax."
     assert text_of(prompt_of("Two {gray}", gray="cross")) == "Two crosses"
     assert text_of(prompt_of("A {gray}", gray="L-shaped block")) == "An L-shaped block"
+    prompt = prompt_of("Reverse the order of {a} {b}.", a="letter A", b="bowl")
+    assert text_of(prompt) == "Reverse the order of the red letter A the red bowl."  # "A" is no article
 
 
 def test_words_that_fit_another_object_on_the_table_are_ambiguous() -> None:
@@ -139,13 +134,9 @@ def test_words_that_fit_another_object_on_the_table_are_ambiguous() -> None:
     tall = replace(placed("block", object_id=6), scale=(1.0, 1.0, 2.0))
 
     def is_ambiguous(other: Placement, prompts: str = "text") -> bool:
-        results = [
-            rewrite(
-                prompt, Scene((image.placement, other)), prompts, make_rng("user", "t", "L1", n, "prompt")
-            )
-            for n in range(10)
-        ]
-        return any(result.is_ambiguous for result in results)
+        scene = Scene((image.placement, other))
+        rngs = (make_rng("user", "t", "L1", seed, "prompt") for seed in range(10))
+        return any(rewrite(prompt, scene, prompts, rng).is_ambiguous for rng in rngs)
 
     assert is_ambiguous(tall)
     assert not is_ambiguous(placed("block", "blue", 6))
@@ -222,21 +213,21 @@ def test_training_paraphrases_are_of_training_tasks_and_do_not_ask_for_textures(
         assert not any(re.search(r"\btextures?\b", PLACEHOLDER.sub("", each)) for each in templates)
 
 
-@pytest.mark.parametrize("prompts", ["multimodal", "text"])
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    ("task", "prompts"),
+    [*((task, "multimodal") for task in TASKS), ("visual_manipulation", "text"), ("rotate", "text")],
+)
 def test_each_prompt_of_the_task_can_be_put_in_other_words(task, prompts):
-    if prompts == "text" and task in ("rearrange", "scene_understanding"):
-        pytest.skip("its prompts have no object images")
+    def slots_and_numbers(text):
+        return sorted(PLACEHOLDER.findall(text)), re.findall(r"\d+", PLACEHOLDER.sub("", text))
+
     env = TabletopEnv(task, level="L1", domain="user", prompts=prompts)
     seen = set()
     for seed in range(3):
         env.reset(seed=seed)
         text = ablate(env, "held_out_phrasings").prompt.text
         assert text == ablate(env, "held_out_phrasings").prompt.text != env.prompt.text
-        assert sorted(PLACEHOLDER.findall(text)) == sorted(PLACEHOLDER.findall(env.prompt.text))
-        assert re.findall(r"\d+", PLACEHOLDER.sub("", text)) == re.findall(
-            r"\d+", PLACEHOLDER.sub("", env.prompt.text)
-        )
+        assert slots_and_numbers(text) == slots_and_numbers(env.prompt.text)
         seen.add(text)
     assert len(seen) > 1
 
@@ -244,35 +235,26 @@ def test_each_prompt_of_the_task_can_be_put_in_other_words(task, prompts):
 @pytest.mark.parametrize("task", sorted(training_paraphrases()))
 def test_prompts_of_training_tasks_follow_their_template(task):
     (phrasing, *_), template = training_paraphrases()[task], task_spec(task).template
-    prompts = [
-        sample_episode(task, level="train", domain="user", seed=seed).problem.prompt for seed in range(4)
-    ]
+    prompts = [sample_episode(task, seed=seed).problem.prompt for seed in range(4)]
     said = [rephrase(prompt.text, template, phrasing) for prompt in prompts]
     assert any(said)  # the definitions of novel_noun come in either order, and the template has one
     for prompt, text in zip(prompts, said, strict=True):
         assert text is None or set(PLACEHOLDER.findall(text)) == {name for name, _ in prompt.images}
 
 
-def test_a_slot_that_occurs_twice_has_one_value_and_an_adverb_may_be_empty():
-    template = "This is a {n} {a}. Put the {adv}{n} {a} here."
-    assert rephrase("This is a wug {a}. Put the wug {a} here.", template, "{adv}|{n}") == "|wug"
-    assert rephrase("This is a wug {a}. Put the less wug {a} here.", template, "{adv}|{n}") == "less |wug"
-    assert rephrase("This is a wug {a}. Put the dax {a} here.", template, "{n}") is None
+TWICE = "This is a {n} {a}. Put the {adv}{n} {a} here."
 
 
-def test_text_of_another_form_has_no_phrasing():
-    assert rephrase("Spin it.", "Rotate the {x} {n} degrees.", "Turn the {x} by {n}.") is None
-
-
-def test_values_stay_where_a_phrasing_orders_slots_anew():
-    text = rephrase(
-        "Put the red bowl into the {b}.", "Put the {x} into the {y}.", "Into the {y} goes the {x}."
-    )
-    assert text == "Into the {b} goes the red bowl."
-
-
-def test_a_description_of_several_words_is_one_value():
-    text = rephrase(
-        "Rotate the red letter A 30 degrees.", "Rotate the {x} {n} degrees.", "By {n} degrees, turn the {x}."
-    )
-    assert text == "By 30 degrees, turn the red letter A."
+@pytest.mark.parametrize(
+    ("text", "template", "phrasing", "said"),
+    [
+        ("This is a wug {a}. Put the wug {a} here.", TWICE, "{adv}|{n}", "|wug"),  # an adverb may be empty
+        ("This is a wug {a}. Put the less wug {a} here.", TWICE, "{adv}|{n}", "less |wug"),
+        ("This is a wug {a}. Put the dax {a} here.", TWICE, "{n}", None),  # a slot has one value
+        ("Spin it.", "Rotate the {x} {n} degrees.", "Turn the {x} by {n}.", None),
+        ("Put a red bowl into {b}.", "Put a {x} into {y}.", "Into {y} goes {x}.", "Into {b} goes red bowl."),
+        ("Rotate red letter A 30 degrees.", "Rotate {x} {n} degrees.", "{n}: {x}.", "30: red letter A."),
+    ],
+)
+def test_the_values_of_a_text_are_put_into_a_phrasing(text, template, phrasing, said):
+    assert rephrase(text, template, phrasing) == said

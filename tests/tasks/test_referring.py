@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from openvima.catalog.partitions import tasks_at
-from openvima.scene import AtPose, Placement, Pose, Problem, Prompt, Scene
+from openvima.scene import AtPose, Placement, Pose, Problem, Scene
 from openvima.tasks import sample_episode
 from openvima.tasks.referring_grammar import PHRASES, are_distinct, sentence, templates
 from openvima.tasks.registry import held_out_tasks, named_tasks
@@ -84,7 +84,7 @@ def test_the_resolver_takes_the_pictures_view_and_refuses_what_is_not_clear() ->
 
 
 @pytest.mark.parametrize("kind", PHRASES)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_what_is_meant_solves_an_episode_and_any_other_object_fails(kind: str, seed: int) -> None:
     problem = sampled(kind, seed=seed)
     goals = goals_of(problem)
@@ -99,14 +99,11 @@ def test_what_is_meant_solves_an_episode_and_any_other_object_fails(kind: str, s
                 assert judged(problem, {other.id: goals[0].target})[-1].failure
 
 
-def test_one_more_than_the_number_is_a_failure() -> None:
+def test_one_more_than_the_number_and_the_wrong_one_of_two_containers_are_failures() -> None:
     problem = sampled("number", template=0)
     assert problem.num_required == 1
     both = {goal.object_id: goal.target for goal in goals_of(problem)[:2]}
     assert judged(problem, both)[-1].failure
-
-
-def test_the_wrong_one_of_two_containers_is_a_failure() -> None:
     problem = sampled("relation", template=2)
     (goal,) = goals_of(problem)
     (other,) = [p for p in problem.scene.placements if p.fixed and p.id != goal.relative_to]
@@ -124,12 +121,10 @@ def test_no_two_objects_look_alike_and_no_texture_is_part_of_another(kind: str) 
 
 @pytest.mark.parametrize("template", [0, 1])
 def test_both_alternatives_occur(template: int) -> None:
-    problems = [sampled("alternative", template=template, seed=seed) for seed in range(20)]
-    first = [_shows_what_is_moved(problem.prompt, problem) for problem in problems]
+    first = []
+    for seed in range(20):
+        problem = sampled("alternative", template=template, seed=seed)
+        shown = dict(problem.prompt.images)["object_1"].placement  # type: ignore[union-attr]
+        moved = problem.scene[goals_of(problem)[0].object_id]
+        first.append((shown.object, shown.texture) == (moved.object, moved.texture))
     assert 4 < sum(first) < 16
-
-
-def _shows_what_is_moved(prompt: Prompt, problem: Problem) -> bool:
-    shown = dict(prompt.images)["object_1"].placement  # type: ignore[union-attr]
-    moved = problem.scene[goals_of(problem)[0].object_id]
-    return (shown.object, shown.texture) == (moved.object, moved.texture)

@@ -14,19 +14,7 @@ from openvima.catalog import Assets, object_spec, pool
 from openvima.catalog.partitions import PUBLISHED_LEVELS, PUBLISHED_TASKS
 from openvima.errors import ConfigError, SamplingError, UnknownTaskError
 from openvima.render.labels import label_raster
-from openvima.scene import (
-    FIRST_OBJECT_ID,
-    AtPose,
-    DistractorsApart,
-    Episode,
-    EveryStepCounts,
-    ObjectImage,
-    Outcome,
-    Placement,
-    Pose,
-    Problem,
-    in_workspace,
-)
+from openvima.scene import FIRST_OBJECT_ID, Episode, EveryStepCounts, Outcome, Placement, Pose, in_workspace
 from openvima.tasks import (
     DOMAINS,
     TableSampler,
@@ -41,6 +29,7 @@ from openvima.tasks import (
 )
 from openvima.tasks.table import CELL_M, is_in_hollow
 from strategies import seeds
+from task_cases import assert_uniform
 
 HEIGHTS_OF_THEIR_OWN = (  # at which the original benchmark spawns some objects
     "follow_motion",
@@ -56,14 +45,6 @@ def table_for(assets: Assets, *, seed: int = 0, compat: bool = False) -> TableSa
     return TableSampler(rng, pool("visual_manipulation", "train"), assets=assets, compat=compat)
 
 
-def roles(episode: Episode) -> tuple[Placement, Placement]:
-    """Target and base of an episode of `visual_manipulation`."""
-    (goal,) = episode.problem.goals
-    scene = episode.problem.scene
-    assert isinstance(goal, AtPose) and goal.relative_to is not None
-    return scene[goal.object_id], scene[goal.relative_to]
-
-
 def standing_on_the_table(episode: Episode) -> list[Placement]:
     """All objects but the one that starts in a base."""
     scene = episode.problem.scene
@@ -71,23 +52,11 @@ def standing_on_the_table(episode: Episode) -> list[Placement]:
     return [p for p in scene.placements if p.fixed or not starts_in_base]
 
 
-@pytest.mark.parametrize(("task", "level"), EVERYWHERE)
-def test_the_same_seed_gives_the_same_episode_and_another_seed_another(task: str, level: str) -> None:
-    episodes = [sample_episode(task, level=level, seed=seed) for seed in (3, 3, 4)]
-    assert episodes[0] == episodes[1]
-    assert episodes[0].problem != episodes[2].problem
-
-
-def test_domains_and_levels_share_no_scene() -> None:
-    task, level = "visual_manipulation", "train"
+def test_seeds_domains_and_levels_share_no_scene() -> None:
+    kinds = [("train", "train"), ("train", "eval"), ("train", "user"), ("L1", "user")]
     scenes = [
-        sample_episode(task, level=level, seed=seed, domain=domain).problem.scene
-        for domain in ("train", "eval", "user")
-        for seed in range(20)
-    ]
-    scenes += [
-        sample_episode(task, level=level, seed=seed).problem.scene
-        for level in task_spec(task).levels[1:2]
+        sample_episode("visual_manipulation", level=level, seed=seed, domain=domain).problem.scene
+        for level, domain in kinds
         for seed in range(20)
     ]
     assert len(set(scenes)) == len(scenes)
@@ -95,9 +64,10 @@ def test_domains_and_levels_share_no_scene() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(seeds)
-def test_every_start_is_open_inside_the_workspace_and_numbered_without_gaps(seed: int) -> None:
+def test_every_start_is_reproducible_open_inside_the_workspace_and_numbered_without_gaps(seed: int) -> None:
     task, level = EVERYWHERE[seed % len(EVERYWHERE)]
     episode = sample_episode(task, level=level, seed=seed)
+    assert sample_episode(task, level=level, seed=seed) == episode
     problem, scene = episode.problem, episode.problem.scene
     first = FIRST_OBJECT_ID[scene.end_effector]
     assert [p.id for p in scene.placements] == list(range(first, first + len(scene.placements)))
@@ -121,7 +91,7 @@ def test_objects_start_at_rest_or_hover_with_compat(task: str, level: str, asset
 
 @pytest.mark.parametrize("task", list_tasks())
 def test_no_two_objects_cover_the_same_cell(task: str, assets: Assets) -> None:
-    for seed in range(10):
+    for seed in range(5):
         episode = sample_episode(task, seed=seed)
         flat = {"line", "three-sided rectangle"}  # these two lie in one another
         apart = [p for p in standing_on_the_table(episode) if p.object not in flat]
@@ -133,21 +103,6 @@ def test_no_two_objects_cover_the_same_cell(task: str, assets: Assets) -> None:
 def test_hardly_any_draw_is_thrown_away(task: str) -> None:
     level = task_spec(task).levels[-2 if "L5" in task_spec(task).levels else -1]
     assert sum(sample_episode(task, level=level, seed=seed).num_redraws for seed in range(40)) <= 1
-
-
-def test_goals_constraints_and_prompt_follow_the_ids() -> None:
-    for seed in range(30):
-        episode = sample_episode("visual_manipulation", seed=seed)
-        target, base = roles(episode)
-        shown = {
-            name: fill.placement
-            for name, fill in episode.problem.prompt.images
-            if isinstance(fill, ObjectImage)
-        }
-        assert shown == {"dragged_obj_1": target, "base_obj": base}
-        (constraint,) = episode.problem.constraints
-        assert isinstance(constraint, DistractorsApart)
-        assert set(constraint.object_ids) == {5, 6, 7} - {target.id, base.id}
 
 
 def test_a_free_place_keeps_half_a_window_from_edge_and_objects(assets: Assets) -> None:
@@ -167,10 +122,7 @@ def test_places_and_headings_are_uniform_over_what_is_free(assets: Assets) -> No
     poses = [table.free_pose("block", (0.07, 0.07, 0.07)) for _ in range(1000)]
     xs, ys, yaws = np.array([(p.x, p.y, p.yaw_rad) for p in poses if p is not None]).T
     for values, low, high in ((xs, 0.303, 0.697), (ys, -0.447, 0.447), (yaws, -np.pi, np.pi)):
-        counts, _ = np.histogram(values, bins=10, range=(low, high))
-        assert (
-            counts.sum() == 1000 and ((counts - 100) ** 2 / 100).sum() < 27.9
-        )  # chi-square, 9 degrees, p = 0.001
+        assert_uniform(np.floor((values - low) / (high - low) * 10).tolist(), range(10))
 
 
 def test_a_crowded_table_has_no_free_place(assets: Assets) -> None:
@@ -203,10 +155,7 @@ def test_the_bars_of_a_square_stay_on_the_table_and_off_other_objects(assets: As
     [
         ((0.144, 0.144, 0.036), "frame", 0.1945),
         ((0.144, 0.144, 0.036), "square", 0.182),
-        ((0.128, 0.128, 0.032), "frame", 0.1865),
-        ((0.128, 0.128, 0.032), "square", 0.174),
         ((0.07, 0.07, 0.07), "frame", 0.1575),
-        ((0.07, 0.07, 0.07), "square", 0.145),
         ((0.07, 0.07, 0.07), "container", None),
     ],
 )
@@ -224,20 +173,17 @@ def test_hollow_bases_keep_objects_out_of_their_middle(
         assert inside(reach - 1e-9) and not inside(reach + 1e-6)
 
 
-def test_nothing_movable_is_placed_in_the_hollow_of_a_base(assets: Assets) -> None:
+@pytest.mark.parametrize(
+    ("first", "second", "reach"), [("frame", "block", 0.1575), ("block", "square", 0.145)]
+)
+def test_nothing_movable_stands_in_the_hollow_of_a_base(
+    first: str, second: str, reach: float, assets: Assets
+) -> None:
     for seed in range(60):
         table = table_for(assets, seed=seed, compat=True)
-        table.add("frame", "red", size=(0.225, 0.225, 0.0), pose=Pose.planar(0.5, 0.0))
-        block = table.place_one("target", lambda: ("block", "blue"), tries=50)
-        assert block.pose.planar_distance(Pose.planar(0.5, 0.0)) > 0.1575
-
-
-def test_no_hollow_base_is_placed_around_what_is_movable(assets: Assets) -> None:
-    for seed in range(60):
-        table = table_for(assets, seed=seed, compat=True)
-        table.add("block", "blue", size=(0.07, 0.07, 0.07), pose=Pose.planar(0.5, 0.0))
-        square = table.place_one("distractor", lambda: ("square", "red"), tries=50)
-        assert square.pose.planar_distance(Pose.planar(0.5, 0.0)) > 0.145
+        table.add(first, "red", size=object_spec(first).size_max, pose=Pose.planar(0.5, 0.0))
+        other = table.place_one("other", lambda: (second, "blue"), tries=50)
+        assert other.pose.planar_distance(Pose.planar(0.5, 0.0)) > reach
 
 
 def test_objects_keep_the_distance_asked_for_except_with_compat(assets: Assets) -> None:
@@ -260,7 +206,21 @@ def test_sizes_are_drawn_axis_by_axis(assets: Assets) -> None:
     assert abs(np.corrcoef(sizes[:, 0], sizes[:, 1])[0, 1]) < 0.25
 
 
-def unlucky_task(num_failures: int) -> list[int]:
+Sample = Callable[[TableSampler], object]
+
+
+@pytest.fixture
+def register(monkeypatch: pytest.MonkeyPatch) -> Callable[[Sample], None]:
+    """Register a task "own" for the length of a test."""
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    pools = task_spec("rotate").pools
+    return register_task("own", family="x", template="x.", oracle_max_steps=1, pools=pools)
+
+
+@pytest.mark.parametrize("num_failures", [3, 1000])
+def test_an_unlucky_draw_is_repeated_with_other_numbers_a_hundred_times(
+    num_failures: int, register: Callable[[Sample], None]
+) -> None:
     calls: list[int] = []
 
     def sample(table: TableSampler) -> object:
@@ -269,59 +229,30 @@ def unlucky_task(num_failures: int) -> list[int]:
             raise SamplingError("no luck.")
         return task_spec("rotate").sample(table)
 
-    pools = task_spec("rotate").pools
-    register_task("unlucky", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample)  # type: ignore[arg-type]
-    return calls
-
-
-def test_an_unlucky_draw_is_repeated_with_other_numbers_and_counted() -> None:
-    calls = unlucky_task(3)
-    try:
-        assert sample_episode("unlucky", seed=0).num_redraws == 3
+    register(sample)
+    if num_failures == 3:
+        assert sample_episode("own", seed=0).num_redraws == 3
         assert len(set(calls)) == 4
-    finally:
-        del registry._TASKS["unlucky"]
-
-
-def test_a_hundred_unlucky_draws_are_an_error() -> None:
-    unlucky_task(1000)
-    try:
-        with pytest.raises(
-            SamplingError, match="101 draws of unlucky at level train, seed 5, failed: no luck"
-        ):
-            sample_episode("unlucky", seed=5)
-    finally:
-        del registry._TASKS["unlucky"]
-
-
-def test_an_episode_of_more_than_twenty_steps_is_refused() -> None:
-    def sample(table: TableSampler) -> Problem:
-        return replace(task_spec("rotate").sample(table), oracle_max_steps=19)
-
-    pools = task_spec("rotate").pools
-    register_task("endless", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample)
-    try:
-        with pytest.raises(ConfigError, match=r"oracle_max_steps of task 'endless' is 19; .* from 1 to 18"):
-            sample_episode("endless", seed=0)
-    finally:
-        del registry._TASKS["endless"]
+    else:
+        with pytest.raises(SamplingError, match="101 draws of own at level train, seed 5, failed: no luck"):
+            sample_episode("own", seed=5)
 
 
 @pytest.mark.parametrize(
     ("sample", "message"),
     [
-        (lambda table: 1 // 0, r"`sample` of task 'wrong', seed 4, raised ZeroDivisionError: .*line \d+"),
-        (lambda table: None, "`sample` of task 'wrong' returned a NoneType; return a Problem"),
+        (lambda table: 1 // 0, r"`sample` of task 'own', seed 4, raised ZeroDivisionError: .*line \d+"),
+        (lambda table: None, "`sample` of task 'own' returned a NoneType; return a Problem"),
+        (
+            lambda table: replace(task_spec("rotate").sample(table), oracle_max_steps=19),
+            r"oracle_max_steps of task 'own' is 19; .* from 1 to 18",
+        ),
     ],
 )
-def test_errors_in_a_task_name_it(sample: Callable[[TableSampler], Problem], message: str) -> None:
-    pools = task_spec("rotate").pools
-    register_task("wrong", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample)
-    try:
-        with pytest.raises(ConfigError, match=message):
-            sample_episode("wrong", seed=4)
-    finally:
-        del registry._TASKS["wrong"]
+def test_errors_in_a_task_name_it(sample: Sample, message: str, register: Callable[[Sample], None]) -> None:
+    register(sample)
+    with pytest.raises(ConfigError, match=message):
+        sample_episode("own", seed=4)
 
 
 def test_wrong_arguments_are_refused_by_name() -> None:
@@ -331,49 +262,28 @@ def test_wrong_arguments_are_refused_by_name() -> None:
         sample_episode("sweep_without_exceeding", level="L3", seed=0)
     with pytest.raises(ConfigError, match="Did you mean 'num_distractors'"):
         sample_episode("rotate", seed=0, num_distractor=2)
-    with pytest.raises(ConfigError, match=r"difficulty 'esy'\. Did you mean 'easy'"):
-        sample_episode("rotate", seed=0, difficulty="esy")
-    with pytest.raises(ConfigError, match="num_distractors is 9; give an integer from 0 to 6"):
-        sample_episode("rotate", seed=0, num_distractors=9)
-    with pytest.raises(ConfigError, match="seed is -1"):
-        sample_episode("rotate", seed=-1)
+    with pytest.raises(ConfigError, match="Did you mean 'train'"):
+        sample_episode("rotate", seed=0, domain="trian")
+    for seed in (-1, 2**63, 1.5, "7", None, True):
+        with pytest.raises(ConfigError, match=r"seed is .*give an integer from 0"):
+            sample_episode("rotate", seed=seed)
 
 
-def first_draw(*key: object, attempt: int = 0) -> int:
-    return int(make_rng(*key, attempt=attempt).integers(2**63))  # type: ignore[arg-type]  # keys are built below
+def test_no_two_keys_share_a_stream_and_names_hash_alike_in_another_process() -> None:
+    def first_draw(*key: object, attempt: int = 0) -> int:
+        return int(make_rng(*key, attempt=attempt).integers(2**63))  # type: ignore[arg-type]
 
-
-def test_no_two_keys_share_a_stream() -> None:
     keys = itertools.product(DOMAINS, ("rotate", "twist"), ("train", "L1"), range(50), ("scene", "oracle"))
     draws = [first_draw(*key) for key in keys]
     draws += [first_draw("user", "rotate", "train", 0, "scene", attempt=attempt) for attempt in range(1, 50)]
+    draws.append(first_draw("user", "rotate", "train", 2**32, "scene"))  # wraps onto no small seed
     assert len(set(draws)) == len(draws)
-
-
-def test_large_seeds_do_not_wrap_onto_small_ones() -> None:
-    assert first_draw("user", "rotate", "train", 2**32, "scene") != first_draw(
-        "user", "rotate", "train", 0, "scene"
-    )
-
-
-def test_names_hash_alike_in_another_process() -> None:
     code = (
         "from openvima.tasks import make_rng; "
         "print(make_rng('eval', 'rotate', 'L2', 7, 'scene').integers(2**63))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(result.stdout) == first_draw("eval", "rotate", "L2", 7, "scene")
-
-
-@pytest.mark.parametrize("seed", [-1, 2**63, 1.5, "7", None, True])
-def test_a_seed_that_is_no_natural_number_is_refused(seed: object) -> None:
-    with pytest.raises(ConfigError, match=r"seed is .*give an integer from 0"):
-        first_draw("user", "rotate", "train", seed, "scene")
-
-
-def test_an_unknown_domain_is_refused_with_a_suggestion() -> None:
-    with pytest.raises(ConfigError, match="Did you mean 'train'"):
-        first_draw("trian", "rotate", "train", 0, "scene")
 
 
 @pytest.mark.slow

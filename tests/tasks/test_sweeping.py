@@ -41,31 +41,49 @@ def plan(problem: Problem, *, open_ids: tuple[int, ...] | None = None, compat: b
     return plan_sweep(goals, problem.scene, problem, compat=compat)
 
 
-def pushed_to(sweep: Sweep) -> tuple[float, float]:
+def way(sweep: Sweep) -> tuple[float, float, float]:
+    """Direction and length of a sweep."""
     dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
     length = math.hypot(dx, dy)
-    return sweep.end[0] - SHORTFALL_M * dx / length, sweep.end[1] - SHORTFALL_M * dy / length
+    return dx / length, dy / length, length
+
+
+def pushed_to(sweep: Sweep) -> tuple[float, float]:
+    dx, dy, _ = way(sweep)
+    return sweep.end[0] - SHORTFALL_M * dx, sweep.end[1] - SHORTFALL_M * dy
+
+
+def passed_over(
+    sweep: Sweep, start: tuple[float, float], back: float, front: float, half_width: float
+) -> Rectangle:
+    """A rectangle along a sweep from so far behind a point to so far ahead of it."""
+    dx, dy, _ = way(sweep)
+    middle = (back + front) / 2
+    x, y = start[0] + middle * dx, start[1] + middle * dy
+    return Rectangle(x, y, math.atan2(dy, dx), (front - back) / 2, half_width)
 
 
 def covered(sweep: Sweep) -> Rectangle:
     """What the spatula passes over, and a block in front of its middle, without any margin."""
-    dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
-    length = math.hypot(dx, dy)
-    back, front = -0.0225, length - SHORTFALL_M + 0.015
-    middle = (back + front) / 2
-    x, y = sweep.start[0] + middle * dx / length, sweep.start[1] + middle * dy / length
-    return Rectangle(x, y, math.atan2(dy, dx), (front - back) / 2, 0.025)
+    return passed_over(sweep, sweep.start, -0.0225, way(sweep)[2] - SHORTFALL_M + 0.015, 0.025)
+
+
+def meets_others(problem: Problem, sweep: Sweep) -> bool:
+    others = [p for p in problem.scene.placements if not p.fixed and p.id != sweep.goal.object_id]
+    return any(covered(sweep).comes_near(Rectangle.of_box(p.pose, 0.03, 0.03)) for p in others)
 
 
 def block_meets(problem: Problem, sweep: Sweep, line: Zone) -> bool:
     """Whether the block that is swept passes over the line."""
     pose = problem.scene[sweep.goal.object_id].pose
-    dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
-    length = math.hypot(dx, dy)
-    way = length - STANDOFF_M - SHORTFALL_M
-    x, y = pose.x + way / 2 * dx / length, pose.y + way / 2 * dy / length
-    block = Rectangle(x, y, math.atan2(dy, dx), way / 2 + 0.0212, 0.0212)
+    front = way(sweep)[2] - STANDOFF_M - SHORTFALL_M
+    block = passed_over(sweep, (pose.x, pose.y), -0.0212, front + 0.0212, 0.0212)
     return block.comes_near(Rectangle.of_zone(line))
+
+
+def is_inside(place: tuple[float, float]) -> bool:
+    """Whether a block pushed there lies well inside the area."""
+    return abs(place[0] - AREA.x) < AREA.size_x / 2 - 0.02 and abs(place[1]) < AREA.size_y / 2 - 0.02
 
 
 def test_a_lone_block_goes_straight_to_the_middle_of_the_zone() -> None:
@@ -84,15 +102,15 @@ def test_the_nearest_block_goes_first_whatever_its_id() -> None:
 def test_a_distractor_in_the_way_makes_another_block_go_first() -> None:
     problem = problem_with({4: (0.65, 0.0), 5: (0.72, -0.15)}, {6: (0.6, 0.01)})
     sweep = plan(problem)
-    assert sweep.goal.object_id == 5
-    assert not covered(sweep).comes_near(Rectangle(0.6, 0.01, 0.0, 0.015, 0.015))
+    assert sweep.goal.object_id == 5 and not meets_others(problem, sweep)
 
 
 def test_the_next_block_stops_beside_the_one_swept_before() -> None:
-    sweep = plan(problem_with({4: (0.5, 0.0), 5: (0.65, -0.1)}, {}), open_ids=(5,))
+    problem = problem_with({4: (0.5, 0.0), 5: (0.65, -0.1)}, {})
+    sweep = plan(problem, open_ids=(5,))
     x, y = pushed_to(sweep)
     assert x == pytest.approx(ZONE.x) and -0.11 < y < -0.04
-    assert not covered(sweep).comes_near(Rectangle(0.5, 0.0, 0.0, 0.015, 0.015))
+    assert not meets_others(problem, sweep)
 
 
 def test_neighbours_too_close_for_the_spatula_are_parted_first() -> None:
@@ -102,11 +120,12 @@ def test_neighbours_too_close_for_the_spatula_are_parted_first() -> None:
 
 
 def test_with_a_neighbour_beside_the_spatula_it_comes_down_a_little_aside() -> None:
-    sweep = plan(problem_with({4: (0.65, 0.0)}, {5: (0.69, 0.04)}))
-    dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
-    aside_m = (dx * (0.0 - sweep.start[1]) - dy * (0.65 - sweep.start[0])) / math.hypot(dx, dy)
+    problem = problem_with({4: (0.65, 0.0)}, {5: (0.69, 0.04)})
+    sweep = plan(problem)
+    dx, dy, _ = way(sweep)
+    aside_m = dx * (0.0 - sweep.start[1]) - dy * (0.65 - sweep.start[0])
     assert abs(aside_m) == pytest.approx(0.015)
-    assert not covered(sweep).comes_near(Rectangle(0.69, 0.04, 0.0, 0.015, 0.015))
+    assert not meets_others(problem, sweep)
     assert sweep.end[0] < ZONE.x
 
 
@@ -115,15 +134,7 @@ def test_the_spatula_comes_down_clear_of_the_box_around_a_turned_neighbour() -> 
     problem = problem_with({4: (0.6938, 0.0596), 5: (0.7478, 0.0365)}, {}, yaw_rad=math.radians(72))
     sweep = plan(problem)
     other = {4: 5, 5: 4}[sweep.goal.object_id]
-    dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
-    length = math.hypot(dx, dy)
-    spatula = Rectangle(
-        sweep.start[0] - 0.02 * dx / length,
-        sweep.start[1] - 0.02 * dy / length,
-        math.atan2(dy, dx),
-        0.0025,
-        0.025,
-    )
+    spatula = passed_over(sweep, sweep.start, -0.0225, -0.0175, 0.025)
     assert not spatula.meets_box_around(Rectangle.of_box(problem.scene[other].pose, 0.03, 0.03))
 
 
@@ -131,9 +142,8 @@ def test_the_spatula_comes_down_clear_of_the_box_around_a_turned_neighbour() -> 
 def test_a_block_beside_a_short_line_goes_through_the_gap(y: float, side: int) -> None:
     problem = problem_with({4: (0.65, y)}, {}, zone=AREA, line=SHORT)
     sweep = plan(problem)
-    x, y = pushed_to(sweep)
     assert not block_meets(problem, sweep, SHORT)
-    assert abs(x - AREA.x) < AREA.size_x / 2 - 0.02 and 0.0 < side * y < AREA.size_y / 2 - 0.02
+    assert is_inside(pushed_to(sweep)) and side * pushed_to(sweep)[1] > 0
 
 
 @pytest.mark.parametrize("line", [SHORT, LONG])
@@ -146,9 +156,8 @@ def test_a_block_in_front_of_a_line_stops_beside_it_first(line: Zone, y: float) 
     assert stop[1] * y > 0 and abs(stop[1]) > line.size_y / 2
     moved = problem_with({4: stop}, {}, zone=AREA, line=line)
     second = plan(moved)
-    x, y = pushed_to(second)
     assert not block_meets(moved, second, line)
-    assert abs(x - AREA.x) < AREA.size_x / 2 - 0.02 and abs(y) < AREA.size_y / 2 - 0.02
+    assert is_inside(pushed_to(second))
 
 
 def test_a_detour_goes_around_the_other_end_if_distractors_fence_the_near_one_off() -> None:
@@ -161,7 +170,7 @@ def test_a_detour_goes_around_the_other_end_if_distractors_fence_the_near_one_of
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 def test_first_sweeps_around_a_line_touch_nothing(difficulty: str) -> None:
     num_clear = 0
-    for seed in range(100):
+    for seed in range(60):
         problem = sample_episode(
             "sweep_without_touching", level="L4", seed=seed, difficulty=difficulty
         ).problem
@@ -169,9 +178,8 @@ def test_first_sweeps_around_a_line_touch_nothing(difficulty: str) -> None:
         assert isinstance(line, NeverTouches)
         sweep = plan(problem)
         assert not block_meets(problem, sweep, line.zone)
-        others = [p for p in problem.scene.placements if not p.fixed and p.id != sweep.goal.object_id]
-        num_clear += not any(covered(sweep).comes_near(Rectangle.of_box(p.pose, 0.03, 0.03)) for p in others)
-    assert num_clear >= 97
+        num_clear += not meets_others(problem, sweep)
+    assert num_clear >= 58
 
 
 def test_a_group_is_parted_without_pushing_a_block_along_the_edge() -> None:
@@ -211,12 +219,10 @@ def test_a_block_at_its_target_already_is_still_a_sweep() -> None:
 
 def test_first_sweeps_touch_nothing_else_and_are_mostly_straight() -> None:
     num_straight, num_clear = 0, 0
-    for seed in range(300):
+    for seed in range(100):
         problem = sample_episode("sweep_without_exceeding", seed=seed).problem
         sweep = plan(problem)
-        others = [p for p in problem.scene.placements if not p.fixed and p.id != sweep.goal.object_id]
-        ways = covered(sweep)
-        num_clear += not any(ways.comes_near(Rectangle.of_box(p.pose, 0.03, 0.03)) for p in others)
+        num_clear += not meets_others(problem, sweep)
         num_straight += abs(pushed_to(sweep)[1]) < 1e-9
-    assert num_straight >= 270
-    assert num_clear >= 290
+    assert num_straight >= 90
+    assert num_clear >= 97
