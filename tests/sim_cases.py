@@ -8,7 +8,7 @@ from openvima.catalog import Geometry, TriangleMesh, Vector3, object_spec
 from openvima.catalog.bodies import block
 from openvima.catalog.objects import OBJECTS
 from openvima.catalog.packs import load_assets
-from openvima.scene import FIRST_OBJECT_ID, Action, EndEffector, Placement, Pose, Scene
+from openvima.scene import FIRST_OBJECT_ID, EndEffector, Placement, Pose, Scene
 
 COLOURS = {"red": (255, 87, 89), "blue": (78, 121, 167), "white": (255, 255, 255)}
 
@@ -75,18 +75,3 @@ def random_table(rng: np.random.Generator, end_effector: EndEffector) -> Scene:
     ]
     num_free = int(rng.integers(1, len(bodies) + 1))
     return table(*bodies[:num_free], fixed=tuple(bodies[num_free:]), end_effector=end_effector)
-
-
-def random_action(rng: np.random.Generator, scene: Scene) -> Action:
-    """An action between points on or near bodies, in corners, or anywhere."""
-
-    def point() -> tuple[float, float]:
-        kind = rng.integers(4)
-        if kind <= 1:
-            pose = scene.placements[rng.integers(len(scene.placements))].pose
-            return pose.x + float(rng.normal(0, 0.02)), pose.y + float(rng.normal(0, 0.02))
-        if kind == 2:
-            return float(rng.choice((0.25, 0.75))), float(rng.choice((-0.5, 0.5)))
-        return float(rng.uniform(0.25, 0.75)), float(rng.uniform(-0.5, 0.5))
-
-    return Action.planar(point(), point(), float(rng.uniform(-3.1, 3.1)))

@@ -85,23 +85,6 @@ def test_kit_objects_and_their_hulls_scale_together(name):
     assert np.linalg.norm(tall.visual.normals, axis=2) == pytest.approx(1.0)
 
 
-def test_the_bowl_is_hollow_and_centred():
-    geometry = build("bowl")
-    vertices = geometry.visual.vertices.reshape(-1, 3)
-    assert np.abs(vertices.min(axis=0) + vertices.max(axis=0))[:2].max() < 0.002
-    inside = vertices[np.hypot(vertices[:, 0], vertices[:, 1]) < 0.05]
-    assert inside[:, 2].max() < 0.01
-    assert len(geometry.collision) == 14
-    walls = [part for part in geometry.collision[1:] if isinstance(part, CollisionHull)]
-    assert min(np.hypot(*part.points[:, :2].T).min() for part in walls) > 0.065
-
-
-def test_the_pan_has_one_hull_with_a_lid():
-    (hull,) = build("pan").collision
-    assert isinstance(hull, CollisionHull)
-    assert hull.points[:, 0].max() == pytest.approx(0.208, abs=1e-3)
-
-
 @pytest.mark.parametrize(("name", "num_holes"), [("letter A", 1), ("letter R", 1), ("ring", 1), ("heart", 0)])
 def test_holes_stay_open_in_what_is_drawn(name, num_holes):
     triangles = np.round(build(name).visual.vertices, 9)

@@ -85,7 +85,10 @@ def test_missing_and_damaged_files_are_named_and_the_rest_is_imported(checkout):
         assets.geometry("cross", SIZE)
     with pytest.raises(AssetError, match=rf"texture 'granite'.*textures/granite\.png is missing.*{command}"):
         assets.texture("granite")
-    assert len(OriginalAssets(PackFiles.imported()).problems()) == 2
+    for pack in (OriginalAssets(PackFiles.imported()), OriginalAssets(checkout)):
+        assert len(pack.problems()) == 2
+        with pytest.raises(AssetError, match=r"kitting/cross\.obj is missing"):
+            pack.geometry("cross", SIZE)
 
 
 def test_importing_again_replaces_the_import_and_what_was_loaded_of_it(checkout):

@@ -206,7 +206,8 @@ def test_the_step_limit_is_given_or_a_default() -> None:
         ("{a} را در {b} بگذارید؛ آن\u200cها را.", "{a} را در {b} بگذارید؛ آن\u200cها را."),
         ("Put the {a}\ninto the {b}.\n", "Put the {a} into the {b}."),
         ("Put\tthe  {a}.\r\n", "Put the {a}."),
-        ("Put  the {a}. \U0001f468\u200d\U0001fae9", "Put  the {a}. \U0001f468\u200d\U0001fae9"),
+        ("Put  the {a}.", "Put  the {a}."),
+        ("Look: \U0001f468\u200d\U0001f467 \U0001fae9", "Look: \U0001f468\u200d\U0001f467 \U0001fae9"),
     ],
 )
 def test_prompts_of_all_languages_are_taken_with_blanks_as_spaces(prompt: str, text: str) -> None:

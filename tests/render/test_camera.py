@@ -36,15 +36,6 @@ def test_unproject_undoes_project(view, factor) -> None:
     np.testing.assert_allclose(found, points[:, :2], atol=1e-9)
 
 
-@pytest.mark.parametrize("view", VIEWS)
-def test_a_pixel_of_the_plain_image_is_the_lower_left_one_of_its_enlarged_block(view) -> None:
-    point = np.array([0.43, -0.21, 0.02])
-    column, row = project(point, CAMERAS[view])
-    np.testing.assert_allclose(
-        project(point, CAMERAS[view].enlarged(4)), (4 * column, 4 * row + 3), rtol=0, atol=1e-9
-    )
-
-
 def test_a_point_behind_the_camera_is_refused_by_name() -> None:
     with pytest.raises(ShapeError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
         project(np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 1001.0]]), TOP)
