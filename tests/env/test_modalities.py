@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import openvima
 from openvima.env import TabletopEnv
 from openvima.env.tabletop import MODALITIES
 from openvima.errors import ConfigError, ShapeError
@@ -70,14 +69,6 @@ def test_joints_are_where_the_path_of_the_last_step_ended() -> None:
     assert env.observation_space.contains(seen)
     assert env.joints.tobytes() == info["joints"].tobytes() == env.joint_path[-1].tobytes()
     assert not np.array_equal(env.joint_path[0], env.joints)
-
-
-def test_vector_environments_collect_depth_and_joints() -> None:
-    envs = openvima.make_vec("rotate", 2, modalities=("depth", "joints"))
-    seen, infos = envs.reset(seed=0)
-    assert seen["depth"]["top"].shape == (2, 128, 256)
-    assert infos["joints"].shape == (2, 6) and infos["joints"].dtype == np.float32
-    assert infos["joints"].tobytes() == seen["joints"].tobytes()
 
 
 class Noting:

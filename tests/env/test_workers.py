@@ -32,8 +32,9 @@ def main():
     while True:
         envs.step(stack_actions([None, None]))
 
+if __name__ == "__main__":
+    main()
 """
-GUARD = 'if __name__ == "__main__":\n    '
 
 
 def build(env_fn: Callable[[], gymnasium.Env] = Faulty) -> TabletopVectorEnv:
@@ -120,7 +121,7 @@ def test_a_worker_that_does_not_start_is_reported() -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_ends_everything_with_one_traceback(start: Start) -> None:
-    process = start(SCRIPT + GUARD + "main()")
+    process = start(SCRIPT)
     assert process.stdout.readline() == "starting\n"
     workers = [int(pid) for pid in process.stdout.readline().split()]
     assert len(workers) == 2
@@ -133,7 +134,7 @@ def test_ctrl_c_ends_everything_with_one_traceback(start: Start) -> None:
 
 
 def test_ctrl_c_while_workers_start_ends_them(start: Start) -> None:
-    process = start(SCRIPT + GUARD + "main()")
+    process = start(SCRIPT)
     process.stdout.readline()
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     while len(pids := children.read_text(encoding="utf-8").split()) < 3:  # a third one counts resources
@@ -147,7 +148,7 @@ def test_ctrl_c_while_workers_start_ends_them(start: Start) -> None:
 
 @pytest.mark.slow
 def test_workers_do_not_outlive_their_parent(start: Start) -> None:
-    process = start(SCRIPT + GUARD + "main()")
+    process = start(SCRIPT)
     process.stdout.readline()
     workers = [int(pid) for pid in process.stdout.readline().split()]
     process.kill()

@@ -1,4 +1,4 @@
-"""Scenes and prompts: what is drawn where, with which id and colour; and the page that shows everything."""
+"""Scenes and prompts: what is drawn where, with which id and colour; the page of all; cameras and rays."""
 
 import html
 import io
@@ -15,21 +15,29 @@ from openvima.errors import AssetError, ConfigError, ShapeError
 from openvima.render import (
     CAMERAS,
     CELL_M,
+    FRONT,
     LABEL_SHAPE,
+    TOP,
     VIEWS,
     Drawable,
     Rasteriser,
     cell_centres,
+    channels_first,
+    channels_last,
     empty_labels,
     label_raster,
     project,
     stamp,
+    unproject,
 )
 from openvima.render.gallery import write_gallery
+from openvima.render.raycast import Hit, first_hit, object_below
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
+from openvima.tasks import sample_episode
 from sim_cases import COLOURS, BoxAssets
 
 BLOCK = (0.07, 0.07, 0.07)
+PROCEDURAL = load_assets("procedural")
 
 
 def boxed(object_id: int, x: float, y: float, yaw_rad: float = 0.0, texture: str = "red") -> Placement:
@@ -204,7 +212,7 @@ def test_an_object_keeps_vertices_normals_and_texture() -> None:
     trimesh = pytest.importorskip("trimesh")
     from openvima.render.gltf import object_glb
 
-    assets, size, scale = load_assets(), (0.05, 0.05, 0.05), (1.0, 1.0, 1.0)
+    assets, size, scale = PROCEDURAL, (0.05, 0.05, 0.05), (1.0, 1.0, 1.0)
     read = trimesh.load(io.BytesIO(object_glb(assets, "block", "red swirl", size, scale)), file_type="glb")
     (mesh,) = read.geometry.values()
     drawn = assets.geometry("block", size, scale).visual
@@ -218,23 +226,11 @@ def cards(page) -> dict[str, str]:
     return dict(re.findall(r'<article class="card"><h3>([^<]+)</h3>(.*?)</article>', text, flags=re.DOTALL))
 
 
-@pytest.mark.slow
-def test_the_page_has_a_card_with_two_pictures_for_every_object_and_texture(tmp_path) -> None:
-    seen = []
-    page, problems = write_gallery(tmp_path, load_assets(), report=lambda *now: seen.append(now[:2]))
-    assert problems == () and page == tmp_path / "index.html"
-    found = cards(page)
-    assert list(found) == [*OBJECTS, *TEXTURES, "gray"]
-    assert {card.count("data:image/png") for card in found.values()} == {2}
-    assert "9.0 × 10.3 × 3.3 cm" in found["letter A"]
-    assert seen[-1] == (len(OBJECTS) + len(TEXTURES) + 1,) * 2
-
-
 class _Incomplete(ProceduralAssets):
-    """A pack without stripes and hearts."""
+    """A pack without tiles and hearts."""
 
     def texture(self, texture_name: str):
-        if "stripe" in texture_name:
+        if texture_name == "tiles":
             raise AssetError(f"{texture_name} is missing")
         return super().texture(texture_name)
 
@@ -245,7 +241,82 @@ class _Incomplete(ProceduralAssets):
 
 
 @pytest.mark.slow
-def test_what_a_pack_lacks_is_reported_and_the_rest_is_shown(tmp_path) -> None:
-    page, problems = write_gallery(tmp_path, _Incomplete())
-    assert "kitting/heart.obj is missing" in problems and "red and blue stripe is missing" in problems
-    assert "heart is missing" in cards(page)["heart"] and "data:" in cards(page)["star"]
+def test_the_page_has_a_card_for_every_object_and_texture_and_says_what_a_pack_lacks(tmp_path) -> None:
+    seen = []
+    page, problems = write_gallery(tmp_path, _Incomplete(), report=lambda *now: seen.append(now[:2]))
+    assert set(problems) == {"kitting/heart.obj is missing", "tiles is missing"}
+    assert page == tmp_path / "index.html"
+    found = cards(page)
+    assert list(found) == [*OBJECTS, *TEXTURES, "gray"]
+    lacking = {name for name, card in found.items() if card.count("data:image/png") != 2}
+    assert lacking == {"heart", "tiles"} and "heart is missing" in found["heart"]
+    assert "9.0 × 10.3 × 3.3 cm" in found["letter A"]
+    assert seen[-1] == (len(OBJECTS) + len(TEXTURES) + 1,) * 2
+
+
+# Point; X and Y (upwards) in the top view; the same in the front view. From the benchmark's own matrices.
+KNOWN_POINTS = [
+    ((0.5, 0.0, 0.0), (128.0, 64.0), (128.0, 48.0001)),
+    ((0.25, -0.5, 0.0), (2.51, 126.745), (2.3024, 92.4429)),
+    ((0.75, 0.5, 0.0), (253.49, 1.255), (253.7290, 3.5462)),
+    ((0.5, 0.0, 0.1), (128.0, 64.0), (128.0, 65.7788)),
+    ((0.41, 0.0, 0.0), (128.0, 86.5882), (128.0, 64.0008)),
+]
+
+
+@pytest.mark.parametrize(("point", "top", "front"), KNOWN_POINTS)
+def test_points_land_on_the_pixels_that_the_benchmark_shows_them_at(point, top, front) -> None:
+    for camera, (x, y) in ((TOP, top), (FRONT, front)):
+        np.testing.assert_allclose(project(np.array(point), camera), (x, 127 - y), atol=1e-4)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("factor", [1, 3])
+def test_unproject_undoes_project(view, factor) -> None:
+    camera = CAMERAS[view].enlarged(factor)
+    rng = np.random.default_rng(1)
+    points = rng.uniform((0.2, -0.6, -0.01), (0.8, 0.6, 0.35), (50, 3))
+    found = unproject(project(points, camera), camera, z=points[:, 2])
+    np.testing.assert_allclose(found, points[:, :2], atol=1e-9)
+
+
+def test_a_point_behind_the_camera_is_refused_by_name() -> None:
+    with pytest.raises(ShapeError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
+        project(np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 1001.0]]), TOP)
+
+
+@pytest.mark.parametrize("leading", [(), (5,), (2, 5)])
+def test_the_layouts_differ_in_the_place_of_the_channels_alone(leading) -> None:
+    images = np.arange(np.prod(leading, dtype=int) * 24).reshape(*leading, 3, 2, 4)
+    last = channels_last(images)
+    assert last.shape == (*leading, 2, 4, 3)
+    assert np.array_equal(last[..., 1, 3, 2], images[..., 2, 1, 3])
+    assert np.array_equal(channels_first(last), images)
+    assert np.shares_memory(last, images)
+
+
+def test_rays_from_above_meet_the_topmost_object() -> None:
+    scene = sample_episode("manipulate_old_neighbor", seed=1).problem.scene
+    labels = label_raster(scene, PROCEDURAL)
+    rng = np.random.default_rng(0)
+    cells = [*rng.permutation(np.argwhere(labels > 0))[:20].tolist(), [160, 2]]
+    for row, column in cells:
+        around = labels[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+        if (around == labels[row, column]).all():  # not at an outline
+            x, y = cell_centres(np.array(row), np.array(column)).tolist()
+            assert object_below(scene, (x, y), PROCEDURAL) == labels[row, column]
+
+
+def test_a_ray_meets_the_table_beside_objects_and_nothing_above_the_horizon() -> None:
+    scene = sample_episode("rotate", seed=0).problem.scene
+    assert first_hit((), (0.0, 0.0, 1.0), (1.0, 0.5, -2.0), PROCEDURAL) == Hit(0, (0.5, 0.25, 0.0))
+    assert first_hit(scene, (0.5, 0.0, 1.0), (0.0, 0.0, 1.0), PROCEDURAL) is None
+    assert first_hit(scene, (0.5, 0.0, 1.0), (1.0, 0.0, 0.0), PROCEDURAL) is None
+
+
+def test_a_slanted_ray_meets_the_near_side() -> None:
+    block = next(p for p in sample_episode("rotate", seed=0).problem.scene.placements)
+    x, y, z = block.pose.position
+    hit = first_hit((block,), (x + 1.0, y, z + 1.0), (-1.0, 0.0, -1.0), PROCEDURAL)
+    assert hit is not None and hit.object_id == block.id
+    assert hit.point[2] > 0 and hit.point[0] - x == pytest.approx(hit.point[2] - z)

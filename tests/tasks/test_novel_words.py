@@ -9,11 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from openvima.catalog import Assets, pool
+from openvima.catalog import pool
 from openvima.catalog.textures import texture_spec
-from openvima.render.rasteriser import Rasteriser
-from openvima.scene import Action, ObjectImage, Placement, Pose, Problem, Scene
-from openvima.sim.world import World
+from openvima.scene import ObjectImage, Placement, Problem
 from openvima.tasks import sample_episode
 from task_cases import assert_frequencies, assert_uniform, roles, roles_with_twins
 
@@ -53,7 +51,7 @@ def test_two_different_nouns_are_introduced_in_either_order(task: str) -> None:
     assert_uniform(pairs, [(a, b) for a in NOUNS for b in NOUNS if a != b])
 
 
-@both_nouns
+@pytest.mark.parametrize("task", LEVELS)
 @pytest.mark.slow
 def test_gray_pictures_introduce_target_and_base_once_each(task: str) -> None:
     target_slot = "dragged_obj_1" if task == "novel_noun" else "dragged_obj"
@@ -155,19 +153,6 @@ def test_all_comparisons_show_the_same_and_by_as_much_as_on_the_table() -> None:
 
 
 @pytest.mark.slow
-def test_gray_pictures_hold_no_colour_of_the_texture(assets: Assets) -> None:
-    rendered = Rasteriser(assets).prompt(problems("novel_adj")[0].prompt)
-    for name in ("dragged_obj", "base_obj"):
-        image = rendered.images[name]
-        assert [record.texture for record in image.objects] == ["gray"]
-        for view, segm in image.segm.items():
-            red, green, blue = image.rgb[view][:, segm == 0].astype(float)
-            # One hue and only one: what varies is the light.
-            for colour, level in ((green, 176), (blue, 172)):
-                assert np.abs(colour / red - level / 186).max() < 0.02
-
-
-@pytest.mark.slow
 def test_a_base_and_two_movable_twins_stand_apart() -> None:
     for problem in problems("novel_adj"):
         target, base, (twin,) = roles(problem)
@@ -190,30 +175,6 @@ def test_beyond_easy_another_shape_is_like_one_of_the_twins(difficulty: str) -> 
         like = target if difficulty == "hard" else twin
         assert extra.object != target.object and not extra.fixed
         assert (extra.texture, extra.scale) == (like.texture, like.scale)
-
-
-@pytest.mark.parametrize("factor", [0.3, 2.4])
-@pytest.mark.parametrize("object_name", ["letter E", "ring", "triangle"])
-def test_short_and_tall_objects_can_be_lifted_and_stand(
-    assets: Assets, object_name: str, factor: float
-) -> None:
-    scale, size = (1.0, 1.0, factor), (0.144, 0.144, 0.036)
-    start = Pose.planar(0.45, -0.2, 0.4)
-    world = World(Scene((Placement(5, object_name, "red", size, start, scale=scale),)), assets)
-    x, y, _ = start.transform(np.array([_inside(assets, object_name)]))[0]
-    execution = world.execute(Action.planar((x, y), (x, y + 0.4), 1.0))
-    end = world.scene[5].pose
-    assert execution.grasped == 5
-    qx, qy, _, _ = end.quaternion
-    assert end.z == pytest.approx(0, abs=1e-4) and abs(qx) + abs(qy) < 1e-3
-
-
-def _inside(assets: Assets, object_name: str) -> tuple[float, float, float]:
-    """A point of an object's outer rim, seen from above."""
-    vertices = assets.geometry(object_name, (0.144, 0.144, 0.036)).visual.vertices
-    upward = vertices[np.ptp(vertices[..., 2], axis=1) == 0]
-    x, y, _ = upward[0].mean(axis=0).tolist()
-    return x, y, 0.0
 
 
 @pytest.mark.slow

@@ -134,12 +134,6 @@ def test_an_object_has_to_be_near_its_target_at_any_heading(distance: float, suc
     assert (outcome.success, outcome.failure) == (success, False)
 
 
-def test_a_parked_distractor_leaves_the_target_to_the_object() -> None:
-    problem, own, target, distractor, inward = single(TASK, conflict=True)
-    for parked in (problem.prerequisites[0].target, target.moved(dy=0.101 * inward), FAR_AWAY):
-        assert judged(problem, {distractor.id: parked}, {own.id: target})[1].success
-
-
 @pytest.mark.parametrize(("distance", "success"), [(0.099, False), (0.101, True)])
 def test_at_the_end_the_distractor_must_be_away_from_target_and_object(
     distance: float, success: bool

@@ -1,8 +1,6 @@
 """Sampling of starts and its seeds."""
 
 import itertools
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,7 +10,7 @@ from hypothesis import given, settings
 
 from openvima.catalog import Assets, object_spec, pool
 from openvima.catalog.partitions import PUBLISHED_LEVELS, PUBLISHED_TASKS
-from openvima.errors import ConfigError, SamplingError, UnknownTaskError
+from openvima.errors import ConfigError, SamplingError
 from openvima.render.labels import label_raster
 from openvima.scene import FIRST_OBJECT_ID, Episode, EveryStepCounts, Outcome, Placement, Pose, in_workspace
 from openvima.tasks import (
@@ -156,21 +154,17 @@ def test_the_bars_of_a_square_stay_on_the_table_and_off_other_objects(assets: As
         ((0.144, 0.144, 0.036), "frame", 0.1945),
         ((0.144, 0.144, 0.036), "square", 0.182),
         ((0.07, 0.07, 0.07), "frame", 0.1575),
-        ((0.07, 0.07, 0.07), "container", None),
+        ((0.07, 0.07, 0.07), "container", -1.0),
     ],
 )
 def test_hollow_bases_keep_objects_out_of_their_middle(
-    size: tuple[float, float, float], base: str, reach: float | None
+    size: tuple[float, float, float], base: str, reach: float
 ) -> None:
     hollow = Placement(5, base, "red", object_spec(base).size_max, Pose.planar(0.5, 0.0), fixed=True)
 
-    def inside(distance: float) -> bool:
-        return is_in_hollow(Placement(6, "any", "red", size, Pose.planar(0.5, distance)), hollow)
-
-    if reach is None:
-        assert not inside(0.0)
-    else:
-        assert inside(reach - 1e-9) and not inside(reach + 1e-6)
+    for distance in (0.0, reach - 1e-9, reach + 1e-6):
+        placement = Placement(6, "any", "red", size, Pose.planar(0.5, distance))
+        assert is_in_hollow(placement, hollow) is (abs(distance) < reach)
 
 
 @pytest.mark.parametrize(
@@ -256,10 +250,6 @@ def test_errors_in_a_task_name_it(sample: Sample, message: str, register: Callab
 
 
 def test_wrong_arguments_are_refused_by_name() -> None:
-    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
-        sample_episode("rotat", seed=0)
-    with pytest.raises(ConfigError, match="not defined at level L3"):
-        sample_episode("sweep_without_exceeding", level="L3", seed=0)
     with pytest.raises(ConfigError, match="Did you mean 'num_distractors'"):
         sample_episode("rotate", seed=0, num_distractor=2)
     with pytest.raises(ConfigError, match="Did you mean 'train'"):
@@ -269,7 +259,7 @@ def test_wrong_arguments_are_refused_by_name() -> None:
             sample_episode("rotate", seed=seed)
 
 
-def test_no_two_keys_share_a_stream_and_names_hash_alike_in_another_process() -> None:
+def test_no_two_keys_share_a_stream() -> None:
     def first_draw(*key: object, attempt: int = 0) -> int:
         return int(make_rng(*key, attempt=attempt).integers(2**63))  # type: ignore[arg-type]
 
@@ -278,12 +268,6 @@ def test_no_two_keys_share_a_stream_and_names_hash_alike_in_another_process() ->
     draws += [first_draw("user", "rotate", "train", 0, "scene", attempt=attempt) for attempt in range(1, 50)]
     draws.append(first_draw("user", "rotate", "train", 2**32, "scene"))  # wraps onto no small seed
     assert len(set(draws)) == len(draws)
-    code = (
-        "from openvima.tasks import make_rng; "
-        "print(make_rng('eval', 'rotate', 'L2', 7, 'scene').integers(2**63))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(result.stdout) == first_draw("eval", "rotate", "L2", 7, "scene")
 
 
 @pytest.mark.slow
