@@ -141,7 +141,6 @@ def test_an_unfit_mesh_is_refused_with_the_name_and_the_limit(mesh: Any, message
     "text",
     [
         "",
-        "v 0 0 0\nf 1 1 1\n",
         obj_text().replace("f 1", "f 99999999999999999999"),
         obj_text() + "\nvt x\n",
         "\x00",

@@ -239,18 +239,13 @@ def test_gymnasiums_wrappers_take_the_infos() -> None:
     assert [info["episode"]["r"] for info in infos] == [1.0, 1.0]
 
 
-def test_seeds_are_dealt_in_turn_and_begin_again() -> None:
-    envs = openvima.make_vec("rotate", 2, seeds=range(5))
-    series = [envs.reset()[1]["seed"].tolist() for _ in range(4)]
-    assert series == [[0, 1], [2, 3], [4, 1], [0, 3]]
-    assert envs.reset(seed=[8, None])[1]["seed"].tolist() == [8, 1]
-
-
-def test_tasks_are_taken_in_turn() -> None:
-    envs = openvima.make_vec(TASKS, 3, level="L1")
-    _, infos = envs.reset(seed=0)
+def test_tasks_and_seeds_are_dealt_in_turn_and_begin_again() -> None:
+    envs = openvima.make_vec(TASKS, 3, level="L1", seeds=range(5))
+    *_, infos = resets = [envs.reset()[1] for _ in range(3)]
+    assert [each["seed"].tolist() for each in resets] == [[0, 1, 2], [3, 4, 2], [0, 1, 2]]
     assert infos["task"].tolist() == ["rotate", "visual_manipulation", "rotate"]
     assert infos["level"].tolist() == ["L1", "L2", "L1"]
+    assert envs.reset(seed=[8, None, None])[1]["seed"].tolist() == [8, 4, 2]
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])

@@ -58,6 +58,13 @@ def test_the_cup_catches_what_is_a_little_beside_it(beside_m, is_caught) -> None
     assert z == pytest.approx(0.069 if is_caught else -0.001, abs=1e-3)
 
 
+@pytest.mark.parametrize(("beside_m", "is_caught"), [(0.0015, True), (0.0025, False)])
+def test_the_cup_catches_what_is_close_beside_it_in_a_container(beside_m, is_caught) -> None:
+    scene = table(("block", 0.5, 0.0, 0.0), fixed=(("container", 0.5, 0.0, 0.0),))
+    action = Action.planar((0.5 + 0.035 + beside_m, 0.0), (0.6, 0.3))
+    assert World(scene, ASSETS).execute(action).grasped == (5 if is_caught else None)
+
+
 def test_a_block_above_the_floor_is_caught_at_any_height_and_tilt() -> None:
     rng = np.random.default_rng(0)
     scene = table(("block", 0.5, 0.0, 0.0))

@@ -147,6 +147,7 @@ def test_a_block_caught_between_spatula_and_wall_is_not_flung_away(x, y, yaw_rad
     world = World(scene, ASSETS)
     world.execute(Action.planar((0.4359, -0.1139), (0.2553, -0.1942)))
     assert world.scene[4].pose.planar_distance(scene[4].pose) < 0.4
+    assert world.scene[5] == scene[5]
 
 
 def test_a_block_that_rides_along_ends_where_physics_alone_pushes_it(monkeypatch) -> None:

@@ -117,9 +117,7 @@ def _zones(task: str, *, line_x: float) -> tuple[Zone, Zone]:
 
 
 def _pose(numbers: list[float]) -> Pose:
-    x, y, z, *quaternion = numbers
-    qx, qy, qz, qw = quaternion
-    return Pose((x, y, z), (qx, qy, qz, qw))
+    return Pose(tuple(numbers[:3]), tuple(numbers[3:]))
 
 
 @pytest.mark.skipif(not RECORDS, reason=f"no recorded scenes in {SCENES} (set OPENVIMA_GOLDEN)")

@@ -4,7 +4,6 @@ import collections
 import functools
 import itertools
 import re
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -92,19 +91,11 @@ def worded(request: str, word: str, is_flipped: bool) -> str:
     return request.replace("Put the", "Put the less" if is_flipped else "Put the").replace("WORD", word)
 
 
-class Asked(NamedTuple):
-    """What a prompt says, read off its text and its pictures."""
-
-    word: str
-    is_flipped: bool
-    meaning: str
-    shown: dict[str, Placement]
-
-
-def read(problem: Problem) -> Asked:
+def read(problem: Problem) -> tuple[str, bool, str, dict[str, Placement]]:
+    """Word, whether there is less of it, its meaning, and the images, read off text and pictures."""
     shown = {name: image.placement for name, image in problem.prompt.images if isinstance(image, ObjectImage)}
     more, less = shown["demo_blicker_obj_1"], shown["demo_less_blicker_obj_1"]
-    return Asked(*word_of(problem), difference(more, less), shown)
+    return *word_of(problem), difference(more, less), shown
 
 
 def difference(first: Placement, second: Placement) -> str:
@@ -138,14 +129,14 @@ def test_the_prompt_means_the_twin_that_it_says_and_its_words_are_uniform() -> N
 def test_all_comparisons_show_the_same_and_by_as_much_as_on_the_table() -> None:
     factors = []
     for problem in problems("novel_adj"):
-        asked = read(problem)
+        *_, meaning, shown = read(problem)
         target, _, (twin,) = roles(problem)
         scales = sorted((target.scale, twin.scale))
         for n in (1, 2, 3):
-            pair = (asked.shown[f"demo_blicker_obj_{n}"], asked.shown[f"demo_less_blicker_obj_{n}"])
-            assert difference(*pair) == asked.meaning
+            pair = (shown[f"demo_blicker_obj_{n}"], shown[f"demo_less_blicker_obj_{n}"])
+            assert difference(*pair) == meaning
             assert sorted(p.scale for p in pair) == scales
-        if asked.meaning in ("shorter", "taller"):
+        if meaning in ("shorter", "taller"):
             (x, y, low), (_, _, high) = scales
             assert x == y == 1 and 0.3 <= low < 0.4 and high - low == pytest.approx(2.0, abs=1e-12)
             factors.append(low)

@@ -279,10 +279,8 @@ def test_the_oracle_takes_the_shortest_way(
     for _ in range(num_steps):
         assert not outcome.is_over
         decision = oracle_action(problem, progress, scene, assets=assets, rng=rng)
-        waiting = [problem.goals[index] for index in progress.open_goals]
-        goal = next(
-            g for g in (*problem.prerequisites, *waiting) if not g.is_met(scene) and isinstance(g, AtPose)
-        )
+        waiting = (*problem.prerequisites, *(problem.goals[index] for index in progress.open_goals))
+        goal = next(goal for goal in waiting if not goal.is_met(scene))
         assert decision.pick_id == goal.object_id
         scene = scene.with_poses({goal.object_id: goal.target})
         progress, outcome = advance(problem, progress, scene)
