@@ -130,17 +130,6 @@ def test_the_layout_of_detectron2_is_that_of_ours_name_by_name(foreign):
     assert torch.equal(given["backbone.lateral.3.weight"], foreign["backbone.fpn_lateral5.weight"])
 
 
-@pytest.mark.slow
-def test_a_file_of_detectron2_is_read_and_finds_something(foreign, tmp_path):
-    torch.save({"model": foreign, "iteration": 7}, tmp_path / "mask_rcnn.pth")
-    network = load_detectron2(tmp_path / "mask_rcnn.pth")
-    network.config = replace(
-        network.config, min_size=64, rpn_post_nms_top_n=4, rpn_pre_nms_top_n=8, score_threshold=0.0
-    )
-    (found,) = network(torch.randint(0, 256, (1, 3, 64, 96), dtype=torch.uint8))
-    assert len(found.boxes) and found.masks.shape[1:] == (64, 96)
-
-
 @pytest.fixture
 def settings(monkeypatch):
     """A function that makes settings of the class that Detectron2's have, which is missing afterwards."""

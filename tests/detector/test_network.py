@@ -9,7 +9,6 @@ from PIL import Image
 
 from openvima.detector import load_detector, load_extractor
 from openvima.detector.config import resnet50, small
-from openvima.detector.detection import DetectedObjects
 from openvima.detector.network import (
     FrameDetector,
     Instances,
@@ -23,6 +22,9 @@ from openvima.perception.boxes import match_ids_to_slots
 from openvima.perception.objects import GROUND_TRUTH
 
 NUM_STEPS = 200  # masks of every seed tried are good by then, whatever the rounding
+
+
+NOTHING = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96, dtype=torch.bool), torch.zeros(0))
 
 
 def made(config, seed: int = 0) -> MaskRCNN:
@@ -85,8 +87,7 @@ def test_every_weight_gets_a_gradient(tiny, rectangles):
 
 
 def test_losses_are_finite_without_objects(tiny):
-    nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96, dtype=torch.bool), torch.zeros(0))
-    losses = made(tiny).losses(images(2), [nothing, nothing], sampled=16, generator=torch.Generator())
+    losses = made(tiny).losses(images(2), [NOTHING] * 2, sampled=16, generator=torch.Generator())
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert losses["mask"] == losses["box"] == 0
 
@@ -98,15 +99,6 @@ def test_equal_seeds_give_equal_losses(tiny, rectangles):
         return [float(loss.detach()) for loss in losses.values()]
 
     assert loss(0) == loss(0) != loss(1)
-
-
-def test_detections_do_not_depend_on_the_batch(tiny):
-    network = made(tiny)
-    batch = images(3)
-    alone = [network(batch[k : k + 1])[0] for k in range(3)]
-    for one, other in zip(network(batch), alone, strict=True):
-        assert torch.allclose(one.scores, other.scores, atol=1e-5)
-        assert torch.allclose(one.boxes, other.boxes, atol=1e-3)
 
 
 def test_images_of_odd_sizes_are_padded_and_boxes_stay_inside(tiny):
@@ -131,37 +123,25 @@ def test_resized_shapes_equal_those_of_detectron2(height, width):
     assert resized_shape(resnet50(), height, width) == ((short, long) if height < width else (long, short))
 
 
-@pytest.mark.parametrize("min_size", [30, 100])
-def test_images_are_resized_as_pillow_does(tiny, min_size):
+@pytest.mark.parametrize(("min_size", "height"), [(30, 64), (100, 64), (10, 65)])  # the last unevenly
+def test_images_are_resized_as_pillow_does(tiny, min_size, height):
+    given = images(1, height)
     network = made(replace(tiny, min_size=min_size, pixel_mean=(0.0,) * 3, pixel_std=(1.0,) * 3))
-    prepared, scale, (height, width) = network._preprocess(images(1))
-    image = Image.fromarray(images(1)[0].permute(1, 2, 0).numpy())
-    expected = np.asarray(image.resize((width, height), Image.Resampling.BILINEAR)).transpose(2, 0, 1)
-    assert np.abs(prepared[0, :, :height, :width].numpy() - expected).max() <= 1  # it counts in integers
-    assert scale.tolist() == pytest.approx([width / 96, height / 64] * 2)
-
-
-def test_boxes_are_scaled_per_axis(tiny):
-    # 64 × 96 pixels become 10 × 15 in both, but 65 × 96 do not grow evenly.
-    network = made(replace(tiny, min_size=10))
-    _, scale, size = network._preprocess(images(1, 65, 96))
-    assert size == (10, 15)
-    assert scale.tolist() == pytest.approx([15 / 96, 10 / 65] * 2)
+    prepared, scale, (rows, columns) = network._preprocess(given)
+    assert min(rows, columns) == min_size
+    image = Image.fromarray(given[0].permute(1, 2, 0).numpy())
+    expected = np.asarray(image.resize((columns, rows), Image.Resampling.BILINEAR)).transpose(2, 0, 1)
+    assert np.abs(prepared[0, :, :rows, :columns].numpy() - expected).max() <= 1  # it counts in integers
+    assert scale.tolist() == pytest.approx([columns / 96, rows / height] * 2)
 
 
 def test_fusing_batch_normalisation_keeps_the_detections(tiny):
     network = made(replace(tiny, score_threshold=0.0)).train()
-    nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
-    network.losses(images(4), [nothing] * 4, sampled=8, generator=torch.Generator())  # moves the statistics
+    network.losses(images(4), [NOTHING] * 4, sampled=8, generator=torch.Generator())  # moves the statistics
     network.eval()
     (plain,), (without,) = network(images(1)), fuse_batch_norm(network)(images(1))
     assert torch.allclose(plain.scores, without.scores, atol=1e-5)
     assert torch.allclose(plain.boxes, without.boxes, atol=1e-3)
-
-
-def test_proposals_count_for_their_best_class(tiny):
-    (found,) = made(replace(tiny, num_classes=3, score_threshold=0.0))(images(1))
-    assert len(found.boxes)
 
 
 def test_masks_are_those_of_the_best_class(tiny):
@@ -177,8 +157,7 @@ def test_frozen_batch_normalisation_keeps_its_statistics(tiny):
     config = replace(tiny, backbone=replace(tiny.backbone, frozen_batch_norm=True))
     network = MaskRCNN(config).train()
     before = network.backbone.stem.norm.running_mean.clone()
-    nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
-    network.losses(images(2), [nothing] * 2, sampled=8, generator=torch.Generator())
+    network.losses(images(2), [NOTHING] * 2, sampled=8, generator=torch.Generator())
     assert torch.equal(network.backbone.stem.norm.running_mean, before)
 
 
@@ -201,12 +180,6 @@ def test_boxes_are_converted_to_covered_pixels():
         torch.tensor([0.9, 0.8]),
     )
     assert to_detections(found).boxes.tolist() == [[2, 4, 9, 9], [95, 0, 95, 63]]
-
-
-def test_the_detector_serves_as_an_extractor(tiny):
-    extractor = DetectedObjects(FrameDetector(made(tiny)), min_score=0.0)
-    rgb = {view: images(1, 128, 256)[0].numpy() for view in ("front", "top")}
-    assert len(extractor.in_observation({"rgb": rgb, "ee": 0})) > 0
 
 
 @pytest.mark.parametrize(
@@ -257,12 +230,6 @@ def test_detections_of_several_pairs_of_images_are_those_of_each_pair(frames) ->
             np.testing.assert_array_equal(one.boxes, other.boxes)
             np.testing.assert_allclose(one.scores, other.scores, atol=1e-4)
             assert np.count_nonzero(one.masks != other.masks) <= len(one)
-
-
-def test_an_image_alone_shows_the_same_objects(frames) -> None:
-    detector = load_detector()
-    for alone, other in zip(
-        map(detector.detect, frames[:4], "ftft"), detector.detect_batch(frames[:4]), strict=True
-    ):
+    for alone, other in zip(map(detector.detect, frames[:4], "ftft"), expected, strict=False):
         np.testing.assert_array_equal(alone.boxes, other.boxes)
         np.testing.assert_allclose(alone.scores, other.scores, atol=1e-4)

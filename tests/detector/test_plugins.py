@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from openvima.data import Dataset
 from openvima.data.preprocessed import preprocess
+from openvima.detector.checkpoint import save_network
+from openvima.detector.network import MaskRCNN
 from openvima.detector.plugins import (
     PluggedExtractor,
     detected_object_cache,
@@ -46,9 +49,7 @@ def test_where_something_is_found_it_is_left_as_it_is():
     ("hook", "message"),
     [
         ("extractor", "MODULE:FUNCTION"),
-        ("no_such_module:make", "no such module"),
         ("no/such/file.py:make", "no such Python file"),
-        ("openvima.perception.objects:make", "has no function 'make'"),
         ("builtins:dict", "returned a dict"),
     ],
 )
@@ -95,16 +96,10 @@ def test_the_name_of_a_function_follows_from_its_file(tmp_path):
 
 
 def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tiny, data):
-    import torch
-
-    from openvima.detector.checkpoint import save_network
-    from openvima.detector.network import MaskRCNN
-
     names = []
     for number, config in enumerate((tiny, tiny, replace(tiny, nms_iou=0.4))):
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(min(number, 1))
-            save_network(MaskRCNN(config), tmp_path / str(number))
+        torch.manual_seed(min(number, 1))
+        save_network(MaskRCNN(config), tmp_path / str(number))
         names.append(plugged_boxes(f"detector={tmp_path / str(number)}").name)
     shutil.copytree(tmp_path / "0", tmp_path / "moved")
     names.append(plugged_boxes(f"detector={tmp_path / 'moved'}").name)
@@ -114,11 +109,6 @@ def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tin
 
 
 def test_the_object_cache_of_a_detector_equals_its_extractor_on_one_thread(tmp_path, tiny, data):
-    import torch
-
-    from openvima.detector.checkpoint import save_network
-    from openvima.detector.network import MaskRCNN
-
     save_network(MaskRCNN(replace(tiny, rpn_pre_nms_top_n=4, rpn_post_nms_top_n=3)), tmp_path / "detector")
     boxes = plugged_boxes(f"detector={tmp_path / 'detector'}")
     assert pickle.loads(pickle.dumps(boxes)) == boxes

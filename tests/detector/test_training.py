@@ -1,6 +1,5 @@
 """Training: what a run leaves, going on after an interruption, and what is refused."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from openvima.training.config import RuntimeConfig, ScheduleConfig
 from openvima.training.detector import DetectorTrainingConfig, train_detector
 from openvima.training.detector.config import FrameLoaderConfig
 from openvima.training.detector.stage import split_episodes
+from small_networks import metrics_of
 
 
 @pytest.fixture
@@ -38,17 +38,13 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
     return load_network(run).state_dict()
 
 
-def lines(run: Path) -> list[dict]:
-    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-
-
 def test_a_run_leaves_a_detector_and_its_metrics(settings):
     seen = []
     run = train_detector(settings, lambda *progress: seen.append(progress))
     assert seen[-1][:2] == (2, 2)
     names = {"loss", *(f"loss/{name}" for name in ("rpn_objectness", "rpn_box", "class", "box", "mask"))}
-    trained = [line for line in lines(run) if "loss" in line]
-    held_out = [line for line in lines(run) if "validation_loss" in line]
+    trained = [line for line in metrics_of(run) if "loss" in line]
+    held_out = [line for line in metrics_of(run) if "validation_loss" in line]
     assert names <= trained[-1].keys() and {f"validation_{name}" for name in names} <= held_out[-1].keys()
     assert [line["step"] for line in held_out] == [1, 2]
     found = load_detector(run).detect(np.zeros((3, 128, 256), np.uint8), "top")
@@ -71,7 +67,7 @@ def test_an_interrupted_run_ends_with_the_weights_of_one_that_was_not(settings, 
     last = "checkpoints/detector-000002"
     one, other = weights(whole / last), weights(run / last)
     assert all(torch.equal(one[name], other[name]) for name in one if "num_batches" not in name)
-    assert [line["step"] for line in lines(run) if "loss" in line] == [1, 2]
+    assert [line["step"] for line in metrics_of(run) if "loss" in line] == [1, 2]
 
 
 def test_other_settings_do_not_continue_a_run(settings):
@@ -115,12 +111,6 @@ def test_too_few_demonstrations_are_told(settings):
             {"optimizer.learning_rate": "high", "loader.augment": 1},
             r"optimizer\.learning_rate is 'high'.*loader\.augment is 1; .* true or false",
         ),
-        (
-            {"optimizer.learning_rate": float("nan")},
-            "optimizer.learning_rate is nan; it must be between 0 and 1",
-        ),
-        ({"optimizer.max_grad_norm": 0.0}, "optimizer.max_grad_norm is 0"),
-        ({"preset": None}, "preset is None; it must be text"),
         ({"optimizer.learning_rate": -1.0, "schedule.steps": 0}, r"learning_rate is -1.*steps is 0"),
     ],
 )
