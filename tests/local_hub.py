@@ -81,19 +81,7 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         """Print nothing."""
 
-    def do_HEAD(self) -> None:
-        self._read()
-
     def do_GET(self) -> None:
-        self._read()
-
-    def do_POST(self) -> None:
-        self._write()
-
-    def do_PUT(self) -> None:
-        self._write()
-
-    def _read(self) -> None:
         path = self._path()
         if self.hub.is_down:
             return self._refuse(503, "", "Service Unavailable")
@@ -120,7 +108,9 @@ class _Handler(BaseHTTPRequestHandler):
         content = repository.commits[oid][path]
         return self._send(200, content, {"ETag": f'"{_oid(path, content)}"', "X-Repo-Commit": oid})
 
-    def _write(self) -> None:
+    do_HEAD = do_GET
+
+    def do_POST(self) -> None:
         path, body = self._path(), self._body()
         if path.startswith("/lfs/"):
             oid = path.removeprefix("/lfs/")
@@ -149,6 +139,8 @@ class _Handler(BaseHTTPRequestHandler):
         if found[3] == "preupload":
             return self._json({"files": [_mode(file["path"]) for file in json.loads(body)["files"]]})
         return self._commit(found[2], repository, branch, [json.loads(line) for line in body.splitlines()])
+
+    do_PUT = do_POST
 
     def _create(self, asked: dict) -> None:
         kind = f"{asked.get('type', 'model')}s"

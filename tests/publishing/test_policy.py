@@ -55,7 +55,10 @@ def scores(run: Path, tmp_path: Path) -> Path:
 
 def test_a_pushed_checkpoint_is_loaded_and_scored_by_its_revision(hub: LocalHub, run: Path) -> None:
     pushed = push_policy(run, "owner/first@v1")
+    hub.requests.clear()
     assert weights_hash(str(pushed)) == weights_hash(run)
+    fetched = {each.rpartition("/")[2] for each in hub.requests if "/resolve/" in each}
+    assert fetched == {"model.safetensors", "config.yaml", "vocabulary.json"}
     assert load_policy("owner/first@v1").network.config == load_checkpoint(find_checkpoint(run)).config
     assert PolicySource("first", "owner/first@v1").record()["hub"] == str(pushed)
     hub.repository("owner/first").commit({"model.safetensors": b"other"}, "v1")

@@ -61,23 +61,21 @@ def test_the_oracle_solves_an_episode_by_commands_with_a_prompt_of_text(make: An
     assert info["is_success"]
 
 
-@pytest.mark.parametrize("row", [np.zeros(12, np.float32), np.zeros(5, int), np.full(5, np.inf, np.float32)])
-def test_a_malformed_command_ends_the_episode_as_a_failure(
-    make: Any, row: np.ndarray, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("changes", "row", "message"),
+    [
+        (LOW_LEVEL, np.zeros(12, np.float32), "the episode ends"),
+        (LOW_LEVEL, np.zeros(5, int), "the episode ends"),
+        (LOW_LEVEL, np.full(5, np.inf, np.float32), "the episode ends"),
+        ({}, np.full(12, np.nan, np.float32), "must be finite"),
+    ],
+)
+def test_a_malformed_action_ends_the_episode_as_a_failure(
+    make: Any, changes: dict, row: np.ndarray, message: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    env = make(**LOW_LEVEL)
-    env.reset(seed=1000)
-    with caplog.at_level(logging.WARNING):
-        assert env.step(row)[1:] == (0.0, True, False, {"is_success": False})
-    assert "the episode ends" in caplog.text
-
-
-def test_an_action_that_is_not_finite_ends_the_episode_as_a_failure(
-    make: Any, caplog: pytest.LogCaptureFixture
-) -> None:
-    env = make()
+    env = make(**changes)
     before, _ = env.reset(seed=1000)
     with caplog.at_level(logging.WARNING):
-        seen, reward, terminated, truncated, info = env.step(np.full(12, np.nan, np.float32))
-    assert (reward, terminated, truncated, info) == (0.0, True, False, {"is_success": False})
-    assert seen is before and "must be finite" in caplog.text
+        seen, *rest = env.step(row)
+    assert seen is before and rest == [0.0, True, False, {"is_success": False}]
+    assert message in caplog.text
