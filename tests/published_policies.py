@@ -1,5 +1,6 @@
 """Small policies as others publish theirs: a `.ckpt` file, and the files of a tokenizer of T5."""
 
+import os
 from pathlib import Path
 
 import torch
@@ -13,6 +14,16 @@ from openvima.policies.sizes import Size
 
 VOCABULARY_SIZE = 160
 _UNUSED_VOCABULARY_SIZE = 40478  # of the first GPT, whose unused embedding Gato and GPT contain
+
+
+class Touch:
+    """Pickled, it makes whoever unpickles it carelessly create a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.folder),)
 
 
 def small_vima() -> VimaConfig:
@@ -63,4 +74,25 @@ def write_tokenizer(folder: Path) -> Path:
     tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
     folder.mkdir(parents=True)
     tokenizer.save(str(folder / "tokenizer.json"))
+    return folder
+
+
+def write_t5(folder: Path, text: TextEncoderConfig, vocabulary_size: int) -> Path:
+    """Write a T5 of transformers with random weights, no two alike."""
+    from transformers import T5Config, T5EncoderModel
+
+    sizes = T5Config(
+        vocab_size=vocabulary_size,
+        d_model=text.width,
+        d_kv=text.head_width,
+        d_ff=text.hidden_width,
+        num_layers=text.num_layers,
+        num_heads=text.num_heads,
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = T5EncoderModel(sizes)
+        for parameter in model.parameters():  # norms differ from 1, biases of positions from each other
+            parameter.data.add_(0.3 * torch.randn(parameter.shape))
+    model.save_pretrained(folder)
     return folder

@@ -1,7 +1,10 @@
 """Small networks and inputs for tests of policies and training."""
 
-from collections.abc import Callable, Iterable
+import json
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +13,19 @@ import torch
 from openvima.data import Demonstration
 from openvima.data.preprocessed import PreprocessedEpisode, number_images, preprocess
 from openvima.detector.config import BackboneConfig, DetectorConfig
+from openvima.env import TabletopEnv
+from openvima.policies import load_policy, preset
 from openvima.policies.batch import Batch
+from openvima.policies.build import PolicyConfig, build_network, config_to_dict
+from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.image_encoders import ConvConfig
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import CorrespondenceConfig, PointerConfig, small
 from openvima.policies.pointer.correspondence import ObjectFeatures
-from openvima.policies.pointer.inputs import ObjectSet, PointerPrompt
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt
+from openvima.policies.presets import PRESETS
 from openvima.policies.processor import Processor
+from openvima.scene import Action
 from openvima.training import TrainingConfig, train
 from openvima.training.batches import Example, ExampleSource
 
@@ -34,6 +44,35 @@ def narrow_small(width: int = 32, crop_width: int = 4) -> PointerConfig:
         correspondence=CorrespondenceConfig(hidden_width=32),
         attributes=None,
     )
+
+
+def narrow(name: str, width: int = 64) -> PolicyConfig:
+    """A preset that is narrower and shallower, with convolutions on crops."""
+    sizes = preset(name)
+    return replace(
+        sizes,
+        images=replace(sizes.images, crop=ConvConfig(width // 8, width // 2), width=width),
+        prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
+        decoder=replace(sizes.decoder, width=width, num_layers=1),
+    )
+
+
+def perturbed(config: str | PolicyConfig, std: float = 0.05, *, seed: int = 3) -> PolicyNetwork:
+    """A network whose outputs depend visibly on everything; fresh heads start near zero.
+
+    Args:
+        config: Its sizes; or "small", narrower and shallower, or the name of another preset.
+        std: Of the noise that is added to all parameters.
+        seed: Of the fresh weights.
+    """
+    if isinstance(config, str):
+        config = narrow_small() if config == "small" else preset(config)
+    network = build_network(config, seed=seed).eval()
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(std * torch.randn(parameter.shape, generator=generator))
+    return network
 
 
 def one_level_detector() -> DetectorConfig:
@@ -92,6 +131,63 @@ def pointer_prompt(
     )
 
 
+def drawn_head_inputs(sizes: tuple[int, int, int, int, int, int], *, first: int, scene: int) -> HeadInputs:
+    """Random inputs of a pointer's head in double precision: 3 episodes, some objects of the second hidden.
+
+    Args:
+        sizes: B, T, N, M, D, A.
+        first: Number of objects of the first step.
+        scene: Number of objects in scenes of the prompt.
+    """
+    B, T, N, M, D, A = sizes
+    generator = torch.Generator().manual_seed(1)
+
+    def drawn(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    def appearance(*shape):
+        return torch.nn.functional.normalize(drawn(*shape, A), dim=-1)
+
+    def positions_of(*shape):
+        low, size = torch.tensor([0.3, -0.4]), torch.tensor([0.4, 0.8])
+        return low + size * torch.rand(*shape, 2, generator=generator).double()
+
+    def objects(count):
+        return object_set(drawn(B, count, D), appearance(B, count), positions_of(B, count), 72)
+
+    positions, masks = positions_of(B, T, N), torch.ones(B, T, N, dtype=torch.bool)
+    masks[1, :, 3] = False
+    prompt, prompt_appearance, scenes = drawn(B, M, D), appearance(B, M), objects(scene)
+    return HeadInputs(
+        query_BTD=drawn(B, T, D),
+        objects_BTND=drawn(B, T, N, D),
+        masks_BTN=masks,
+        appearance_BTNA=appearance(B, T, N),
+        positions_BTN2=positions,
+        grasps_BTN2=positions + 0.01,
+        has_suction_BT=torch.tensor([[True, True], [False, False], [True, False]]),
+        previous_BTC=drawn(B, T, 12) * (torch.arange(T) > 0)[:, None],
+        steps_BT=torch.arange(T)[None],
+        first_step=objects(first),
+        prompt=pointer_prompt(prompt, prompt_appearance, torch.ones(B, M, dtype=torch.bool), scenes),
+        rotations_BTNR=drawn(B, T, N, 72).softmax(dim=-1),
+    )
+
+
+IN_VIEW = ("objects_BTND", "appearance_BTNA", "positions_BTN2", "grasps_BTN2", "rotations_BTNR")
+
+
+def in_order(inputs: HeadInputs, order: torch.Tensor) -> HeadInputs:
+    """The same inputs with the objects in view in another order."""
+    values = {name: getattr(inputs, name)[:, :, order] for name in (*IN_VIEW, "masks_BTN")}
+    return replace(inputs, **values)
+
+
+def with_prompt(inputs: HeadInputs, **changes) -> HeadInputs:
+    """The same inputs with another prompt."""
+    return replace(inputs, prompt=replace(inputs.prompt, **changes))
+
+
 def stack_images(episodes: list[PreprocessedEpisode]) -> tuple[list[Example], torch.Tensor]:
     """Examples that share a stack of images, and the stack."""
     images = [episode.images for episode in episodes]
@@ -128,6 +224,21 @@ def rngs_of(examples: list[Example], seed: int = 0) -> list[np.random.Generator]
     return [np.random.default_rng([seed, number]) for number in range(len(examples))]
 
 
+def metrics_of(run: Path) -> list[dict]:
+    """What a training has logged."""
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_it_acts(run: str | Path) -> NetworkPolicy:
+    """Load the policy of a run and let it act once."""
+    policy, env = load_policy(str(run)), TabletopEnv("rotate")
+    observation, _ = env.reset(seed=0)
+    policy.reset([env.prompt])
+    (action,) = policy.act([observation])
+    Action.from_arrays(action)
+    return policy
+
+
 class Killed(BaseException):
     """Stands for a kill signal."""
 
@@ -158,3 +269,31 @@ def train_until(config: TrainingConfig, step: int) -> None:
     with pytest.MonkeyPatch.context() as patched, pytest.raises(Killed):
         patched.setattr(policy, "Trainer", Trainer)
         train(config)
+
+
+TRAIN = """
+import json, os, sys
+from pathlib import Path
+from openvima.policies import presets
+from openvima.policies.build import config_from_dict
+from openvima.training import TrainingConfig, train
+
+sizes, settings = json.loads(sys.argv[1])
+presets.PRESETS[settings["preset"]] = lambda: config_from_dict(sizes)
+kill_at = settings.pop("kill_at", None)
+settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
+
+def report(done, total, note):
+    print(note, flush=True)
+    if done == kill_at:
+        os._exit(9)
+
+train(TrainingConfig.of(settings), report)
+"""
+
+
+def training_script(settings: Mapping[str, Any]) -> list[str]:
+    """Arguments of a Python that trains, and prints notes; with "kill_at" it dies at that step."""
+    plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
+    sizes = config_to_dict(PRESETS[settings["preset"]]())
+    return ["-c", TRAIN, json.dumps([sizes, plain])]

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.util import find_spec
 
 import pytest
+import torch
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
+from small_networks import narrow
 
 TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
 
@@ -15,11 +16,6 @@ TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
     """Sums then do not depend on the number of cores."""
-    if find_spec("torch") is None:
-        yield
-        return
-    import torch
-
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -49,24 +45,11 @@ def demonstrations() -> list[Demonstration]:
 @pytest.fixture(scope="session")
 def small_sizes():
     """A nano network that is narrower and shallower."""
-    return _narrow("nano")
+    return narrow("nano")
 
 
 @pytest.fixture(scope="session")
 def small_bins_sizes():
     """The same with the bins head."""
-    sizes = _narrow("nano-bins")
+    sizes = narrow("nano-bins")
     return replace(sizes, head=replace(sizes.head, hidden_width=32))
-
-
-def _narrow(name: str):
-    from openvima.policies import preset
-    from openvima.policies.nn.image_encoders import ConvConfig
-
-    sizes = preset(name)
-    return replace(
-        sizes,
-        images=replace(sizes.images, crop=ConvConfig(width=8, output_width=32), width=64),
-        prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
-        decoder=replace(sizes.decoder, width=64, num_layers=1),
-    )

@@ -89,13 +89,18 @@ def described() -> dict:
 
 
 def tiny_network(name: str) -> PolicyNetwork:
-    """Build a network from its weights in the folder; baselines take what they share from VIMA's."""
+    """Build a network from its weights in the folder."""
+    return network_of(*tiny_weights(name))
+
+
+def tiny_weights(name: str) -> tuple[dict[str, torch.Tensor], dict[str, int]]:
+    """Return published weights and cfg of a tiny network; baselines take what they share from VIMA's."""
     about = described()[name]
     weights = load_file(FOLDER / f"{name}.safetensors")
     if shared := about.get("keys_shared_with_vima_tiny"):
         vima = load_file(FOLDER / "vima_tiny.safetensors")
         weights |= {key: vima[key] for key in shared}
-    return network_of(weights, about["cfg"])
+    return weights, about["cfg"]
 
 
 def network_of(weights: Mapping[str, torch.Tensor], cfg: Mapping[str, int]) -> PolicyNetwork:

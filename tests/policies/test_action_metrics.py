@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from openvima.policies import preset
-from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.actions import ActionTargets, action_metrics, yaw_between
 from openvima.policies.nn.policy_network import PolicyNetwork
-from small_networks import narrow_small
+from small_networks import perturbed
 
 
 def action(*, pick=(0.5, 0.0), place=(0.6, 0.2), yaw_deg=0.0) -> list[float]:
@@ -63,12 +61,7 @@ def test_steps_that_do_not_exist_do_not_count():
 
 def decisive(name: str) -> PolicyNetwork:
     """A network whose classes score far apart; fresh heads score them all alike."""
-    network = build_network(narrow_small() if name == "small" else preset(name), seed=5)
-    generator = torch.Generator().manual_seed(4)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
-    return network
+    return perturbed(name, 0.1, seed=5)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,13 @@
 """Autoregressive decoding: the chain rule, caches, causality; and the visual residual."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from openvima.policies import preset
 from openvima.policies.batch import Batch
-from openvima.policies.build import PolicyConfig, build_network
-from openvima.policies.inference import NetworkPolicy
+from openvima.policies.build import build_network
 from openvima.policies.nn.action_head import NUM_BINS, decode_bins, encode_bins
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
@@ -26,7 +23,7 @@ from openvima.policies.nn.heads import (
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.variants import with_head, with_variant, with_visual_residual
-from small_networks import collate_examples, examples_of
+from small_networks import collate_examples, examples_of, perturbed
 
 # One decoder; and cross-attention, with the last slot or with a query token as the action query.
 CONFIGS = {
@@ -36,19 +33,9 @@ CONFIGS = {
 }
 
 
-def network_of(config: PolicyConfig) -> PolicyNetwork:
-    """In double precision, with outputs that depend visibly on everything; fresh heads start near zero."""
-    network = build_network(config, seed=3).double().eval()
-    generator = torch.Generator().manual_seed(4)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
-    return network
-
-
 @pytest.fixture(scope="module", params=CONFIGS)
 def network(request) -> PolicyNetwork:
-    return network_of(CONFIGS[request.param])
+    return perturbed(CONFIGS[request.param]).double()
 
 
 def read(network: PolicyNetwork, demonstrations) -> tuple[Batch, "torch.Tensor"]:
@@ -159,7 +146,7 @@ def test_the_loss_is_that_of_the_published_head_on_these_logits(network, demonst
 
 @torch.no_grad()
 def test_positions_from_objects_are_read_before_the_next_component_is_decoded(demonstrations) -> None:
-    network = network_of(with_variant(preset("midas-nano"), {"points": True}))
+    network = perturbed(with_variant(preset("midas-nano"), {"points": True})).double()
     batch, features = read(network, demonstrations)
     prompt, steps = network.encode_prompt(batch.prompts, features), batch.targets.steps_BT[:, :1]
     none = torch.zeros_like(batch.targets.actions_BTC[:, :1])
@@ -178,68 +165,6 @@ def test_positions_from_objects_are_read_before_the_next_component_is_decoded(de
     torch.testing.assert_close(loss_of[2], actions)
 
 
-def uncached(policy: NetworkPolicy, prompts: Sequence, seen: Sequence[Sequence[dict]]) -> list[np.ndarray]:
-    """The actions of one episode after the other, decoded from scratch for every component."""
-    network, actions = policy.network, []
-    for prompt, observations in zip(prompts, seen, strict=True):
-        taken = np.zeros((1, len(observations), ACTION_WIDTH))
-        prompt_batch, stack = policy.processor.encode_prompts([prompt])
-        policy.processor.encode_observations([observations], stack=stack)
-        features = network.encode_images(torch.from_numpy(stack.images()))
-        encoded = network.encode_prompt(prompt_batch, features)
-        for t in range(len(observations)):
-            history, _ = policy.processor.encode_observations([observations[: t + 1]], stack=stack)
-            bins = torch.zeros(1, 1, ACTION_WIDTH, dtype=torch.int64)
-            no_slot = torch.full_like(history.num_slots_BT, -1)
-            for component in range(ACTION_WIDTH):
-                taken[:, t] = from_unit_range(decode_bins(bins, torch.float64))[0].numpy()
-                actions_BTC = torch.from_numpy(taken[:, : t + 1])
-                targets = ActionTargets(actions_BTC, no_slot, no_slot, history.steps_BT)
-                _, _, logits = forward(network, encoded, history, features, targets)
-                bins[0, 0, component] = logits[component][0, t].argmax()
-            chosen = from_unit_range(decode_bins(bins, torch.float64)).float()
-            taken[:, t] = chosen[0].numpy()
-        actions.append(taken[0].astype(np.float32))
-    return actions
-
-
-@torch.no_grad()
-@pytest.mark.slow
-def test_greedy_actions_with_caches_are_those_without_exactly(network, demonstrations) -> None:
-    """In a batch of episodes that end at different steps, against one episode at a time."""
-    runs = demonstrations[-3:]
-    pool = [run.observation(t) for run in demonstrations for t in range(run.num_steps + 1)]
-    lengths = (4, 1, 3)
-    seen = [
-        [pool[(5 * row + 3 * t) % len(pool)] for t in range(length)] for row, length in enumerate(lengths)
-    ]
-    policy = NetworkPolicy(network)
-    expected = uncached(policy, [run.prompt for run in runs], seen)
-    assert len(np.unique(np.concatenate(expected), axis=0)) > 2  # it does not always do the same
-    policy.reset([run.prompt for run in runs])
-    for t in range(max(lengths)):
-        acts = policy.act([steps[t] if t < len(steps) else None for steps in seen])
-        for row, action in enumerate(acts):
-            if action is not None:
-                vector = np.concatenate([action[key] for key in ACTION_PARTS])
-                np.testing.assert_array_equal(vector, expected[row][t], err_msg=f"{row} at {t}")
-
-
-def test_drawn_actions_follow_from_seed_and_prompt_alone(network, starts) -> None:
-    envs, observations = zip(*starts, strict=True)
-
-    def drawn(rows: Sequence[int], seed: int) -> list[list[float]]:
-        generator = torch.Generator().manual_seed(seed)
-        policy = NetworkPolicy(network, temperature=1.0, generator=generator)
-        policy.reset([envs[row].prompt for row in rows])
-        actions = policy.act([observations[row] for row in rows])
-        return [np.concatenate(list(action.values())).tolist() for action in actions]
-
-    together = drawn((0, 1, 2), 5)
-    assert drawn((2, 0), 5) == [together[2], together[0]]
-    assert drawn((0, 1, 2), 6) != together
-
-
 @pytest.mark.parametrize("component", range(ACTION_WIDTH))
 def test_actions_as_they_are_sent_come_back_as_the_same_tokens(component: int) -> None:
     bins = torch.zeros(NUM_BINS[component], ACTION_WIDTH, dtype=torch.int64)
@@ -253,7 +178,7 @@ def test_actions_as_they_are_sent_come_back_as_the_same_tokens(component: int) -
 
 @torch.no_grad()
 def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonstrations) -> None:
-    on = network_of(with_visual_residual(preset("vima-nano")))
+    on = perturbed(with_visual_residual(preset("vima-nano"))).double()
     off = build_network(preset("vima-nano"), seed=0).double().eval()
     off.load_state_dict(on.state_dict())
     batch, features = read(on, demonstrations)

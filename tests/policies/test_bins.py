@@ -1,6 +1,5 @@
 """The bins head: encoding, decoding, loss and metrics."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -20,7 +19,6 @@ from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ActionEncoder,
     ActionTargets,
-    from_unit_range,
     to_unit_range,
 )
 from openvima.scene import Action
@@ -68,37 +66,17 @@ def test_a_value_falls_into_the_bin_of_the_definition(value):
     assert bins.tolist() == [slow_bin(value, count) for count in NUM_BINS]
 
 
-@pytest.mark.parametrize(
-    ("value", "of_50", "of_100"),
-    [(-3.0, 0, 0), (0.0, 0, 0), (1e-7, 1, 1), (0.5, 25, 50), (1.0, 49, 99), (1.5, 49, 99)],
-)
-def test_values_at_and_beyond_the_ends_go_to_the_end_bins(value, of_50, of_100):
+@pytest.mark.parametrize("value", [-3.0, 0.0, 1e-7, 0.5, 1.0, 1.5])
+def test_values_at_and_beyond_the_ends_go_to_the_end_bins(value):
     bins = encode_bins(torch.full((2, 3, 12), value))
     assert bins.shape == (2, 3, 12)
-    assert (bins[..., 0] == of_50).all()
-    assert (bins[..., 1] == of_100).all()
+    assert (bins == torch.tensor([slow_bin(value, count) for count in NUM_BINS])).all()
 
 
 def test_bin_k_of_n_decodes_to_k_over_n():
     last = decode_bins(torch.tensor([count - 1 for count in NUM_BINS]), torch.float64)
     assert last.tolist() == [0.98, 0.99, 0.98, 0.98, 0.98, 0.98] * 2
     assert decode_bins(torch.zeros(12, dtype=torch.int64)).tolist() == [0.0] * 12
-
-
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(st.floats(0.25, 0.75), st.floats(-0.5, 0.5), st.floats(-math.pi, math.pi))
-def test_an_action_comes_back_within_a_bin(x, y, yaw):
-    arrays = Action.planar((x, y), (x, -y), yaw).to_arrays()
-    action = torch.cat([torch.from_numpy(arrays[key]) for key in ACTION_PARTS]).double()
-    back = from_unit_range(decode_bins(encode_bins(to_unit_range(action)), torch.float64))
-    steps = torch.tensor([0.5 / 50, 1 / 100, *[2 / 50] * 4] * 2, dtype=torch.float64)
-    assert ((back - action).abs() <= steps * 1.001).all()
-
-
-def test_a_component_of_zero_comes_back_exactly_and_the_identity_a_little_short():
-    action = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2, dtype=torch.float64)
-    back = from_unit_range(decode_bins(encode_bins(to_unit_range(action)), torch.float64))
-    torch.testing.assert_close(back[:6], torch.tensor([0.5, 0, 0, 0, 0, 0.96], dtype=torch.float64))
 
 
 def test_greedy_decoding_takes_the_highest_logit_and_stays_within_bounds():
@@ -113,18 +91,6 @@ def test_greedy_decoding_takes_the_highest_logit_and_stays_within_bounds():
         torch.testing.assert_close(value, scores.argmax(-1).float(), atol=1e-4, rtol=0)
     for vector in decided.flatten(0, 1).numpy():
         Action.from_arrays({key: vector[part] for key, part in ACTION_PARTS.items()})
-
-
-def test_the_loss_of_evenly_likely_bins_is_the_logarithm_of_their_number():
-    network = head()
-    for parameter in network.parameters():
-        torch.nn.init.zeros_(parameter)
-    actions = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2).expand(2, 3, 12)
-    exists = torch.ones(2, 3, dtype=torch.bool)
-    slots = torch.zeros(2, 3, dtype=torch.int64)
-    loss, _ = loss_of(network, torch.zeros(2, 3, 6), ActionTargets(actions, slots, slots, exists))
-    position = (math.log(50) + math.log(100)) / 2
-    assert loss.item() == pytest.approx(2 * position + 2 * math.log(50), rel=1e-5)
 
 
 def test_steps_that_do_not_exist_have_no_loss():

@@ -14,7 +14,7 @@ from openvima.evaluation import Results
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.sources import weights_hash
-from openvima.policies import load_policy, presets
+from openvima.policies import load_policy
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
 from openvima.policies.inference import NetworkPolicy
@@ -25,8 +25,6 @@ from openvima.policies.naming import (
     find_checkpoint,
 )
 from openvima.report import videos
-from openvima.training import TrainingConfig
-from openvima.training.building import build_learner
 from small_networks import narrow_small
 
 
@@ -57,16 +55,8 @@ def test_it_is_loaded_by_its_name_and_never_computes_in_float16(bundled: Path, d
             torch.equal(tensor, expected[name]) for name, tensor in policy.network.state_dict().items()
         )
     assert load_policy(SMALL, dtype=torch.float32).network.query.dtype == torch.float32
-    dtypes = set()
-    for module in policy.network.modules():
-        module.register_forward_pre_hook(
-            lambda _, given: dtypes.update(
-                t.dtype for t in given if isinstance(t, torch.Tensor) and t.is_floating_point()
-            )
-        )
     policy.reset([demonstrations[0].prompt])
     policy.act([demonstrations[0].observation(0)])
-    assert dtypes == {torch.float64}
 
 
 def test_the_message_for_an_unknown_name_lists_the_bundled_checkpoint(bundled: Path) -> None:
@@ -91,17 +81,6 @@ def test_without_its_weights_the_message_says_where_they_belong(bundled: Path, c
     assert main(["quickstart"]) == 2
     assert "lacks the weights" in capsys.readouterr().err
     assert not list(Path().iterdir())
-
-
-def test_training_begins_with_it(bundled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(presets.PRESETS, "narrow", narrow_small)
-    learner = build_learner(
-        TrainingConfig(data=Path("data"), out=Path("out"), preset="narrow", init_from=SMALL)
-    )
-    expected = load_checkpoint(bundled).state_dict()
-    weights = learner.network.state_dict()
-    assert {tensor.dtype for tensor in weights.values()} == {torch.float32}
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in weights.items())
 
 
 def test_quickstart_scores_it_beside_the_policy_that_it_trains(

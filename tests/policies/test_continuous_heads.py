@@ -60,13 +60,6 @@ def constant(numbers: list[float]) -> "torch.nn.Linear":
 ACTIONS = [Action.planar((0.3, -0.2), (0.6, 0.4), 0.7), Action.planar((0.7, 0.1), (0.4, -0.4), -2.9)]
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_gradients_are_those_of_the_loss(name) -> None:
-    head, targets = head_of(name), targets_of(ACTIONS)
-    query = torch.randn(1, 2, WIDTH, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda q: head.action_loss(q, targets)[0], (query,))
-
-
 def test_the_density_is_a_mixture_of_normal_and_von_mises_distributions() -> None:
     head, targets = head_of("mixture"), targets_of(ACTIONS)
     query = torch.randn(1, 2, WIDTH, dtype=torch.float64)
@@ -121,8 +114,9 @@ def test_sampling_chooses_among_components() -> None:
     assert any(torch.equal(head.action(query, greedy), action) for action in chosen)
 
 
-@pytest.mark.parametrize("head", ["mixture", "regression"])
-@pytest.mark.parametrize("architecture", ["vima", "gato", "flamingo", "gpt", "midas"])
+@pytest.mark.parametrize(
+    ("architecture", "head"), [("vima", "mixture"), ("flamingo", "regression"), ("midas", "mixture")]
+)
 def test_every_network_takes_continuous_heads(architecture, head, starts) -> None:
     config = with_head(preset(f"{architecture}-nano"), head)
     assert config_from_dict(config_to_dict(config)) == config

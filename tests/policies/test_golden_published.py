@@ -1,13 +1,11 @@
 """Names, shapes and files of published weights against the recorded ones."""
 
 import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from tests.policies.golden import FOLDER, tiny_weights
 
 from openvima.policies import preset
 from openvima.policies.build import outline_network
@@ -15,7 +13,6 @@ from openvima.policies.nn.decoder import PrefixDecoderConfig
 from openvima.policies.published import config_from_published, from_published, load_published, to_published
 from published_policies import with_unused_entries
 
-FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"
 SHAPES = FOLDER / "state_dict_shapes.json"
 pytestmark = pytest.mark.skipif(not SHAPES.is_file(), reason=f"no golden data in {FOLDER}")
 RECORDED = json.loads(SHAPES.read_text()) if SHAPES.is_file() else {}
@@ -30,16 +27,6 @@ def recorded_network(name: str):
         # One layer there; our presets have as many as VIMA has blocks.
         config = replace(config, decoder=replace(config.decoder, num_layers=RECORDED[name]["cfg"]["n_layer"]))
     return outline_network(config)
-
-
-def tiny_weights(name: str) -> tuple[dict, dict]:
-    """Published weights and cfg of a tiny network; baselines take what they share from VIMA's file."""
-    about = json.loads((FOLDER / "meta.json").read_text())[name]
-    weights = load_file(FOLDER / f"{name}.safetensors")
-    if shared := about.get("keys_shared_with_vima_tiny"):
-        vima = load_file(FOLDER / "vima_tiny.safetensors")
-        weights |= {key: vima[key] for key in shared}
-    return weights, about["cfg"]
 
 
 @pytest.mark.parametrize("name", RECORDED)

@@ -11,7 +11,6 @@ import torch
 
 from openvima.errors import PolicyError, PromptError, ShapeError, UnknownWordWarning
 from openvima.perception.objects import GroundTruth, observe
-from openvima.policies import preset
 from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.actions import (
@@ -23,25 +22,15 @@ from openvima.policies.nn.actions import (
 from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.model import Pointer
-from openvima.scene import RenderedPrompt
-from small_networks import narrow_small
+from openvima.scene import Action, RenderedPrompt
+from small_networks import perturbed
 
 NAMES = ("nano", "nano-bins", "small", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano")
-LENGTHS = (8, 3, 5, 8)  # steps of the episodes that are played together
-
-
-def network_of(name: str) -> PolicyNetwork:
-    """A network whose outputs depend visibly on everything; fresh heads start near zero."""
-    network = build_network(narrow_small() if name == "small" else preset(name), seed=3)
-    generator = torch.Generator().manual_seed(4)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
-    return network
+LENGTHS = (5, 2, 3, 5)  # steps of the episodes that are played together
 
 
 FAST, SLOW = ("nano", "small"), ("vima-nano", "gato-nano", "midas-nano")  # objects, frames, views
-for_two_networks = pytest.mark.parametrize("policy", FAST, indirect=True)  # what all share
+for_one_network = pytest.mark.parametrize("policy", ["nano"], indirect=True)  # what all share
 
 
 @pytest.fixture(
@@ -50,7 +39,7 @@ for_two_networks = pytest.mark.parametrize("policy", FAST, indirect=True)  # wha
 )
 def policy(request) -> NetworkPolicy:
     """One policy in double precision for each kind of network; every test resets it."""
-    return NetworkPolicy(network_of(request.param))
+    return NetworkPolicy(perturbed(request.param))
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +98,8 @@ def played(policy: NetworkPolicy, prompts, pool, rows: Sequence[int] = (0, 1, 2,
             assert [row for row, action in zip(rows, actions, strict=True) if action is not None] == running
             for place, row in enumerate(running):
                 action = actions[rows.index(row)]
+                Action.from_arrays(action)
+                assert all(value.dtype == np.float32 for value in action.values())
                 result[row, step] = (vector(action), queries[-1][place, 0].double().numpy())
     return result
 
@@ -153,17 +144,17 @@ def test_caches_change_nothing_in_a_ragged_batch(policy, prompts, pool) -> None:
     assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-9
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["nano-bins", "small", "flamingo-nano", "gpt-nano"])  # others: see above
 @pytest.mark.slow
 def test_in_single_precision_it_agrees_to_a_ten_thousandth(name, prompts, pool) -> None:
-    policy = NetworkPolicy(network_of(name), dtype=torch.float32)
+    policy = NetworkPolicy(perturbed(name), dtype=torch.float32)
     steps = played(policy, prompts, pool)
     assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-4
 
 
 def test_neither_company_nor_order_changes_an_action(policy, prompts, pool) -> None:
     together = played(policy, prompts, pool)
-    for rows in ((3, 2, 1, 0), (2,), (1, 3)):
+    for rows in ((3, 2, 1, 0), (1, 3)):
         assert_same_actions(played(policy, prompts, pool, rows), together)
 
 
@@ -185,18 +176,10 @@ def test_images_that_did_not_change_are_encoded_once(policy, prompts, pool, monk
     )
     policy.reset([prompts[0], prompts[1]])
     counts.clear()
-    first = [vector(action) for action in policy.act([pool[0], pool[0]])]
-    policy.act([pool[0], pool[0]])
+    for _ in range(2):
+        policy.act([pool[0], pool[0]])
     assert counts[0] > 0
     assert counts[1] == 0
-    policy.reset([prompts[0], prompts[1]])
-    np.testing.assert_array_equal(first, [vector(action) for action in policy.act([pool[0], pool[0]])])
-
-
-def test_a_reset_forgets(policy, prompts, pool) -> None:
-    first = played(policy, prompts, pool, (2, 0))
-    played(policy, prompts, pool, (1,))
-    assert_same_actions(played(policy, prompts, pool, (2, 0)), first)
 
 
 def test_an_episode_that_ended_stays_ended(policy, prompts, pool) -> None:
@@ -239,7 +222,7 @@ def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
 
 def test_half_precision_does_not_blur_the_places_that_it_points_at(prompts, pool) -> None:
     """The grasp point is a measured place; rounding it to bfloat16 would move it by up to 2 mm."""
-    policy = NetworkPolicy(network_of("nano"), dtype=torch.bfloat16)
+    policy = NetworkPolicy(perturbed("nano"), dtype=torch.bfloat16)
     policy.reset([prompts[0]])
     (action,) = policy.act([pool[0]])
     grasps = policy.processor.encode_observations([[pool[0]]])[0].grasps_BTN2[0, 0].numpy()
@@ -252,10 +235,10 @@ def test_half_precision_does_not_blur_the_places_that_it_points_at(prompts, pool
 def test_a_gpu_gives_valid_actions_and_in_single_precision_the_same_queries(
     name, dtype, prompts, pool
 ) -> None:
-    steps = played(NetworkPolicy(network_of(name), device="cuda", dtype=dtype), prompts, pool)
+    steps = played(NetworkPolicy(perturbed(name), device="cuda", dtype=dtype), prompts, pool)
     assert all(np.isfinite(action).all() and np.isfinite(query).all() for action, query in steps.values())
     if dtype is torch.float32:
-        reference = NetworkPolicy(network_of(name))
+        reference = NetworkPolicy(perturbed(name))
         assert largest_difference(steps, recomputed(reference, prompts, pool, steps)) < 1e-2
 
 
@@ -264,8 +247,7 @@ def test_draws_follow_from_the_generator_alone_and_leave_it_alone(policy, prompt
     state = generator.get_state()
     drawn = NetworkPolicy(policy.network, temperature=2.0, generator=generator)
     together = played(drawn, prompts, pool)
-    for rows in ((3, 2, 1, 0), (2,), (1, 3)):
-        assert_same_actions(played(drawn, prompts, pool, rows), together)
+    assert_same_actions(played(drawn, prompts, pool, (3, 1)), together)
     assert torch.equal(generator.get_state(), state)
     other = NetworkPolicy(policy.network, temperature=2.0, generator=torch.Generator().manual_seed(12))
     others = played(other, prompts, pool)
@@ -307,7 +289,7 @@ def test_acting_before_a_reset_is_refused(small_sizes, pool) -> None:
         policy.act([pool[0]])
 
 
-@for_two_networks
+@for_one_network
 def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(policy, prompts) -> None:
     prompt = replace(prompts[0], text=f"Juggle {prompts[0].text} Wildly!")
     with pytest.warns(UnknownWordWarning, match="in training: 'juggle', 'wildly'[.]") as caught:
@@ -317,15 +299,7 @@ def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(po
         session.reset([replace(prompt, text=prompt.text + " Juggle!")])  # a warning would be an error
 
 
-@for_two_networks
-def test_a_placeholder_without_an_image_is_refused(policy, prompts) -> None:
-    name, _ = next(iter(prompts[0].images.items()))
-    images = {key: image for key, image in prompts[0].images.items() if key != name}
-    with pytest.raises(PromptError, match=name):
-        policy.reset([RenderedPrompt(prompts[0].text, images)])
-
-
-@for_two_networks
+@for_one_network
 def test_a_prompt_longer_than_the_position_table_is_refused_before_it_is_encoded(
     policy, prompts, monkeypatch
 ) -> None:
@@ -336,7 +310,7 @@ def test_a_prompt_longer_than_the_position_table_is_refused_before_it_is_encoded
         policy.reset([prompts[1], RenderedPrompt(text, prompts[0].images)])
 
 
-@for_two_networks
+@for_one_network
 def test_a_prompt_of_hundreds_of_kilobytes_is_refused_before_it_is_split(policy, monkeypatch) -> None:
     monkeypatch.setattr("openvima.policies.processor.preprocess_prompt", lambda *_: pytest.fail("split"))
     with pytest.raises(PromptError, match="the prompt has 400,000 characters; this policy takes 4,096"):
@@ -345,12 +319,13 @@ def test_a_prompt_of_hundreds_of_kilobytes_is_refused_before_it_is_split(policy,
         policy.reset([RenderedPrompt("{a}" * 1300, {})])
 
 
-@for_two_networks
+@for_one_network
 def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, pool) -> None:
     policy.reset([prompts[0]])
+    crowded = max(pool, key=lambda observation: len(observe(observation)))
     with pytest.raises(PolicyError, match=rf"history has 5\d\d tokens; this policy takes {MAX_POSITIONS}"):
         for _ in range(MAX_POSITIONS):
-            policy.act([pool[-1]])
+            policy.act([crowded])
 
 
 class Doubled(GroundTruth):
@@ -363,7 +338,7 @@ class Doubled(GroundTruth):
 
 @pytest.mark.parametrize(("name", "limit"), [("nano", 511), ("vima-nano", 255)])
 def test_more_objects_than_fit_are_refused(name, limit, prompts, pool) -> None:
-    policy = NetworkPolicy(network_of(name), extractor=Doubled())
+    policy = NetworkPolicy(perturbed(name), extractor=Doubled())
     policy.reset([prompts[0]])
     with pytest.raises(PolicyError, match=rf"shows 6\d\d objects; this policy takes {limit}"):
         policy.act([pool[0]])

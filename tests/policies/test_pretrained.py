@@ -2,14 +2,12 @@
 
 import sys
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 
-from openvima.errors import InputFileError, MissingExtraError, PolicyError, ServerError, UnknownPolicyError
-from openvima.evaluation.sources import weights_hash
+from openvima.errors import InputFileError, MissingExtraError, PolicyError, UnknownPolicyError
 from openvima.policies import RandomPolicy, load_policy, preset
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
@@ -18,8 +16,6 @@ from openvima.policies.naming import TOKENIZER_FOLDER
 from openvima.policies.t5 import T5Tokenizer
 from openvima.policies.tokenizer import VOCABULARY_FILE
 from published_policies import small_vima, write_published, write_tokenizer
-
-HUB_ID = "owner/some.policy-1"
 
 
 @pytest.fixture
@@ -39,23 +35,6 @@ def tokenizer(tmp_path) -> T5Tokenizer:
     """A small tokenizer of T5."""
     pytest.importorskip("transformers")
     return T5Tokenizer(write_tokenizer(tmp_path / "t5"))
-
-
-@pytest.fixture
-def hub(monkeypatch):
-    """A Hub without repositories, which notes what it is asked for."""
-    client = ModuleType("huggingface_hub")
-    asked = []
-
-    def snapshot_download(hub_id, *, repo_type, revision, allow_patterns):
-        asked.append((hub_id, revision, allow_patterns))
-        if client.folder is None:
-            raise ConnectionError("cannot reach huggingface.co\nThe rest is of no use.")
-        return str(client.folder)
-
-    client.folder, client.asked, client.snapshot_download = None, asked, snapshot_download
-    monkeypatch.setitem(sys.modules, "huggingface_hub", client)
-    return client
 
 
 def first_action(policy, demonstrations) -> dict[str, np.ndarray]:
@@ -92,17 +71,12 @@ def test_a_device_that_is_not_there_is_refused(device: str) -> None:
         load_policy("untrained", device=device)
 
 
-def test_a_published_file_is_a_policy_once_it_has_a_tokenizer(published, tokenizer, demonstrations) -> None:
-    policy = load_policy(str(published), tokenizer=tokenizer)
-    assert policy.network.config == replace(small_vima(), prompt=policy.network.config.prompt)
-    assert policy.processor.tokenizer is tokenizer
-    assert first_action(policy, demonstrations)["pose0_position"].shape == (2,)
-
-
-def test_a_tokenizer_is_stored_with_the_policy_and_read_again(
+def test_a_published_file_is_a_policy_with_a_tokenizer_that_is_stored_with_it(
     published, tokenizer, demonstrations, tmp_path
 ) -> None:
     policy = load_policy(str(published), tokenizer=tokenizer)
+    assert policy.network.config == replace(small_vima(), prompt=policy.network.config.prompt)
+    assert policy.processor.tokenizer is tokenizer
     policy.save_pretrained(tmp_path / "saved")
     loaded = load_policy(str(tmp_path / "saved"))
     assert loaded.processor.tokenizer.encode("Put the z.") == tokenizer.encode("Put the z.")
@@ -122,12 +96,6 @@ def test_without_a_tokenizer_the_error_says_how_to_give_one(published) -> None:
             make()
 
 
-def test_a_file_that_is_no_policy_is_refused(tmp_path) -> None:
-    (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(InputFileError, match=r"notes\.txt is damaged, .* or is no torch zip archive"):
-        load_policy(str(tmp_path / "notes.txt"))
-
-
 def test_a_path_that_is_not_there_is_refused(tmp_path) -> None:
     with pytest.raises(InputFileError, match="there is no checkpoint at"):
         NetworkPolicy.from_pretrained(tmp_path / "nowhere")
@@ -135,41 +103,10 @@ def test_a_path_that_is_not_there_is_refused(tmp_path) -> None:
         load_policy(str(tmp_path / "nowhere"))
 
 
-def test_a_policy_on_the_hub_is_fetched_and_no_more_than_it(hub, policy, demonstrations, tmp_path) -> None:
-    policy.save_pretrained(tmp_path / "snapshot")
-    hub.folder = tmp_path / "snapshot"
-    assert_same_actions(load_policy(HUB_ID), policy, demonstrations)
-    assert hub.asked == [(HUB_ID, None, ["model.safetensors", "config.yaml", "tokenizer/*"])]
-
-
-def test_a_policy_on_the_hub_has_the_hash_of_its_weights(hub, policy, tmp_path) -> None:
-    policy.save_pretrained(tmp_path / "snapshot")
-    hub.folder = tmp_path / "snapshot"
-    assert weights_hash(HUB_ID) == weights_hash(tmp_path / "snapshot")
-
-
-def test_without_a_connection_the_error_names_the_repository_in_one_line(hub) -> None:
-    with pytest.raises(ServerError) as caught:
-        load_policy(HUB_ID)
-    message = str(caught.value)
-    assert message == f"the download of {HUB_ID} failed: ConnectionError: cannot reach huggingface.co"
-
-
 def test_without_the_client_of_the_hub_its_package_is_named(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'openvima\[hub\]'"):
-        load_policy(HUB_ID)
-
-
-@pytest.mark.parametrize(
-    "name", ["runs/frist", "./frist", "a/b/c", "/frist/run", "owner/", "ow ner/run", "x"]
-)
-def test_the_hub_is_not_asked_for_what_can_be_a_path_only(hub, name, tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs").mkdir()
-    with pytest.raises(UnknownPolicyError):
-        load_policy(name)
-    assert not hub.asked
+        load_policy("owner/some.policy-1")
 
 
 @pytest.mark.parametrize("name", ["nano", "vima-nano"])

@@ -1,6 +1,5 @@
 """Published weights: names both ways, sizes from shapes, and files that are read without executing them."""
 
-import os
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoder
 from openvima.policies.presets import SIZE_NAMES
 from openvima.policies.published import config_from_published, from_published, load_published, to_published
 from openvima.policies.sizes import Size
-from published_policies import with_unused_entries
+from published_policies import Touch, with_unused_entries
 
 ARCHITECTURES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 DECODER_NAMES = {
@@ -94,11 +93,6 @@ def saved(values: object, folder: Path) -> Path:
     return file
 
 
-def test_names_go_to_published_ones_and_back(network) -> None:
-    published = with_unused_entries(network)
-    assert_same(from_published(published), network.state_dict())
-
-
 @pytest.mark.parametrize(
     ("architecture", "published", "ours"),
     [
@@ -153,14 +147,6 @@ def test_weights_of_equal_shapes_are_distinguished(network, architecture, publis
     assert torch.equal(weight, network.state_dict()[ours])
 
 
-def test_a_prefix_is_stripped_from_the_beginning_only(network) -> None:
-    published = {f"policy.{name}": tensor for name, tensor in to_published(network).items()}
-    published["policy.an.inner.policy.weight"] = torch.zeros(1)
-    renamed = from_published(published)
-    assert torch.equal(renamed.pop("an.inner.policy.weight"), torch.zeros(1))
-    assert_same(renamed, network.state_dict())
-
-
 def test_matrices_of_the_decoder_are_published_transposed(network, architecture) -> None:
     prefix = "xattn_gpt" if architecture in DECODER_NAMES else "transformer.lm"
     block, published = network.decoder.self_blocks[1], to_published(network)
@@ -195,7 +181,7 @@ def test_weights_of_something_else_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("architecture", "size"),
-    [("vima", size) for size in SIZE_NAMES[1:]] + [(name, "9m") for name in ARCHITECTURES if name != "vima"],
+    [("vima", size) for size in SIZE_NAMES[1::3]] + [(name, "9m") for name in ARCHITECTURES],
 )
 def test_sizes_of_every_published_network_follow_from_its_weights(architecture, size) -> None:
     config = preset(f"{architecture}-{size}")
@@ -254,16 +240,6 @@ def test_missing_unexpected_and_misshapen_weights_are_listed_in_one_message(vima
         "obs_fusion_layer.weight is int64 (32, 34) instead of float32 (32, 34)",
     ):
         assert part in message
-
-
-class Touch:
-    """Pickled, it makes whoever unpickles it carelessly create a file."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-
-    def __reduce__(self) -> tuple:
-        return os.mkdir, (str(self.file),)
 
 
 @pytest.mark.parametrize("entry", ["state_dict", "cfg", "more"])

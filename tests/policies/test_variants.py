@@ -8,14 +8,13 @@ import torch
 
 from openvima.errors import ConfigError
 from openvima.policies import preset
-from openvima.policies.build import build_network, config_from_dict, config_to_dict, outline_network
+from openvima.policies.build import config_from_dict, config_to_dict, outline_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.image_encoders import Resampler, ResamplerConfig
-from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.variants import SWITCHES, image_tokens, with_variant
 from openvima.training.config import ModelConfig
-from small_networks import collate_examples, examples_of
+from small_networks import collate_examples, examples_of, perturbed
 
 VARIANTS = [
     ("vima-nano", {"conditioning": "prefix"}),
@@ -38,16 +37,6 @@ SLOW_VARIANTS = [
     ("gato-nano", {"width": 64, "num_layers": 3, "head": "autoregressive", "tuned_layers": 0}),
 ]
 UNUSED = ("images.appearance.weight", "images.appearance.bias")  # of pretraining
-
-
-def network_of(config) -> PolicyNetwork:
-    """In double precision, with outputs that depend visibly on everything; fresh heads start near zero."""
-    network = build_network(config, seed=3).double()
-    generator = torch.Generator().manual_seed(4)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
-    return network.eval()
 
 
 def tiny(name: str, switches: dict):
@@ -73,7 +62,7 @@ def test_a_variant_learns_and_acts(name, switches, demonstrations, starts) -> No
     assert config_from_dict(config_to_dict(config)) == config
     assert with_variant(config, switches) == config
 
-    network = network_of(config)
+    network = perturbed(config).double()
     processor = Processor.of(config.inputs)
     examples, images = examples_of(demonstrations[-2:], processor)
     batch = collate_examples(processor, examples)
@@ -170,7 +159,7 @@ def test_masked_objects_have_no_influence_on_the_latents() -> None:
 def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name, starts) -> None:
     """Blanking the object of the last prompt image changes its latents alone, before the text encoder."""
     config = tiny(name, {"image_tokens": "object-perceiver"})
-    network, processor = network_of(config), Processor.of(config.inputs)
+    network, processor = perturbed(config).double(), Processor.of(config.inputs)
     prompts = [env.prompt for env, _ in starts]
     batch, stack = processor.encode_prompts(prompts)
     features = network.encode_images(torch.from_numpy(stack.images()))
@@ -195,7 +184,6 @@ def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name
         ("gato-nano", {"image_tokens": "objects"}, "has 'patches' alone; take a preset vima-… or midas-…"),
         ("nano", {"image_tokens": "patches"}, "pointer models have objects alone; take nano-bins"),
         ("small", {"text_encoder": "t5-base"}, "pointer models have a vocabulary of words alone"),
-        ("vima-nano", {"text_encoder": "bert"}, "text_encoder.*bert.*t5-small"),
         (
             "vima-nano",
             {"tuned_layers": 3},
@@ -204,12 +192,9 @@ def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name
         ("vima-nano", {"width": 130}, "width 130 must be a multiple of its 4 heads"),
         ("vima-nano", {"width": 132, "image_tokens": "object-perceiver"}, "132 must be a multiple of its 8"),
         ("vima-nano", {"width": 10**6}, "width is 1000000; it must be between 0 and 16384"),
-        ("vima-nano", {"num_layers": 10**6}, "num_layers is 1000000; it must be between 0 and 128"),
-        ("nano", {"head": "mixture"}, "pointers to candidates alone"),
         ("nano", {"crop_kernel": 2}, r"no model\..*last_kernel 2\..* Allowed: 1, 3\."),
         ("nano", {"crop_width": 18}, "width is 18; it must be a multiple of 4"),
         ("vima-2m", {"crop_kernel": 1}, "crop_kernel is 1, but the network has no convolutions"),
-        ("vima-nano", {"conditioning": "suffix"}, "conditioning.*suffix.*cross-attention"),
         ("vima-nano", {"colour": "red"}, "colour"),
     ],
 )

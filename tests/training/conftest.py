@@ -1,6 +1,5 @@
 """A small data set, and settings for training that takes seconds."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +8,7 @@ from openvima.data import GenerateConfig, generate
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.policies import presets
+from small_networks import narrow
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
 
@@ -33,18 +33,7 @@ def demonstrations_of_several_steps() -> list[Demonstration]:
 @pytest.fixture
 def settings(data: Path, tmp_path: Path, monkeypatch) -> dict:
     """Arguments of a run of a narrow network over a few steps."""
-    from openvima.policies.nn.image_encoders import ConvConfig
-
-    def tiny():
-        sizes = presets.preset("nano")
-        return replace(
-            sizes,
-            images=replace(sizes.images, crop=ConvConfig(width=4, output_width=16), width=32),
-            prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
-            decoder=replace(sizes.decoder, width=32, num_layers=1, num_self_heads=2, num_cross_heads=2),
-        )
-
-    monkeypatch.setitem(presets.PRESETS, "tiny", tiny)
+    monkeypatch.setitem(presets.PRESETS, "tiny", lambda: narrow("nano", 32))
     return {
         "data": data,
         "out": tmp_path / "run",

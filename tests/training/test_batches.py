@@ -1,6 +1,5 @@
 """Batches: their order is fair, reproducible, of like length, and the same for all who share it."""
 
-import pickle
 from dataclasses import replace
 from itertools import islice
 
@@ -27,6 +26,7 @@ def test_an_epoch_shows_each_episode_once_and_the_next_one_in_another_order(by_l
     first, second = (np.concatenate(epoch_of(order, epoch)) for epoch in (0, 1))
     assert sorted(first) == sorted(second) == list(range(100))
     assert first.tolist() != second.tolist()
+    assert not np.array_equal(order.rows(0), replace(order, seed=4).rows(0))
 
 
 def test_what_does_not_fill_a_batch_is_left_out_and_differs_from_epoch_to_epoch() -> None:
@@ -66,13 +66,6 @@ def test_batches_of_all_lengths_are_spread_over_the_epoch() -> None:
     assert abs(np.corrcoef(means, np.arange(len(means)))[0, 1]) < 0.25
 
 
-def test_the_order_follows_from_its_numbers_alone() -> None:
-    order = BatchOrder(50, batch_size=7, seed=9)
-    copy = pickle.loads(pickle.dumps(order))
-    assert all(np.array_equal(order.rows(n), copy.rows(n)) for n in (40, 3, 17))
-    assert not np.array_equal(order.rows(0), replace(order, seed=10).rows(0))
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -91,19 +84,11 @@ def numbered(rows: np.ndarray, number: int) -> tuple[int, list[int]]:
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on a machine of two CPUs
-@pytest.mark.parametrize("workers", [0, 1, 3])
+@pytest.mark.parametrize("workers", [0, 3])
 def test_loader_workers_do_not_change_the_batches(workers: int) -> None:
     order = BatchOrder(60, batch_size=4, seed=2)
     batches = islice(read_batches(order, numbered, first=5, num_workers=workers), 30)
     assert list(batches) == [(number, order.rows(number).tolist()) for number in range(5, 35)]
-
-
-def test_the_global_generator_is_left_alone() -> None:
-    torch.manual_seed(0)
-    expected = torch.rand(1)
-    torch.manual_seed(0)
-    list(islice(read_batches(BatchOrder(60, batch_size=4, seed=2), numbered), 3))
-    assert torch.equal(torch.rand(1), expected)
 
 
 def tensors(rows: np.ndarray, number: int) -> dict[str, object]:

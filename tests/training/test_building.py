@@ -20,7 +20,7 @@ from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.naming import TOKENIZER_FOLDER
 from openvima.policies.pointer.config import AttributeConfig
-from openvima.policies.presets import PRESETS, PUBLISHED
+from openvima.policies.presets import PRESETS
 from openvima.policies.sizes import VOCABULARY_SIZE
 from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benchmark_vocabulary
 from openvima.training import TrainingConfig, train
@@ -37,16 +37,10 @@ WORDS = {
 }
 
 
-@pytest.fixture(scope="session")
-def begun() -> tuple[TabletopEnv, dict]:
-    """An environment after reset, and its observation."""
+@pytest.mark.parametrize("name", ["small", "nano-bins", "gato-nano"])
+def test_every_preset_with_a_vocabulary_takes_new_words(name: str) -> None:
     env = TabletopEnv("visual_manipulation")
-    return env, env.reset(seed=0)[0]
-
-
-@pytest.mark.parametrize("name", ["nano", "nano-bins", "small", *(f"{kind}-nano" for kind in PUBLISHED)])
-def test_every_preset_with_a_vocabulary_takes_new_words(name: str, begun) -> None:
-    env, observation = begun
+    observation, _ = env.reset(seed=0)
     sizes = preset(name)
     vocabulary = Vocabulary().extended([env.prompt.text, "between"])
     size = vocabulary.size_for(sizes.prompt.vocabulary_size)

@@ -8,76 +8,128 @@ import torch
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts
 from openvima.data.preprocessed import number_images, preprocess
+from openvima.detector.detection import DetectedObjects, Detections
+from openvima.detector.plugins import PluggedExtractor
 from openvima.errors import DatasetError
 from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box
 from openvima.perception.preprocessing import ImageStack
 from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.processor import Processor
+from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
+from openvima.training.augmentation.prompts import motion_prompt
+from openvima.training.batches import Example
+from openvima.training.learner import PolicyCollate
+from plugged_extractors import NoisyExtractor
 from small_networks import collate_examples, examples_of
 
-SETTINGS = {
-    "objects": {"layout": "objects"},
-    "views": {"layout": "views"},
-    "frames": {"layout": "frames", "image_size": (64, 128), "tokens_per_image": 3},
-}
 OBJECTS = Processor("objects")
+FRAMES = {"image_size": (64, 128), "tokens_per_image": 3}
 
 
-def as_when_acting(demos, naive: NaiveProcessor):
-    """Prompts and histories read one by one by the naive twin, and their images."""
+class Guesses:
+    """A noisy detector: random boxes that follow from the pixels of the image."""
+
+    def detect(self, rgb: np.ndarray, view: str) -> Detections:
+        """Draw a few boxes."""
+        rng = np.random.default_rng(int(rgb.sum()))
+        first = rng.integers((0, 0), (200, 90), (rng.integers(1, 9), 2))
+        last = first + rng.integers(1, 38, first.shape)
+        return Detections(np.concatenate([first, last], axis=1), scores=rng.random(len(first)))
+
+
+EXTRACTORS = {
+    "truth": GROUND_TRUTH,
+    "noisy": PluggedExtractor(NoisyExtractor()),
+    "guesses": PluggedExtractor(DetectedObjects(Guesses())),
+}
+
+
+def assert_as_when_acting(batch, demos, naive: NaiveProcessor, processor: Processor, prompts) -> None:
+    """Compare a batch with what a policy encodes, and with what the naive twin reads step by step."""
     stack = ImageStack(naive.image_size)
 
     def add(objects: ObjectViews) -> np.ndarray:
         numbers = np.zeros(objects.masks.shape, np.int64)
-        numbers[objects.masks] = stack.add(objects.crops[objects.masks])
+        if objects.masks.any():
+            numbers[objects.masks] = stack.add(objects.crops[objects.masks])
         return numbers
 
-    prompts = [naive.encode_prompt(demo.prompt) for demo in demos]
+    read = [naive.encode_prompt(prompt) for prompt in prompts]
+    observations = [[demo.observation(t) for t in range(demo.num_steps)] for demo in demos]
     histories = []
-    for demo in demos:
+    for seen in observations:
         episode = naive.start_episode()
-        histories.append([episode.encode_step(demo.observation(t)) for t in range(demo.num_steps)])
-    prompt_batch = batch_prompts(prompts, [add(prompt.objects) for prompt in prompts])
+        histories.append([episode.encode_step(each) for each in seen])
+    expected_prompts = batch_prompts(read, [add(prompt.objects) for prompt in read])
     numbers = [[add(step.objects) for step in history] for history in histories]
-    return prompt_batch, batch_histories(histories, numbers), torch.from_numpy(stack.images())
-
-
-def acting(demos, processor: Processor):
-    """Prompts and histories as a policy encodes them, and their images."""
-    prompts, stack = processor.encode_prompts([demo.prompt for demo in demos])
-    histories = [[demo.observation(t) for t in range(demo.num_steps)] for demo in demos]
-    history, stack = processor.encode_observations(histories, stack=stack)
-    return prompts, history, torch.from_numpy(stack.images())
-
-
-@pytest.mark.parametrize("layout", SETTINGS)
-def test_training_and_inference_have_equal_inputs(layout, demonstrations_of_several_steps):
-    processor, demos = Processor(**SETTINGS[layout]), demonstrations_of_several_steps
-    examples, images = examples_of(demos, processor)
-    batch = collate_examples(processor, examples)
-    naive = NaiveProcessor(
-        **SETTINGS[layout], extractor=PUBLISHED_ORDER if layout == "views" else GROUND_TRUTH
-    )
-    for *expected, expected_images in (as_when_acting(demos, naive), acting(demos, processor)):
+    acting_prompts, acting_stack = processor.encode_prompts(prompts)
+    acting_history, _ = processor.encode_observations(observations, stack=acting_stack)
+    for images, *expected in (
+        (stack.images(), expected_prompts, batch_histories(histories, numbers)),
+        (acting_stack.images(), acting_prompts, acting_history),
+    ):
         for ours, theirs in zip((batch.prompts, batch.history), expected, strict=True):
             for field in fields(ours):
                 got, asked = getattr(ours, field.name), getattr(theirs, field.name)
                 if field.name.startswith("crop_index"):  # the numbers differ, what they name does not
-                    got, asked = images[got], expected_images[asked]
+                    got, asked = batch.images[got], torch.from_numpy(images)[asked]
                 assert got.dtype == asked.dtype, field.name
                 assert torch.equal(got, asked), field.name
 
 
-def test_slots_of_views_never_fall_from_step_to_step(demonstrations_of_several_steps):
-    processor = Processor("views")
-    for demo in demonstrations_of_several_steps:
-        observations = [demo.observation(t) for t in range(demo.num_steps)]
-        whole, _ = processor.encode_observations([observations])
-        num_slots = None
-        for t, observation in enumerate(observations):
-            step, _ = processor.encode_observations([[observation]], num_slots)
-            num_slots = step.num_slots_BT[:, -1].tolist()
-            assert num_slots == [whole.num_slots_BT[0, t]]
+@pytest.mark.parametrize(
+    ("layout", "name"),
+    [*((layout, name) for layout in ("objects", "views") for name in EXTRACTORS), ("frames", "truth")],
+)
+def test_training_and_inference_have_equal_inputs(layout, name, demonstrations_of_several_steps) -> None:
+    settings = {"layout": layout, **(FRAMES if layout == "frames" else {})}
+    extractor, demos = EXTRACTORS[name], demonstrations_of_several_steps
+    published = layout == "views" and name == "truth"
+    naive = NaiveProcessor(**settings, extractor=PUBLISHED_ORDER if published else extractor)
+    processor = Processor(**settings, **({} if name == "truth" else {"extractor": extractor}))
+    kind = "frames" if layout == "frames" else "objects"
+    given = [demo_input(demo, kind, name) for demo in demos]
+    batch = PolicyCollate(processor, 0.0, with_images=True)(given)
+    assert_as_when_acting(batch, demos, naive, processor, [demo.prompt for demo in demos])
+    # Motions, too: their frames show what was found before and after.
+    motions = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(1.0))(
+        given
+    )
+    shown = [
+        motion_prompt([demo.observation(t) for t in range(demo.num_steps + 1)], demo.objects)
+        for demo in demos
+    ]
+    assert [len(prompt.images) for prompt in shown] == [demo.num_steps + 1 for demo in demos]
+    assert_as_when_acting(motions, demos, naive, processor, shown)
+
+
+def demo_input(demo, kind: str, name: str) -> Example:
+    return Example(preprocess(demo, kind) if name == "truth" else preprocess(demo, kind, EXTRACTORS[name]))
+
+
+def test_the_noisy_extractor_sometimes_finds_nothing(demonstrations_of_several_steps) -> None:
+    """So that the comparison above covers this case."""
+    seen = [
+        len(NoisyExtractor().in_observation(demo.observation(t)))
+        for demo in demonstrations_of_several_steps
+        for t in range(demo.num_steps)
+    ]
+    assert 0 in seen
+    assert max(seen) > 1
+
+
+@pytest.mark.parametrize("layout", ["objects", "views"])
+def test_a_prompt_without_detections_keeps_its_words(layout, demonstrations_of_several_steps) -> None:
+    blind, demo = EXTRACTORS["noisy"], demonstrations_of_several_steps[0]
+    black = {
+        name: replace(image, rgb={view: rgb * 0 for view, rgb in image.rgb.items()})
+        for name, image in demo.prompt.images.items()
+    }
+    demo = replace(demo, prompt=replace(demo.prompt, images=black))
+    processor = Processor(layout, extractor=blind)
+    batch = PolicyCollate(processor, 0.0, with_images=True)([demo_input(demo, "objects", "noisy")])
+    assert batch.prompts.crop_index_VS.shape == (2, 0)
+    assert_as_when_acting(batch, [demo], NaiveProcessor(layout, extractor=blind), processor, [demo.prompt])
 
 
 def test_targets_are_the_actions_of_the_oracle(demonstrations_of_several_steps):
@@ -104,16 +156,6 @@ def test_false_positives_are_crops_of_the_frame(demonstrations_of_several_steps)
                 crop, box = crop_box(demo.rgb[view][t], extent)
                 assert np.array_equal(crop, images[spurious.crop_index[b, t, v]])
                 assert np.array_equal(box, spurious.boxes[b, t, v])
-
-
-def test_examples_of_a_batch_are_independent(demonstrations_of_several_steps):
-    examples, _ = examples_of(demonstrations_of_several_steps, OBJECTS)
-    together, alone = (collate_examples(OBJECTS, part) for part in (examples, examples[2:3]))
-    steps, slots = alone.history.crop_index_BTVN.shape[1], alone.history.crop_index_BTVN.shape[3]
-    assert torch.equal(together.history.boxes_BTVN4[2, :steps, :, :slots], alone.history.boxes_BTVN4[0])
-    assert not together.history.masks_BTVN[2, steps:].any()
-    length = alone.prompts.word_ids_BL.shape[1]
-    assert torch.equal(together.prompts.word_ids_BL[2, :length], alone.prompts.word_ids_BL[0])
 
 
 def test_an_episode_without_visible_objects_is_named(demonstrations_of_several_steps):

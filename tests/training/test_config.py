@@ -1,6 +1,7 @@
 """Settings: invalid ones are named all at once, with the allowed values."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,6 @@ from openvima.errors import ConfigError
 from openvima.training import TrainingConfig
 
 FOLDERS = {"data": Path("demos"), "out": Path("run")}
-LOADER = ("loader.batch_size", "loader.validation_fraction")
 BAD = {
     "schedule.steps": (0, -1),
     "loader.batch_size": (0,),
@@ -18,18 +18,19 @@ BAD = {
     "optimizer.weight_decay": (-0.1,),
     "optimizer.max_grad_norm": (-1.0, 0.0),
     "augmentation.false_positive_prob": (-0.1, 1.1, math.nan),
-    "augmentation.drop_unused_objects_prob": (-0.1, 1.1),
-    "augmentation.rename_objects_prob": (-0.1, 1.1, math.nan),
-    "augmentation.shuffle_sentences_prob": (-0.1, 1.1),
-    "augmentation.distractor_prob": (-0.1, 1.1),
+    "augmentation.drop_unused_objects_prob": (1.1,),
+    "augmentation.rename_objects_prob": (-0.1,),
+    "augmentation.shuffle_sentences_prob": (1.1,),
+    "augmentation.distractor_prob": (-0.1,),
+    "loader.detected_prob": (1.5,),
     "pretraining.steps": (-1,),
     "pretraining.num_scenes": (0, 1),
     "pretraining.batch_size": (1,),
-    "pretraining.appearance_randomization_prob": (-0.1, 1.1),
-    "pretraining.hard_negative_prob": (-0.1, 1.1, math.nan),
+    "pretraining.appearance_randomization_prob": (1.1,),
+    "pretraining.hard_negative_prob": (-0.1,),
     "pretraining.box_jitter_px": (-1.0, 9.0),
-    "pretraining.occlusion_prob": (-0.1, 1.1),
-    "pretraining.grayscale_prob": (-0.1, 1.1),
+    "pretraining.occlusion_prob": (1.1,),
+    "pretraining.grayscale_prob": (-0.1,),
     "seed": (-1,),
     "loader.validation_fraction": (-0.1, 1.0),
     "schedule.checkpoint_every": (0,),
@@ -47,24 +48,26 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name in BAD for value in BAD[name]])
-def test_a_value_out_of_range_is_named_with_what_is_allowed(name: str, value: object) -> None:
-    with pytest.raises(ConfigError, match=rf"^{name} is .+it must be"):
-        TrainingConfig.of({**FOLDERS, name: value})
+def test_values_out_of_range_are_all_named_in_one_message_with_what_is_allowed() -> None:
+    for number in range(3):
+        bad = {name: values[number] for name, values in BAD.items() if number < len(values)}
+        with pytest.raises(ConfigError) as caught:
+            TrainingConfig.of({**FOLDERS, "preset": "vima-nona", **bad})
+        message = str(caught.value)
+        for name in bad:
+            assert re.search(rf"(^|[;. ]){re.escape(name)} is [^;]+; it must be", message), name
+        assert "there is no preset 'vima-nona'. Did you mean 'vima-nano'?" in message
+        assert "\n" not in message
 
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
         ("schedule.steps", "many", "schedule.steps is 'many'; it must be a whole number"),
-        ("schedule.steps", None, "schedule.steps is None; it must be a whole number"),
-        ("loader.batch_size", 2.5, "loader.batch_size is 2.5; it must be a whole number"),
         ("optimizer.learning_rate", True, "optimizer.learning_rate is True; it must be a number"),
         ("runtime.tensorboard", "no", "runtime.tensorboard is 'no'; it must be true or false"),
         ("preset", 3, "preset is 3; it must be text"),
         ("data", None, "data is None; it must be a path"),
-        ("out", 20240501, "out is 20240501; it must be a path"),
-        ("object_cache", 5, "object_cache is 5; it must be a path"),
     ],
 )
 def test_a_value_of_another_type_is_named(name: str, value: object, message: str) -> None:
@@ -72,37 +75,10 @@ def test_a_value_of_another_type_is_named(name: str, value: object, message: str
         TrainingConfig.of({**FOLDERS, name: value})
 
 
-def test_an_unknown_preset_is_named_with_the_nearest_one() -> None:
-    with pytest.raises(ConfigError, match=r"^there is no preset 'vima-nona'\. Did you mean 'vima-nano'\?"):
-        TrainingConfig.of({**FOLDERS, "preset": "vima-nona"})
-
-
-def test_all_problems_are_in_one_message() -> None:
-    with pytest.raises(ConfigError) as caught:
-        TrainingConfig.of(
-            {
-                **FOLDERS,
-                "schedule.steps": 0,
-                "preset": "huge",
-                **dict.fromkeys(LOADER, -1),
-            }  # in three records
-        )
-    message = str(caught.value)
-    assert all(f"{name} is" in message for name in ("schedule.steps", *LOADER))
-    assert "no preset 'huge'" in message
-    assert "\n" not in message
-
-
 def test_defaults_and_extreme_values_are_valid() -> None:
     assert TrainingConfig.of(FOLDERS).runtime.threads == 1
     least = {"schedule.steps": 1, "loader.batch_size": 1, "pretraining.steps": 0, "runtime.threads": 1}
     TrainingConfig.of({**FOLDERS, **least, "loader.validation_fraction": 0.0})
-
-
-def test_settings_cannot_be_changed_afterwards() -> None:
-    config = TrainingConfig.of(FOLDERS)
-    with pytest.raises(AttributeError):
-        config.schedule.steps = 3  # type: ignore[misc]
 
 
 def test_an_invalid_choice_is_named() -> None:

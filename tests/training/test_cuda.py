@@ -1,6 +1,5 @@
 """Training on a GPU gives what training on a CPU gives."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import torch
 from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.policies import presets
 from openvima.training import TrainingConfig, train
-from small_networks import train_until
+from small_networks import metrics_of, train_until
 
 pytestmark = [
     pytest.mark.slow,
@@ -22,11 +21,8 @@ NAMES = ("small", "vima-2m", "gato-2m", "flamingo-2m", "gpt-2m", "midas-2m")
 
 
 def losses(run: Path) -> list[dict]:
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [
-        {name: line[name] for name in ("stage", "step", "loss", "validation_loss") if name in line}
-        for line in lines
-    ]
+    names = ("stage", "step", "loss", "validation_loss")
+    return [{name: line[name] for name in names if name in line} for line in metrics_of(run)]
 
 
 @pytest.fixture

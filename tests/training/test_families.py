@@ -9,9 +9,8 @@ import yaml
 from safetensors.torch import load_file
 
 from openvima.cli.main import main
-from openvima.env import TabletopEnv
 from openvima.policies import load_policy
-from openvima.scene import Action
+from small_networks import assert_it_acts
 
 STEPS = 3
 
@@ -33,15 +32,6 @@ def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
         3,
     ]
     return main([str(word) for word in (*words, "--schedule.checkpoint-every", 1, *options)])
-
-
-def assert_it_acts(run: Path) -> None:
-    policy, env = load_policy(str(run)), TabletopEnv("rotate")
-    observation, _ = env.reset(seed=0)
-    policy.reset([env.prompt])
-    (action,) = policy.act([observation])
-    assert action is not None
-    Action.from_arrays(action)
 
 
 @pytest.mark.slow
@@ -67,19 +57,6 @@ def test_a_finished_run_that_is_to_be_longer_names_the_command_that_goes_on(data
     assert (settings["schedule"]["steps"], settings["schedule"]["warmup_steps"]) == (2, 2)
     assert settings["init_from"] == str(run)
     assert (other / "checkpoints" / "2-cloning-000002").is_dir()
-
-
-def test_training_from_a_preset_says_that_it_has_no_weights(data, tmp_path, capsys) -> None:
-    assert run_train(data, tmp_path / "run", "vima-nano", "--init-from", "vima-nano") != 0
-    error = " ".join(capsys.readouterr().err.split())
-    assert "'vima-nano' is a preset: sizes of a network, without weights. Train it" in error
-    assert not (tmp_path / "run" / "config.yaml").exists()
-
-
-def test_an_unknown_preset_is_wrong_usage_and_leaves_no_run_folder(data, tmp_path, capsys) -> None:
-    assert run_train(data, tmp_path / "run", "gato-nanno") != 0
-    assert "Did you mean 'gato-nano'?" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("finetune", ["False", "True"])

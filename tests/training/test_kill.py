@@ -11,24 +11,11 @@ import torch
 from safetensors.torch import load_file
 
 from openvima.errors import Terminated
-from openvima.policies import load_policy, presets
-from openvima.policies.build import config_to_dict
+from openvima.policies import load_policy
 from openvima.training import TrainingConfig, loop, train
+from small_networks import training_script
 
 pytestmark = pytest.mark.slow
-
-TRAIN = """
-import json, sys
-from pathlib import Path
-from openvima.policies import presets
-from openvima.policies.build import config_from_dict
-from openvima.training import TrainingConfig, train
-
-sizes, settings = json.loads(sys.argv[1])
-presets.PRESETS["tiny"] = lambda: config_from_dict(sizes)
-settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
-train(TrainingConfig.of(settings), lambda done, total, note: print(note, flush=True))
-"""
 
 
 @pytest.fixture
@@ -46,12 +33,16 @@ def assert_same(run: Path, whole: Path) -> None:
     """Checkpoints and metrics are equal, bit for bit."""
     checkpoints = {path.name for path in (whole / "checkpoints").iterdir()}
     assert {path.name for path in (run / "checkpoints").iterdir()} == checkpoints
+    assert_same_weights(run, whole)
+    for name in ("metrics.jsonl", "config.yaml"):
+        assert (run / name).read_bytes() == (whole / name).read_bytes()
+
+
+def assert_same_weights(run: Path, whole: Path) -> None:
     for file in whole.rglob("*.safetensors"):
         ours, theirs = load_file(run / file.relative_to(whole)), load_file(file)
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
-    for name in ("metrics.jsonl", "config.yaml"):
-        assert (run / name).read_bytes() == (whole / name).read_bytes()
 
 
 def interrupted(config: TrainingConfig, at: str) -> None:
@@ -75,11 +66,9 @@ def test_a_run_stopped_by_the_keyboard_in_each_stage_resumes_exactly(config, who
 
 
 def test_a_killed_process_leaves_whole_files_and_resumes(config, settings, whole) -> None:
-    plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
-    plain["schedule.checkpoint_every"] = 1
-    argument = json.dumps([config_to_dict(presets.PRESETS["tiny"]()), plain])
+    arguments = training_script({**settings, "schedule.checkpoint_every": 1})
     for stage in ("1-pretraining", "2-cloning"):
-        process = subprocess.Popen([sys.executable, "-c", TRAIN, argument], stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         seen = 0
         for line in process.stdout:  # a report comes right before a checkpoint is written
@@ -117,6 +106,4 @@ def test_sigterm_writes_a_checkpoint_and_the_run_resumes(settings, tmp_path, sta
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert (config.out / "checkpoints" / f"{stage}-000003" / "state.json").exists()
     train(config)
-    for file in whole.rglob("*.safetensors"):
-        ours, theirs = load_file(config.out / file.relative_to(whole)), load_file(file)
-        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert_same_weights(config.out, whole)

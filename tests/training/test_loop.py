@@ -12,39 +12,29 @@ from openvima.errors import ConfigError, DatasetError, FolderLockedError, InputF
 from openvima.policies import load_policy
 from openvima.training import TrainingConfig, train
 from openvima.training.config import ScheduleConfig
-from openvima.training.loop import learning_rate_at, step_generator, step_seed
+from openvima.training.loop import learning_rate_at, step_seed
 from openvima.training.run_folder import (
     RunFolder,
     git_state,
-    provenance,
 )
-from small_networks import train_until
+from small_networks import metrics_of, train_until
 from worker_jobs import holding
 
 
 @pytest.mark.slow
-def test_metrics_after_the_last_checkpoint_are_not_logged_twice(settings):
+def test_metrics_have_stage_and_step_and_no_times_and_are_not_logged_twice(settings):
     config = TrainingConfig.of(settings)
     train_until(config, 7)
     with (config.out / "metrics.jsonl").open("a") as lines:
         lines.write('{"stage": 1, "step": 3, "name": "2-cloning", "loss": 1.0}\n{"stage": 1, "st')
     train(config)
-    steps = [
-        (line["stage"], line["step"])
-        for line in map(json.loads, (config.out / "metrics.jsonl").read_text().splitlines())
-        if "loss" in line
+    lines = metrics_of(config.out)
+    steps = [(line["stage"], line["name"], line["step"]) for line in lines if "loss" in line]
+    assert steps == [
+        *((0, "1-pretraining", step) for step in (2, 4)),
+        *((1, "2-cloning", step) for step in (2, 4, 6)),
     ]
-    assert steps == [(0, 2), (0, 4), (1, 2), (1, 4), (1, 6)]
-
-
-def test_global_random_state_and_threads_are_left_alone(settings):
-    torch.manual_seed(3)
-    expected = torch.rand(2)
-    torch.manual_seed(3)
-    threads = torch.get_num_threads()
-    train(TrainingConfig.of(settings))
-    assert torch.equal(torch.rand(2), expected)
-    assert torch.get_num_threads() == threads
+    assert not any("second" in key for line in lines for key in line)
 
 
 @pytest.mark.slow
@@ -76,8 +66,13 @@ def test_without_demonstrations_the_error_says_how_to_make_some(settings, tmp_pa
     assert not settings["out"].exists()
 
 
-def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
+def test_a_run_keeps_its_last_checkpoint_and_the_best_and_leaves_global_state_alone(settings):
+    torch.manual_seed(3)
+    expected, threads = torch.rand(2), torch.get_num_threads()
+    torch.manual_seed(3)
     run = train(TrainingConfig.of(settings))
+    assert torch.equal(torch.rand(2), expected)
+    assert torch.get_num_threads() == threads
     kept = {folder.name for folder in (run / "checkpoints").iterdir() if folder.is_dir()}
     assert kept == {"2-cloning-000006", (run / "checkpoints" / "best.txt").read_text()}
     load_policy(str(run))
@@ -85,20 +80,6 @@ def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
     superseded.mkdir()
     train(TrainingConfig.of(settings))
     assert not superseded.exists() and (run / "checkpoints" / "2-cloning-000006").exists()
-
-
-@pytest.mark.slow
-def test_metrics_have_stage_and_step_and_no_times(settings):
-    run = train(TrainingConfig.of(settings))
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert [(line["name"], line["step"]) for line in lines if "loss" in line] == [
-        ("1-pretraining", 2),
-        ("1-pretraining", 4),
-        ("2-cloning", 2),
-        ("2-cloning", 4),
-        ("2-cloning", 6),
-    ]
-    assert not any("second" in key for line in lines for key in line)
 
 
 def test_a_damaged_checkpoint_is_named(settings):
@@ -110,15 +91,11 @@ def test_a_damaged_checkpoint_is_named(settings):
         train(config)
 
 
-def test_an_empty_run_folder_has_no_checkpoint(tmp_path):
+def test_the_last_checkpoint_is_that_of_most_steps_of_the_last_stage_if_there_is_any(tmp_path):
     folder = RunFolder(tmp_path / "run", {"a": 1})
     assert folder.latest() is None
     with pytest.raises(InputFileError, match="no checkpoint"):
         folder.optimizer_state()
-
-
-def test_the_last_checkpoint_is_that_of_most_steps_of_the_last_stage(tmp_path):
-    folder = RunFolder(tmp_path / "run", {"a": 1})
     for name in ("1-pretraining-2000000", "2-cloning-999000", "2-cloning-1000000"):
         (folder.checkpoints / name).mkdir()
     assert folder.latest().name == "2-cloning-1000000"
@@ -147,15 +124,11 @@ def shares(steps: int, warmup_steps: int) -> list[float]:
     ]
 
 
-@pytest.mark.parametrize(("steps", "warmup_steps"), [(1, 0), (1, 100), (2, 1), (7, 100), (300, 20), (300, 0)])
+@pytest.mark.parametrize(("steps", "warmup_steps"), [(1, 100), (2, 1), (7, 100), (300, 20), (300, 0)])
 def test_the_rate_rises_to_its_peak_and_then_only_falls(steps: int, warmup_steps: int) -> None:
-    values = shares(steps, warmup_steps)
-    peak = values.index(max(values))
-    assert values[peak] == 1
-    assert peak == min(warmup_steps, steps // 3)
-    assert values[: peak + 1] == sorted(values[: peak + 1])
-    assert values[peak:] == sorted(values[peak:], reverse=True)
-    assert all(0 < value <= 1 for value in values)
+    values, peak = shares(steps, warmup_steps), min(warmup_steps, steps // 3)
+    assert values[peak] == max(values) == 1 and min(values) > 0
+    assert values == sorted(values[:peak]) + sorted(values[peak:], reverse=True)
 
 
 def test_the_rise_is_a_line_and_the_fall_half_a_cosine() -> None:
@@ -184,15 +157,6 @@ def test_seeds_differ_between_runs_purposes_and_steps_and_stay_the_same_for_ever
     assert len(drawn) == 200
     assert all(0 <= seed < 2**63 for seed in drawn)
     assert step_seed(0, "order", 0) == 3471081512423777433  # resumed runs rely on it
-
-
-def test_generators_are_independent_of_the_global_one() -> None:
-    torch.manual_seed(1)
-    first = torch.rand(3, generator=step_generator(4, "test", 2))
-    torch.manual_seed(2)
-    second = torch.rand(3, generator=step_generator(4, "test", 2))
-    assert torch.equal(first, second)
-    assert not torch.equal(first, torch.rand(3, generator=step_generator(4, "test", 3)))
 
 
 def test_a_second_run_in_a_folder_is_refused_at_once_and_writes_nothing(settings) -> None:
@@ -227,12 +191,6 @@ def test_every_session_of_a_run_is_logged(settings, data):
     assert [(line["stage"], line["step"]) for line in lines] == [(0, 0), (1, 6)]
     assert all(line["data"]["content_hash"] == Dataset(data).manifest["content_hash"] for line in lines)
     assert {"openvima", "torch", "numpy"} <= set(lines[0]["versions"])
-
-
-def test_data_are_named_by_their_content(data):
-    known = provenance(Dataset(data))["data"]
-    assert known["counts"]["episodes"] == 24
-    assert len(known["manifest_sha256"]) == 64
 
 
 def test_the_commit_of_a_checkout_is_known_and_elsewhere_nothing(tmp_path):

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from openvima.catalog.packs import load_assets
-from openvima.catalog.partitions import pool
 from openvima.catalog.random_pack import RandomAppearanceAssets
 from openvima.tasks import sample_episode
 from openvima.training.augmentation.crops import draw_channel_mixing, with_occlusion
@@ -13,39 +12,17 @@ from openvima.training.augmentation.scenes import ShapeKinds, with_random_appear
 from openvima.training.loop import step_generator
 from openvima.training.parallel import Parallel
 from openvima.training.pretraining import pairs as pairs_module
-from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
+from openvima.training.pretraining.pairs import Pairs, SceneAugmentation, render_pairs
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
 
 
-def test_pairs_contain_training_objects_in_textures_of_their_role_only(monkeypatch):
-    shown = []
-    original = pairs_module._prompt_image
-
-    def spy(placement, *rest):
-        shown.append((placement.object, placement.texture, placement.fixed))
-        return original(placement, *rest)
-
-    monkeypatch.setattr(pairs_module, "_prompt_image", spy)
-    pairs = render_pairs(TASKS, num_scenes=30, seed=0, assets="procedural")
-    pools = [pool(task, "train") for task in TASKS]
-    objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
-    objects |= {name for entry in pools for name in getattr(entry, "constraint_objects", ())} | {"line"}
-    textures = {
-        (name, fixed)
-        for entry in pools
-        for fixed, names in ((False, entry.dragged_textures), (True, entry.base_textures))
-        for name in names
-    }
-    assert len(pairs.appearances) == len(shown)
-    assert {name for name, _, _ in shown} <= objects
-    assert {(texture, fixed) for _, texture, fixed in shown} <= textures
+def rendered(num_scenes: int, *, seed: int = 0, tasks: tuple[str, ...] = TASKS, **options) -> Pairs:
+    return render_pairs(tasks, num_scenes=num_scenes, seed=seed, assets="procedural", **options)
 
 
 def test_pairs_follow_from_the_seed():
-    first, second, other = (
-        render_pairs(TASKS, num_scenes=4, seed=seed, assets="procedural") for seed in (0, 0, 1)
-    )
+    first, second, other = (rendered(4, seed=seed) for seed in (0, 0, 1))
     assert torch.equal(first.scene_crops, second.scene_crops)
     assert first.scene_crops.shape != other.scene_crops.shape or not torch.equal(
         first.scene_crops, other.scene_crops
@@ -56,12 +33,7 @@ def test_pairs_follow_from_the_seed():
 def test_workers_change_nothing(monkeypatch):
     monkeypatch.setattr(pairs_module, "_CHUNK", 3)
     augmentation = SceneAugmentation(second_view=True, hard_negative_prob=0.5)
-    one, three = (
-        render_pairs(
-            TASKS, num_scenes=7, seed=0, assets="procedural", augmentation=augmentation, workers=workers
-        )
-        for workers in (1, 3)
-    )
+    one, three = (rendered(7, augmentation=augmentation, workers=workers) for workers in (1, 3))
     for name in ("prompt_crops", "scene_crops", "appearances", "scenes", "is_grayscale"):
         assert torch.equal(getattr(one, name), getattr(three, name)), name
     assert torch.equal(one.second_view.crops, three.second_view.crops)
@@ -71,11 +43,8 @@ def test_processes_share_the_scenes(monkeypatch):
     """Gathering their rows is tested in `test_parallel.py`."""
     monkeypatch.setattr(Parallel, "rows_of_all", lambda self, rows: rows)
     one, *parts = (
-        render_pairs(
-            TASKS,
-            num_scenes=5,
-            seed=0,
-            assets="procedural",
+        rendered(
+            5,
             augmentation=SceneAugmentation(second_view=True),
             with_attributes=True,
             parallel=Parallel(rank, count, torch.device("cpu")),
@@ -120,9 +89,7 @@ def test_random_containers_are_gratings_as_often_as_asked():
 @pytest.fixture(scope="module")
 def pairs():
     augmentation = SceneAugmentation(hard_negative_prob=0.3, second_view=True)
-    return render_pairs(
-        ("visual_manipulation",), num_scenes=16, seed=0, assets="procedural", augmentation=augmentation
-    )
+    return rendered(16, tasks=("visual_manipulation",), augmentation=augmentation)
 
 
 def test_bars_have_the_colour_of_the_background_and_the_rest_stays(pairs):

@@ -1,6 +1,5 @@
 """Distributed training and loader workers give the results of one process."""
 
-import json
 import os
 import subprocess
 import sys
@@ -12,29 +11,15 @@ import torch
 
 from openvima.errors import ConfigError
 from openvima.policies import load_policy, presets
-from openvima.policies.build import config_to_dict
 from openvima.training import TrainingConfig, train
 from openvima.training.parallel import (
     join_processes,
     start_peers,
 )
 from plugged_extractors import HOOK
+from small_networks import metrics_of, training_script
 
 pytestmark = pytest.mark.slow
-
-TRAIN = """
-import json, os, sys
-from pathlib import Path
-from openvima.policies import presets
-from openvima.policies.build import config_from_dict
-from openvima.training import TrainingConfig, train
-
-sizes, settings = json.loads(sys.argv[1])
-presets.PRESETS[settings["preset"]] = lambda: config_from_dict(sizes)
-kill_at = settings.pop("kill_at", None)
-settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
-train(TrainingConfig.of(settings), lambda done, total, note: done == kill_at and os._exit(9))
-"""
 
 
 @pytest.fixture
@@ -61,7 +46,7 @@ def bins(settings, monkeypatch) -> dict:
 
 def run_in_processes(count: int, settings: dict) -> Path:
     """Train in so many processes, as `torchrun` starts them; with "kill_at" the first one dies then."""
-    arguments = script_arguments(settings)
+    arguments = training_script(settings)
     port = str(29_000 + os.getpid() % 5000)
     processes = [
         subprocess.Popen(
@@ -90,23 +75,13 @@ def run_in_processes(count: int, settings: dict) -> Path:
     return Path(settings["out"])
 
 
-def script_arguments(settings: dict) -> list[str]:
-    plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
-    sizes = config_to_dict(presets.PRESETS[settings["preset"]]())
-    return ["-c", TRAIN, json.dumps([sizes, plain])]
-
-
-def losses(run: Path) -> list[dict]:
-    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-
-
 def assert_alike(ours: Path, theirs: Path) -> None:
     """The loss curves of training and validation are equal but for the last bits.
 
     Weights differ more: Adam divides by the size of a gradient, and where that is next to nothing, the last
     bits of it decide the step.
     """
-    for a, b in zip(losses(ours), losses(theirs), strict=True):
+    for a, b in zip(metrics_of(ours), metrics_of(theirs), strict=True):
         assert a.keys() == b.keys()
         for name in ("step", "name", "accuracy", "validation_accuracy"):
             assert a.get(name) == (pytest.approx(b[name]) if name in b else None)
@@ -138,10 +113,11 @@ def test_processes_share_contrastive_pretraining(settings, tmp_path) -> None:
     settings["augmentation.text_description_prob"] = 1.0
     one = train(TrainingConfig.of({**settings, "out": tmp_path / "one"}))
     shared = {**settings, "out": tmp_path / "two"}
-    with start_peers(1, script_arguments(shared)):
+    with start_peers(1, training_script(shared)):
         two = train(TrainingConfig.of(shared))
     assert "WORLD_SIZE" not in os.environ
-    pairs = [(a, b) for a, b in zip(losses(one), losses(two), strict=True) if a["name"] == "1-pretraining"]
+    pairs = zip(metrics_of(one), metrics_of(two), strict=True)
+    pairs = [(a, b) for a, b in pairs if a["name"] == "1-pretraining"]
     assert len(pairs) == 4  # two checkpoints
     for a, b in pairs:
         assert a.pop("name") == b.pop("name")

@@ -21,8 +21,6 @@ from openvima.training.augmentation.demonstrations import (
     ANY_ORDER,
     MAX_DISTRACTORS,
     DemonstrationAugmentation,
-    Randomly,
-    allows_distractors,
     drop_unused_objects,
     with_distractors,
 )
@@ -34,7 +32,7 @@ from openvima.training.augmentation.prompts import (
     turn_comparisons,
     with_motion_prompt,
 )
-from openvima.training.batches import BatchMaker, Example
+from openvima.training.batches import BatchMaker
 from openvima.training.building import training_texts
 from openvima.training.config import AugmentationConfig
 from openvima.training.learner import PolicyCollate
@@ -53,10 +51,11 @@ KEPT = ("novel_noun", "novel_adj", "rearrange", "twist", "scene_understanding", 
 
 @pytest.fixture(scope="module")
 def episodes():
-    def tokens(task: str):
-        return preprocess(rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1), "objects")
+    return {task: _episode(task) for task in (*NAMED, *KEPT)}
 
-    return {task: tokens(task) for task in (*NAMED, *KEPT)}
+
+def _episode(task: str, seed: int = 1):
+    return preprocess(rollout_oracle(TabletopEnv(task, level="train", domain="user"), seed), "objects")
 
 
 def _images(episode) -> dict[str, list]:
@@ -134,16 +133,6 @@ def test_prompts_with_novel_words_or_without_single_objects_are_unchanged(task, 
     assert rename_objects(episodes[task], np.random.default_rng(0)) is episodes[task]
 
 
-def test_objects_are_renamed_in_training_and_not_in_validation(episodes):
-    several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
-    naming = DemonstrationAugmentation(of_tasks=(Randomly(1.0, rename_objects),))
-    collate = PolicyCollate(Processor("objects"), 0.0, with_images=True, augmentation=naming)
-    plain = PolicyCollate(Processor("objects"), 0.0, with_images=True)
-    assert torch.equal(collate(several).prompts.word_ids_BL, plain(several).prompts.word_ids_BL)
-    lengths = [made(several, rngs_of(several)).prompts.mask_BL.sum(1) for made in (collate, plain)]
-    assert (lengths[0] > lengths[1]).all()
-
-
 @pytest.mark.parametrize("task", ["novel_noun", "novel_adj", "visual_manipulation"])
 def test_shuffled_sentences_keep_images_and_placeholders(task, episodes):
     seen, examples = set(), set()
@@ -168,9 +157,8 @@ def test_shuffled_sentences_keep_images_and_placeholders(task, episodes):
 
 def test_turned_comparisons_ask_for_the_same_without_less():
     turned = plain = 0
-    env = TabletopEnv("novel_adj", level="train", domain="user")
     for seed in range(6):
-        episode = preprocess(rollout_oracle(env, seed), "objects")
+        episode = _episode("novel_adj", seed)
         after = turn_comparisons(episode, np.random.default_rng(0))
         if "the less " not in episode.prompt.text:
             assert after is episode
@@ -259,10 +247,10 @@ def test_each_prompt_image_lists_its_objects_in_an_order_of_its_own(task, episod
         assert orders == {((0,),) * len(before)}
 
 
-@pytest.mark.parametrize("task", ["rotate", "twist", "rearrange", "sweep_without_exceeding"])
+@pytest.mark.parametrize("task", ["rotate", "rearrange", "sweep_without_exceeding"])
 def test_centred_picks_are_on_their_objects_and_solve_the_episode_as_well(task) -> None:
     env = TabletopEnv(task, level="train", domain="user")
-    for seed in range(3):
+    for seed in range(2):
         demo = rollout_oracle(env, seed)
         episode = preprocess(demo, "objects")
         centred = DemonstrationAugmentation(centres_picks=True)(episode, None)
@@ -303,15 +291,10 @@ def test_the_leftmost_action_may_be_done_in_place_of_the_demonstrated_one(task) 
     assert num_changed
 
 
-TASKS = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "same_shape", "rearrange")
-
-
 @pytest.fixture(scope="module")
-def distractor_episodes():
-    def tokens(task: str):
-        return preprocess(rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1), "objects")
-
-    return [tokens(task) for task in TASKS]
+def distractor_episodes(episodes):
+    tasks = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "same_shape", "rearrange")
+    return [episodes[task] for task in tasks]
 
 
 @pytest.fixture(scope="module")
@@ -325,12 +308,10 @@ def _rows(table):
 
 
 def _overlap(one, other) -> bool:
-    for v in range(2):
-        (x, y, height, width), (x2, y2, height2, width2) = (row.boxes[0, v] for row in (one, other))
-        seen = one.masks[0, v] and other.masks[0, v]
-        if seen and 2 * abs(x - x2) < width + width2 and 2 * abs(y - y2) < height + height2:
-            return True
-    return False
+    """Whether boxes of two objects overlap in a view that shows both."""
+    (centres, sizes), (centres2, sizes2) = (np.split(row.boxes[0], 2, axis=1) for row in (one, other))
+    apart = 2 * abs(centres - centres2) >= (sizes + sizes2)[:, ::-1]  # columns by width, rows by height
+    return bool((~apart.any(axis=1) & one.masks[0] & other.masks[0]).any())
 
 
 def test_distractors_overlap_nothing_at_any_step_and_nothing_else_changes(stacked):
@@ -373,10 +354,6 @@ def test_distractors_overlap_nothing_at_any_step_and_nothing_else_changes(stacke
     assert added > 10
 
 
-def test_few_tasks_receive_distractors(distractor_episodes):
-    assert [allows_distractors(episode.task) for episode in distractor_episodes] == [True] * 4 + [False] * 2
-
-
 def test_distractors_are_inserted_in_training_only_with_their_probability(distractor_episodes):
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
 
@@ -396,7 +373,7 @@ def test_distractors_are_inserted_in_training_only_with_their_probability(distra
     )
     assert torch.equal(counts(0.0), plain)
     more = counts(1.0) - plain
-    receiving = torch.tensor([allows_distractors(distractor_episodes[row].task) for row in order])
+    receiving = torch.from_numpy(order < 4)  # the last two tasks receive none
     assert (more[~receiving] == 0).all() and (more >= 0).all() and more.sum() > 0
 
 

@@ -1,7 +1,6 @@
 """Scene augmentation of contrastive pretraining, second views, and relative rotations between them."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, is_random
 from openvima.policies.nn.image_encoders import ConvConfig
-from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig, RelativeRotation
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
 from openvima.training.augmentation.crops import (
@@ -43,38 +42,41 @@ def pairs():
     return render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", augmentation=HARD)
 
 
-def _encoder(rotation_bins: int = 72) -> ObjectEncoder:
+@pytest.fixture
+def encoder() -> ObjectEncoder:
     torch.manual_seed(0)
-    crop = ConvConfig(8, 32, place_channels=8)
-    return ObjectEncoder(
-        ObjectEncoderConfig(
-            crop, box_width=4, width=8, fuse_views=True, appearance_width=16, rotation_bins=rotation_bins
-        )
-    )
+    crop = ConvConfig(8, 16, place_channels=2)
+    sizes = {"box_width": 4, "width": 8, "appearance_width": 16, "rotation_bins": 72}
+    return ObjectEncoder(ObjectEncoderConfig(crop, fuse_views=True, **sizes))
 
 
-def test_nothing_comes_from_the_test_levels(monkeypatch):
+@pytest.mark.parametrize("augmentation", [SceneAugmentation(), HARD])
+def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
+    """Pairs show training objects in textures of their role, and random ones where it is asked for."""
     shown = []
-    original = pairs_module.pairs_of_scene
+    original = pairs_module._prompt_image
 
-    def spy(scene, *rest, **options):
-        shown.extend((p.object, p.texture, p.fixed) for p in scene.placements)
-        return original(scene, *rest, **options)
+    def spy(placement, *rest):
+        shown.append(placement)
+        return original(placement, *rest)
 
-    monkeypatch.setattr(pairs_module, "pairs_of_scene", spy)
-    render_pairs(TASKS, num_scenes=24, seed=3, assets="procedural", augmentation=HARD)
-    pools = [pool(task, "train") for task in TASKS]
+    monkeypatch.setattr(pairs_module, "_prompt_image", spy)
+    tasks = (*TASKS, "rotate", "sweep_without_exceeding")
+    pairs = render_pairs(tasks, num_scenes=30, seed=3, assets="procedural", augmentation=augmentation)
+    pools = [pool(task, "train") for task in tasks]
     objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
+    objects |= {name for entry in pools for name in getattr(entry, "constraint_objects", ())} | {"line"}
     textures = {
         (name, fixed)
         for entry in pools
         for fixed, names in ((False, entry.dragged_textures), (True, entry.base_textures))
         for name in names
     }
-    assert {name for name, _, _ in shown if not is_random(name)} <= objects
-    assert {(name, fixed) for _, name, fixed in shown if not is_random(name)} <= textures
-    fraction = sum(is_random(name) for _, name, _ in shown) / len(shown)
-    assert 0.2 < fraction < 0.8
+    assert len(pairs.appearances) <= len(shown)
+    assert {p.object for p in shown if not is_random(p.object)} <= objects
+    assert {(p.texture, p.fixed) for p in shown if not is_random(p.texture)} <= textures
+    fraction = sum(is_random(p.texture) for p in shown) / len(shown)
+    assert 0.2 < fraction < 0.8 if augmentation is HARD else fraction == 0
 
 
 def test_a_second_view_leaves_the_scenes_unchanged():
@@ -155,16 +157,6 @@ def test_a_mirrored_image_is_that_of_a_mirrored_heading(yaw):
     assert difference.mean() < 0.35 * (crops[0] - crops[1]).abs().mean()
 
 
-def test_objects_of_other_height_are_other_appearances():
-    low = Placement(5, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1))
-    high = replace(low, id=6, scale=(1.0, 1.0, 2.0), pose=Pose.planar(0.5, -0.1))
-    scene = Scene((low, high))
-    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), 0, (scene, {5: 0.0, 6: 0.0}))
-    first, second = stack_rows(rows).appearances.tolist()
-    assert first != second
-    assert len(set(stack_rows(rows).shapes.tolist())) == 1
-
-
 def test_horizontal_flips_reverse_rotations(pairs):
     mirrored = with_horizontal_flips(pairs, step_generator(0, "mirror", 0))
     is_mirrored = (mirrored.scene_crops == pairs.scene_crops.flip(-1)).flatten(1).all(1)
@@ -177,14 +169,13 @@ def test_horizontal_flips_reverse_rotations(pairs):
     assert torch.equal(mirrored.second_view.crops, flipped)
 
 
-def test_rotations_are_correct_within_fifteen_degrees():
+def test_rotations_are_correct_within_fifteen_degrees(encoder):
     class Fixed(torch.nn.Module):
         """Always estimates 25 degrees."""
 
         def forward(self, first, second, seen, seen_again):
             return torch.log_softmax(50.0 * torch.eye(72)[[5] * seen.shape[-1]], dim=-1)
 
-    encoder = _encoder()
     encoder.rotation = Fixed()
     features, seen = torch.zeros(3, 2, 4, 1), torch.ones(3, 2, 4, dtype=torch.bool)
     rotations = torch.deg2rad(torch.tensor([25.0, 39.0, 41.0, 25.0 - 360.0]))[:, None].expand(4, 2)
@@ -194,3 +185,61 @@ def test_rotations_are_correct_within_fifteen_degrees():
     assert rotation_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) > 10  # the second is wrong
     seen[1] = False
     assert rotation_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) < 1e-3
+
+
+FRONT, TOP = 0, 1
+VISIBLE = torch.ones(2, 3, dtype=torch.bool)
+
+
+def _features(*shape: int) -> torch.Tensor:
+    return torch.randn(*shape, 2, 3, 16, generator=torch.Generator().manual_seed(len(shape)))
+
+
+def test_exchanging_the_images_inverts_the_rotation(encoder):
+    first, second = _features(), _features(1)[0]
+    there = encoder.rotation_between(first, second, VISIBLE, VISIBLE)
+    back = encoder.rotation_between(second, first, VISIBLE, VISIBLE)
+    torch.testing.assert_close(there, back.flip(-1).roll(1, -1))
+
+
+def test_equal_crops_are_not_rotated(encoder):
+    probabilities = encoder.rotation_between(_features(), _features(), VISIBLE, VISIBLE)
+    assert (probabilities.argmax(-1) == 0).all()
+
+
+def test_the_top_view_decides_where_it_shows_both(encoder):
+    first, second = _features(), _features(1)[0]
+    probabilities = encoder.rotation_between(first, second, VISIBLE, VISIBLE)
+    torch.testing.assert_close(probabilities.sum(-1), torch.ones(3))
+    other_front = first.clone()
+    other_front[FRONT] += 1.0
+    assert torch.equal(probabilities, encoder.rotation_between(other_front, second, VISIBLE, VISIBLE))
+
+    hidden = VISIBLE.clone()
+    hidden[TOP, 1] = False
+    of_front = encoder.rotation_between(first, second, hidden, VISIBLE)
+    assert torch.equal(of_front[[0, 2]], probabilities[[0, 2]])
+    assert not torch.equal(of_front[1], probabilities[1])
+
+
+def test_without_a_common_view_the_distribution_is_uniform(encoder):
+    only_top, only_front = VISIBLE.clone(), VISIBLE.clone()
+    only_top[FRONT], only_front[TOP] = False, False
+    probabilities = encoder.rotation_between(_features(), _features(1)[0], only_top, only_front)
+    torch.testing.assert_close(probabilities, torch.full((3, 72), 1 / 72))
+
+
+def test_shifted_phases_are_a_rotation():
+    estimator = RelativeRotation(features=256, bins=72)
+    with torch.no_grad():
+        for view in estimator.views:  # features are the harmonics themselves
+            view.weight.copy_(torch.eye(256))
+            view.bias.zero_()
+    angle = 2 * math.pi * 17 / 72
+    harmonics = torch.randn(16, 8, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    rotated = harmonics * torch.exp(1j * angle * torch.arange(1, 9))
+    first, second = (
+        torch.stack([w.real, w.imag]).flatten().expand(2, 1, 256).contiguous() for w in (harmonics, rotated)
+    )
+    visible = torch.ones(2, 1, dtype=torch.bool)
+    assert int(estimator(first, second, visible, visible).argmax()) == 17

@@ -151,18 +151,6 @@ def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_pro
         make_order(few, batch_size=64, seed=0, bucket=0, rank=0, num_ranks=4)
 
 
-def test_an_example_of_a_source_knows_its_images_among_all(data):
-    cache = open_object_cache(Dataset(data))
-    training, kept = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
-    images = np.concatenate([episode.images for episode in cache])
-    for part in (training, kept):
-        for example in part:
-            count = len(example.episode.images)
-            assert np.array_equal(images[example.base : example.base + count], example.episode.images)
-            assert cache[example.row].seed == example.episode.seed
-    assert training.num_steps(np.arange(len(training))) == sum(e.episode.num_steps for e in training)
-
-
 def test_an_unknown_word_is_found_before_training(data):
     class Cache:
         def texts(self):
@@ -212,20 +200,6 @@ def test_targets_follow_their_objects_through_shuffling(examples):
     added = changed.history.masks_BTVN.sum() - batch.history.masks_BTVN.sum()
     possible = 2 * int(batch.targets.steps_BT.sum())
     assert 0.3 * possible < added < 0.7 * possible
-
-
-def test_a_false_positive_is_in_one_view_only(examples):
-    batch = collate_examples(OBJECTS, examples[:4])
-    nothing = replace(batch.history, masks_BTVN=torch.zeros_like(batch.history.masks_BTVN))
-    changed = add_false_positives(
-        replace(batch, history=nothing),
-        "objects",
-        probability=1.0,
-        rngs=rngs_of(examples[:4]),
-    )
-    views = changed.history.masks_BTVN.sum(dim=2)[changed.history.steps_BT]
-    assert views.max() == 1
-    assert (views.sum(dim=1) == 2).all()
 
 
 @pytest.fixture(scope="module")

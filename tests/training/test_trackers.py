@@ -12,7 +12,7 @@ from PIL import Image
 
 from openvima.errors import MissingExtraError
 from openvima.training.config import TrainingConfig
-from openvima.training.trackers import TensorBoardTracker, WandbTracker, open_trackers
+from openvima.training.trackers import TensorBoardTracker, Tracker, WandbTracker, open_trackers
 from openvima.video.encoder import Animation
 
 
@@ -21,6 +21,12 @@ def animation() -> Animation:
     """Three frames of one shade each."""
     frames = np.stack([np.full((16, 32, 3), shade, np.uint8) for shade in (0, 100, 200)])
     return Animation("rotate", "solved (steps: 1)", np.full((8, 32, 3), 255, np.uint8), frames, 6)
+
+
+def track(tracker: Tracker, animation: Animation) -> None:
+    tracker.add("2-cloning", {"loss": 0.25}, 7)
+    tracker.add_animations("2-cloning", [animation], 8)
+    tracker.close()
 
 
 def test_an_animation_is_a_gif_of_its_frames(animation: Animation) -> None:
@@ -35,10 +41,7 @@ def test_an_animation_is_a_gif_of_its_frames(animation: Animation) -> None:
 def test_tensorboard_has_numbers_prompts_and_rollouts(animation: Animation, tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    tracker = TensorBoardTracker(tmp_path, 1)
-    tracker.add("2-cloning", {"loss": 0.25}, 7)
-    tracker.add_animations("2-cloning", [animation], 8)
-    tracker.close()
+    track(TensorBoardTracker(tmp_path, 1), animation)
     events = EventAccumulator(str(tmp_path / "tensorboard_log"))
     events.Reload()
     assert [(event.step, event.value) for event in events.Scalars("2-cloning/loss")] == [(7, 0.25)]
@@ -83,10 +86,7 @@ def test_wandb_is_asked_for_by_project_and_continued_by_run_folder(
     settings = {"data": tmp_path / "demos", "out": tmp_path, "runtime.tensorboard": False}
     config = TrainingConfig.of({**settings, "runtime.wandb": "robots"})
     for _ in range(2):
-        (tracker,) = open_trackers(config, tmp_path, 1)
-        tracker.add("2-cloning", {"loss": 0.25}, 7)
-        tracker.add_animations("2-cloning", [animation], 8)
-        tracker.close()
+        track(*open_trackers(config, tmp_path, 1), animation)
     assert asked[0] == asked[1]
     assert (asked[0]["project"], asked[0]["dir"]) == ("robots", str(tmp_path / "wandb_log"))
     assert asked[0]["config"]["preset"] == "nano"

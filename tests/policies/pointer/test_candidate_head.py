@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from openvima.policies.nn.actions import ActionTargets, at, rotate, yaw_between
+from openvima.policies.nn.actions import ActionTargets, rotate, yaw_between
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.candidates import PlaceCandidates
 from openvima.policies.pointer.config import CandidateHeadConfig
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet
-from small_networks import object_set, pointer_prompt
+from small_networks import drawn_head_inputs, in_order, with_prompt
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
 NUM_FIRST, NUM_SCENE = 3, 2
@@ -21,59 +21,17 @@ IN_VIEW, FIRST_STEP, IN_PROMPT = 0, N, N + NUM_FIRST  # number of the first cand
 
 @pytest.fixture
 def head() -> CandidatePointerHead:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        network = CandidatePointerHead(CandidateHeadConfig(hidden_width=16), D).double()
-        torch.nn.init.normal_(network.offset.weight, std=0.1)  # it starts at zero
-        return network
-
-
-def drawn_inputs(batch: int = B, seed: int = 1) -> HeadInputs:
-    generator = torch.Generator().manual_seed(seed)
-
-    def drawn(*shape):
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    def appearance(*shape):
-        return torch.nn.functional.normalize(drawn(*shape, A), dim=-1)
-
-    def positions_of(*shape):
-        low, size = torch.tensor([0.3, -0.4]), torch.tensor([0.4, 0.8])
-        return low + size * torch.rand(*shape, 2, generator=generator).double()
-
-    def objects(count):
-        return object_set(drawn(batch, count, D), appearance(batch, count), positions_of(batch, count), 72)
-
-    positions = positions_of(batch, T, N)
-    has_suction = torch.tensor([[True, True], [False, False], [True, False]])
-    query, in_view, objects_appearance = drawn(batch, T, D), drawn(batch, T, N, D), appearance(batch, T, N)
-    prompt, prompt_appearance = drawn(batch, M, D), appearance(batch, M)
-    first_step, prompt_objects = objects(NUM_FIRST), objects(NUM_SCENE)
-    return HeadInputs(
-        query_BTD=query,
-        objects_BTND=in_view,
-        masks_BTN=torch.ones(batch, T, N, dtype=torch.bool),
-        appearance_BTNA=objects_appearance,
-        positions_BTN2=positions,
-        grasps_BTN2=positions + 0.01,
-        has_suction_BT=has_suction.repeat(batch // B + 1, 1)[:batch],
-        previous_BTC=drawn(batch, T, 12) * (torch.arange(T) > 0)[:, None],
-        steps_BT=torch.arange(T)[None],
-        first_step=first_step,
-        prompt=pointer_prompt(
-            prompt, prompt_appearance, torch.ones(batch, M, dtype=torch.bool), prompt_objects
-        ),
-        rotations_BTNR=drawn(batch, T, N, 72).softmax(dim=-1),
-    )
+    torch.manual_seed(0)
+    network = CandidatePointerHead(CandidateHeadConfig(hidden_width=16), D).double()
+    torch.nn.init.normal_(network.offset.weight, std=0.1)  # it starts at zero
+    return network
 
 
 @pytest.fixture
 def inputs() -> HeadInputs:
     """Three episodes; some objects of the second one do not exist."""
-    whole = drawn_inputs()
-    masks = whole.masks_BTN.clone()
-    masks[1, :, 3] = False
-    return with_objects(replace(whole, masks_BTN=masks), "prompt", "masks_BK", [[1, 1], [0, 1], [1, 1]])
+    whole = drawn_head_inputs((B, T, N, M, D, A), first=NUM_FIRST, scene=NUM_SCENE)
+    return with_objects(whole, "prompt", "masks_BK", [[1, 1], [0, 1], [1, 1]])
 
 
 def set_of(inputs: HeadInputs, kind: str) -> ObjectSet:
@@ -87,11 +45,6 @@ def with_objects(inputs: HeadInputs, kind: str, name: str, value) -> HeadInputs:
     return replace(inputs, first_step=new) if kind == "first_step" else with_prompt(inputs, objects=new)
 
 
-def with_prompt(inputs: HeadInputs, **changes) -> HeadInputs:
-    """The same with another prompt."""
-    return replace(inputs, prompt=replace(inputs.prompt, **changes))
-
-
 def candidates_of(inputs: HeadInputs) -> PlaceCandidates:
     """All candidates but grid points."""
     grid = ObjectSet(*(getattr(inputs.first_step, name)[:, :0] for name in ObjectSet.__slots__))
@@ -100,15 +53,14 @@ def candidates_of(inputs: HeadInputs) -> PlaceCandidates:
 
 def targets_at(inputs: HeadInputs, place_BT2, *, yaw: float = 0.0, place_slot: int = -1) -> ActionTargets:
     """Pick slot 0 a centimetre beside the grasp point, and bring its centre to a place."""
-    batch = len(inputs.masks_BTN)
     held = inputs.grasps_BTN2[:, :, 0] + 0.01 - inputs.positions_BTN2[:, :, 0]
-    actions = torch.zeros(batch, T, 12, dtype=torch.float64)
+    actions = torch.zeros(B, T, 12, dtype=torch.float64)
     actions[..., 0:2] = inputs.positions_BTN2[:, :, 0] + held
-    tool = place_BT2 + rotate(held, torch.full((batch, T), yaw, dtype=torch.float64))
+    tool = place_BT2 + rotate(held, torch.full((B, T), yaw, dtype=torch.float64))
     actions[..., 6:8] = torch.where(inputs.has_suction_BT[..., None], tool, place_BT2)
     actions[..., 5], actions[..., 10], actions[..., 11] = 1, math.sin(yaw / 2), math.cos(yaw / 2)
-    slots = torch.zeros(batch, T, dtype=torch.int64)
-    return ActionTargets(actions, slots, slots + place_slot, torch.ones(batch, T, dtype=torch.bool))
+    slots = torch.zeros(B, T, dtype=torch.int64)
+    return ActionTargets(actions, slots, slots + place_slot, torch.ones(B, T, dtype=torch.bool))
 
 
 def place_of(inputs: HeadInputs, candidate: int) -> "torch.Tensor":
@@ -170,15 +122,7 @@ def test_values_behind_the_masks_change_nothing(head, inputs):
 
 def test_neither_the_order_in_view_nor_that_of_candidates_changes_action_or_loss(head, inputs):
     order, other = torch.tensor([2, 0, 3, 1]), torch.tensor([1, 0])
-    shuffled = replace(
-        inputs,
-        objects_BTND=inputs.objects_BTND[:, :, order],
-        masks_BTN=inputs.masks_BTN[:, :, order],
-        appearance_BTNA=inputs.appearance_BTNA[:, :, order],
-        positions_BTN2=inputs.positions_BTN2[:, :, order],
-        grasps_BTN2=inputs.grasps_BTN2[:, :, order],
-        rotations_BTNR=inputs.rotations_BTNR[:, :, order],
-    )
+    shuffled = in_order(inputs, order)
     for kind, places in (("first_step", order[order < NUM_FIRST]), ("prompt", other)):
         for name in ("tokens_BKD", "masks_BK", "appearance_BKA", "positions_BK2", "image_index_BK"):
             value = getattr(set_of(inputs, kind), name)[:, places]
@@ -394,9 +338,8 @@ def test_the_pick_depends_on_neighbours_and_on_what_a_scene_shows_there(head, in
 
 
 def test_rotations_shown_in_the_prompt_are_copied(inputs):
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        head = CandidatePointerHead(CandidateHeadConfig(hidden_width=16), D, rotation_bins=72).double()
+    torch.manual_seed(0)
+    head = CandidatePointerHead(CandidateHeadConfig(hidden_width=16), D, rotation_bins=72).double()
     torch.nn.init.zeros_(head.yaw.weight)
     torch.nn.init.zeros_(head.yaw.bias)
     rotations = torch.zeros(B, NUM_SCENE, 72, dtype=torch.float64)
@@ -413,13 +356,3 @@ def test_rotations_shown_in_the_prompt_are_copied(inputs):
     turned = none.clone()
     turned[:, :, 2, 6] = turned[:, :, 1, 12] = 1.0
     torch.testing.assert_close(yaw_between(head.decode(replace(shown, rotations_BTNR=turned))), -expected)
-
-
-def test_with_a_kept_place_in_the_batch_the_chosen_one_is_still_that_of_its_own_episode(head, inputs):
-    first = inputs.first_step.select([2, 0])
-    assert torch.equal(first.positions_BK2, inputs.first_step.positions_BK2[[2, 0]])
-    place = torch.tensor([[1, FIRST_STEP], [IN_PROMPT, 0], [FIRST_STEP + 2, IN_PROMPT + 1]])
-    got = at(candidates_of(inputs).positions_BTC2, place)
-    for b in range(B):
-        for t in range(T):
-            assert torch.equal(got[b, t], candidates_of(inputs).positions_BTC2[b, t, place[b, t]])
