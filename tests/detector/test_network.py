@@ -101,17 +101,15 @@ def test_equal_seeds_give_equal_losses(tiny, rectangles):
     assert loss(0) == loss(0) != loss(1)
 
 
-def test_images_of_odd_sizes_are_padded_and_boxes_stay_inside(tiny):
-    (found,) = made(replace(tiny, score_threshold=0.0))(images(1, 61, 83))
-    assert found.masks.shape[1:] == (61, 83)
+@pytest.mark.parametrize(
+    ("changes", "height", "width"), [({}, 61, 83), ({"min_size": 128, "channel_order": "bgr"}, 64, 96)]
+)
+def test_images_are_padded_or_enlarged_and_boxes_are_in_their_pixels(tiny, changes, height, width):
+    (found,) = made(replace(tiny, score_threshold=0.0, **changes))(images(1, height, width))
+    assert found.masks.shape[1:] == (height, width)
     assert len(found.boxes) and (found.boxes >= 0).all()
-    assert (found.boxes[:, 2] <= 83).all() and (found.boxes[:, 3] <= 61).all()
-
-
-def test_enlarged_images_give_boxes_in_pixels_of_the_image(tiny):
-    (found,) = made(replace(tiny, score_threshold=0.0, min_size=128, channel_order="bgr"))(images(1))
-    assert len(found.boxes) and (found.boxes[:, 2] <= 96).all() and (found.boxes[:, 3] <= 64).all()
-    assert found.boxes[:, 2].max() > 48
+    assert (found.boxes[:, 2] <= width).all() and (found.boxes[:, 3] <= height).all()
+    assert found.boxes[:, 2].max() > width / 2
 
 
 @pytest.mark.parametrize(("height", "width"), [(128, 256), (480, 640), (1080, 1920), (333, 500), (801, 800)])

@@ -52,9 +52,6 @@ def test_each_object_takes_the_slot_that_overlaps_it_most_and_none_twice() -> No
     found = objects((50, 54, 59, 63), (0, 0, 10, 9), (100, 100, 109, 109), (3, 0, 12, 9), first_id=0)
     assert match_ids_to_slots(found, true) == {5: 1, 6: 3}  # the third overlaps by 60 of 140 only
     assert match_ids_to_slots(found.select(np.array([1])), true) == {5: 0}  # 6 overlaps it, too, but less
-
-
-def test_where_nothing_is_found_or_there_nothing_is_named() -> None:
     box = objects((0, 0, 9, 9))
     assert (
         match_ids_to_slots(make_hidden_objects(), box) == match_ids_to_slots(box, make_hidden_objects()) == {}

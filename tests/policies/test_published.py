@@ -169,12 +169,9 @@ def test_weights_are_published_and_read_in_float32(network) -> None:
     assert {tensor.dtype for tensor in from_published(halves).values()} == {torch.float32}
 
 
-def test_a_network_with_parts_of_its_own_has_no_published_names() -> None:
+def test_networks_and_weights_of_another_kind_have_no_published_names() -> None:
     with pytest.raises(InputFileError, match=r"no published policy has: query, .*images\.appearance\.weight"):
         to_published(outline_network(preset("nano-bins")))
-
-
-def test_weights_of_something_else_are_refused() -> None:
     with pytest.raises(InputFileError, match="no weights of VIMA, VIMA-Gato"):
         from_published({"layers.0.weight": torch.zeros(2)})
 

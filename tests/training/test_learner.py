@@ -138,7 +138,7 @@ def test_rollouts_are_logged_with_their_step(settings, monkeypatch) -> None:
 
     def rollout(checkpoint: Path) -> dict[str, float]:
         seen.append(checkpoint.name)
-        return OnlineEval(("rotate",), episodes=2)(checkpoint)
+        return OnlineEval(("rotate",), episodes=1)(checkpoint)
 
     monkeypatch.setattr("openvima.training.loop.open_trackers", lambda *_: [Noted()])
     config = TrainingConfig.of({**settings, "rollout.every": 4})

@@ -1,20 +1,47 @@
-"""Pairs of contrastive pretraining: where they come from, channel mixing, and the loss."""
+"""Pairs of contrastive pretraining: where they come from, augmentation, and rotations between their views."""
+
+import math
 
 import numpy as np
 import pytest
 import torch
 
 from openvima.catalog.packs import load_assets
-from openvima.catalog.random_pack import RandomAppearanceAssets
+from openvima.catalog.partitions import pool
+from openvima.catalog.random_pack import RandomAppearanceAssets, is_random
+from openvima.policies.nn.image_encoders import ConvConfig
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig, RelativeRotation
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import Placement, Pose, Scene
 from openvima.tasks import sample_episode
-from openvima.training.augmentation.crops import draw_channel_mixing, with_occlusion
-from openvima.training.augmentation.scenes import ShapeKinds, with_random_appearance
+from openvima.training.augmentation.crops import (
+    draw_channel_mixing,
+    with_horizontal_flips,
+    with_occlusion,
+)
+from openvima.training.augmentation.scenes import (
+    ShapeKinds,
+    rearrange,
+    with_hard_negatives,
+    with_random_appearance,
+)
 from openvima.training.loop import step_generator
 from openvima.training.parallel import Parallel
 from openvima.training.pretraining import pairs as pairs_module
-from openvima.training.pretraining.pairs import Pairs, SceneAugmentation, render_pairs
+from openvima.training.pretraining.losses import (
+    is_rotation_correct,
+    rotation_loss,
+)
+from openvima.training.pretraining.pairs import (
+    Pairs,
+    SceneAugmentation,
+    pairs_of_scene,
+    render_pairs,
+    stack_rows,
+)
 
-TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
+TASKS = ("twist", "novel_adj", "visual_manipulation")
+HARD = SceneAugmentation(0.5, 0.6, second_view=True)
 
 
 def rendered(num_scenes: int, *, seed: int = 0, tasks: tuple[str, ...] = TASKS, **options) -> Pairs:
@@ -88,8 +115,7 @@ def test_random_containers_are_gratings_as_often_as_asked():
 
 @pytest.fixture(scope="module")
 def pairs():
-    augmentation = SceneAugmentation(hard_negative_prob=0.3, second_view=True)
-    return rendered(16, tasks=("visual_manipulation",), augmentation=augmentation)
+    return rendered(12, augmentation=HARD)
 
 
 def test_bars_have_the_colour_of_the_background_and_the_rest_stays(pairs):
@@ -132,3 +158,203 @@ def test_probability_zero_changes_nothing_and_equal_seeds_occlude_equally(pairs)
     assert torch.equal(none.second_view.rotations.nan_to_num(), pairs.second_view.rotations.nan_to_num())
     same = [with_occlusion(pairs, 0.5, step_generator(0, "gaps", 2)).scene_crops for _ in range(2)]
     assert torch.equal(*same)
+
+
+@pytest.fixture
+def encoder() -> ObjectEncoder:
+    torch.manual_seed(0)
+    crop = ConvConfig(8, 16, place_channels=2)
+    sizes = {"box_width": 4, "width": 8, "appearance_width": 16, "rotation_bins": 72}
+    return ObjectEncoder(ObjectEncoderConfig(crop, fuse_views=True, **sizes))
+
+
+@pytest.mark.parametrize("augmentation", [SceneAugmentation(), HARD])
+def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
+    """Pairs show training objects in textures of their role, and random ones where it is asked for."""
+    shown = []
+    original = pairs_module._prompt_image
+
+    def spy(placement, *rest):
+        shown.append(placement)
+        return original(placement, *rest)
+
+    monkeypatch.setattr(pairs_module, "_prompt_image", spy)
+    tasks = (*TASKS, "rotate", "sweep_without_exceeding")
+    pairs = rendered(30, seed=3, tasks=tasks, augmentation=augmentation)
+    pools = [pool(task, "train") for task in tasks]
+    objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
+    objects |= {name for entry in pools for name in getattr(entry, "constraint_objects", ())} | {"line"}
+    textures = {
+        (name, fixed)
+        for entry in pools
+        for fixed, names in ((False, entry.dragged_textures), (True, entry.base_textures))
+        for name in names
+    }
+    assert len(pairs.appearances) <= len(shown)
+    assert {p.object for p in shown if not is_random(p.object)} <= objects
+    assert {(p.texture, p.fixed) for p in shown if not is_random(p.texture)} <= textures
+    fraction = sum(is_random(p.texture) for p in shown) / len(shown)
+    assert 0.2 < fraction < 0.8 if augmentation is HARD else fraction == 0
+
+
+def test_a_second_view_leaves_the_scenes_unchanged():
+    plain, twice = rendered(4), rendered(4, augmentation=SceneAugmentation(second_view=True))
+    assert plain.second_view is None
+    assert torch.equal(plain.prompt_crops, twice.prompt_crops)
+    assert torch.equal(plain.scene_crops, twice.scene_crops)
+
+
+def test_hard_negatives_differ_in_one_respect():
+    assets = RandomAppearanceAssets(load_assets("procedural"))
+    rng = np.random.default_rng(0)
+    originals = tuple(
+        Placement(5 + k, name, texture, (0.144, 0.144, 0.036), Pose.planar(0.4 + 0.1 * k, 0.2 * k, z=0.0))
+        for k, (name, texture) in enumerate((("letter A", "red"), ("heart", "green")))
+    )
+    kinds = set()
+    for _ in range(40):
+        scene = with_hard_negatives(Scene(originals), 1.0, {"red", "dark red", "green"}, assets, rng)
+        for negative in scene.placements[2:]:
+            differing = min(
+                (
+                    [
+                        name
+                        for name in ("object", "texture", "scale")
+                        if getattr(negative, name) != getattr(p, name)
+                    ]
+                    for p in originals
+                ),
+                key=len,
+            )
+            assert len(differing) <= 1
+            kinds |= {*differing, negative.texture}
+    assert {"object", "scale", "dark red"} <= kinds or {"scale", "texture", "dark red"} <= kinds
+    assert "dark green" not in kinds
+
+
+def test_rotations_are_those_between_the_headings():
+    rng = np.random.default_rng(1)
+    hearts = (Placement(k, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1 * k, k)) for k in (1, 2))
+    scene = Scene(tuple(hearts))
+    again, rotations = rearrange(scene, rng)
+    for before, after in zip(scene.placements, again.placements, strict=True):
+        error = after.pose.yaw_rad - before.pose.yaw_rad - rotations[before.id]
+        assert abs(math.remainder(error, 2 * math.pi)) < 1e-9
+
+
+def test_without_rotation_prompt_image_and_scene_have_the_same_crop():
+    scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, math.pi / 2)),))
+    rasteriser = Rasteriser(load_assets("procedural"))
+    rows = pairs_of_scene(scene, {}, rasteriser, 0, (scene, {5: 0.0}))
+    drawn = stack_rows(rows)
+    assert drawn.second_view.rotations.tolist() == [[0.0, 0.0]]
+    red = (drawn.prompt_crops[0, 1, 0] == 255) & (drawn.prompt_crops[0, 1, 1] == 87)
+    also_red = (drawn.scene_crops[0, 1, 0] == 255) & (drawn.scene_crops[0, 1, 1] == 87)
+    assert (red == also_red).float().mean() > 0.95
+
+
+def test_rotations_from_prompt_images_follow_from_the_heading():
+    scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, 2.0)),))
+    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), 0, (scene, {5: 0.5}))
+    np.testing.assert_allclose(stack_rows(rows).second_view.rotations[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
+
+
+@pytest.mark.parametrize("yaw", [0.4, 1.9])
+def test_a_mirrored_image_is_that_of_a_mirrored_heading(yaw):
+    """The T is its own mirror image about its upright, which at yaw 0 points to the left of the robot."""
+    rasteriser = Rasteriser(load_assets("procedural"))
+    crops = []
+    for heading in (yaw, -yaw - math.pi):
+        scene = Scene((Placement(5, "letter T", "red", (0, 0, 0), Pose.planar(0.5, 0.0, heading)),))
+        rows = pairs_of_scene(scene, {}, rasteriser, 0)
+        crops.append(stack_rows(rows).scene_crops[0, :, 0].float())
+    difference = (crops[0].flip(-1) - crops[1]).abs()
+    assert difference.mean() < 0.35 * (crops[0] - crops[1]).abs().mean()
+
+
+def test_horizontal_flips_reverse_rotations(pairs):
+    mirrored = with_horizontal_flips(pairs, step_generator(0, "mirror", 0))
+    is_mirrored = (mirrored.scene_crops == pairs.scene_crops.flip(-1)).flatten(1).all(1)
+    shows = ~pairs.second_view.rotations[:, 0].isnan()
+    assert 0.2 < is_mirrored.float().mean() < 0.8
+    expected = torch.where(is_mirrored[:, None], -pairs.second_view.rotations, pairs.second_view.rotations)
+    assert torch.equal(mirrored.second_view.rotations[shows], expected[shows])
+    crops = pairs.second_view.crops
+    flipped = torch.where(is_mirrored[:, None, None, None, None], crops.flip(-1), crops)
+    assert torch.equal(mirrored.second_view.crops, flipped)
+
+
+def test_rotations_are_correct_within_fifteen_degrees(encoder):
+    class Fixed(torch.nn.Module):
+        """Always estimates 25 degrees."""
+
+        def forward(self, first, second, seen, seen_again):
+            return torch.log_softmax(50.0 * torch.eye(72)[[5] * seen.shape[-1]], dim=-1)
+
+    encoder.rotation = Fixed()
+    features, seen = torch.zeros(3, 2, 4, 1), torch.ones(3, 2, 4, dtype=torch.bool)
+    rotations = torch.deg2rad(torch.tensor([25.0, 39.0, 41.0, 25.0 - 360.0]))[:, None].expand(4, 2)
+    right = is_rotation_correct(encoder, features, seen, rotations)
+    assert right.tolist() == [True, True, False, True]
+    exact = torch.deg2rad(torch.tensor([[25.0, 360.0], [25.0, -360.0]]))
+    assert rotation_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) > 10  # the second is wrong
+    seen[1] = False
+    assert rotation_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) < 1e-3
+
+
+FRONT, TOP = 0, 1
+VISIBLE = torch.ones(2, 3, dtype=torch.bool)
+
+
+def _features(*shape: int) -> torch.Tensor:
+    return torch.randn(*shape, 2, 3, 16, generator=torch.Generator().manual_seed(len(shape)))
+
+
+def test_exchanging_the_images_inverts_the_rotation(encoder):
+    first, second = _features(), _features(1)[0]
+    there = encoder.rotation_between(first, second, VISIBLE, VISIBLE)
+    back = encoder.rotation_between(second, first, VISIBLE, VISIBLE)
+    torch.testing.assert_close(there, back.flip(-1).roll(1, -1))
+
+
+def test_equal_crops_are_not_rotated(encoder):
+    probabilities = encoder.rotation_between(_features(), _features(), VISIBLE, VISIBLE)
+    assert (probabilities.argmax(-1) == 0).all()
+
+
+def test_the_top_view_decides_where_it_shows_both(encoder):
+    first, second = _features(), _features(1)[0]
+    probabilities = encoder.rotation_between(first, second, VISIBLE, VISIBLE)
+    torch.testing.assert_close(probabilities.sum(-1), torch.ones(3))
+    other_front = first.clone()
+    other_front[FRONT] += 1.0
+    assert torch.equal(probabilities, encoder.rotation_between(other_front, second, VISIBLE, VISIBLE))
+
+    hidden = VISIBLE.clone()
+    hidden[TOP, 1] = False
+    of_front = encoder.rotation_between(first, second, hidden, VISIBLE)
+    assert torch.equal(of_front[[0, 2]], probabilities[[0, 2]])
+    assert not torch.equal(of_front[1], probabilities[1])
+
+
+def test_without_a_common_view_the_distribution_is_uniform(encoder):
+    only_top, only_front = VISIBLE.clone(), VISIBLE.clone()
+    only_top[FRONT], only_front[TOP] = False, False
+    probabilities = encoder.rotation_between(_features(), _features(1)[0], only_top, only_front)
+    torch.testing.assert_close(probabilities, torch.full((3, 72), 1 / 72))
+
+
+def test_shifted_phases_are_a_rotation():
+    estimator = RelativeRotation(features=256, bins=72)
+    with torch.no_grad():
+        for view in estimator.views:  # features are the harmonics themselves
+            view.weight.copy_(torch.eye(256))
+            view.bias.zero_()
+    angle = 2 * math.pi * 17 / 72
+    harmonics = torch.randn(16, 8, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    rotated = harmonics * torch.exp(1j * angle * torch.arange(1, 9))
+    first, second = (
+        torch.stack([w.real, w.imag]).flatten().expand(2, 1, 256).contiguous() for w in (harmonics, rotated)
+    )
+    visible = torch.ones(2, 1, dtype=torch.bool)
+    assert int(estimator(first, second, visible, visible).argmax()) == 17
