@@ -234,18 +234,18 @@ def test_a_finished_run_that_is_to_be_longer_names_the_command_that_goes_on(data
     run = tmp_path / "my run"
     assert run_train(data, run, "vima-nano", "--schedule.warmup-steps", 2) == 0
     capsys.readouterr()
-    longer = ["--schedule.warmup-steps", 2, "--schedule.steps", STEPS + 2]
+    longer = ["--schedule.warmup-steps", 2, "--schedule.steps", STEPS + 3]
     assert run_train(data, run, "vima-nano", *longer) != 0
     error = " ".join(capsys.readouterr().err.split())
-    assert "finished run, whose learning-rate schedule has ended. Train 2 more steps" in error
+    assert "finished run, whose learning-rate schedule has ended. Train 3 more steps" in error
     _, command, _ = error.split("`")
     program, *words = shlex.split(command)
     assert program == "openvima" and main(words) == 0
     other = tmp_path / "my run-longer"
     settings = yaml.safe_load((other / "config.yaml").read_text())["training"]
-    assert (settings["schedule"]["steps"], settings["schedule"]["warmup_steps"]) == (2, 2)
+    assert (settings["schedule"]["steps"], settings["schedule"]["warmup_steps"]) == (3, 2)
     assert settings["init_from"] == str(run)
-    assert (other / "checkpoints" / "2-cloning-000002").is_dir()
+    assert (other / "checkpoints" / "2-cloning-000003").is_dir()
 
 
 @pytest.mark.parametrize("finetune", ["False", "True"])
