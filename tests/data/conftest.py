@@ -19,6 +19,7 @@ from openvima.scene import (
     RenderedPrompt,
     Scene,
 )
+from small_data_sets import config
 
 VERSIONS = {"openvima": "0", "numpy": "0"}
 INFO = ShardInfo("stack", "train", "train", 0, 3, 0, "none", VERSIONS)
@@ -76,15 +77,21 @@ def _placement(object_id: int, rng: np.random.Generator) -> Placement:
     return Placement(object_id, "flower", "red swirl", (0.1, 0.2, 0.3), pose, object_id == 5, (1.0, 2.0, 0.7))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def made_up() -> Callable[..., Demonstration]:
     """A function that makes a demonstration of a seed, `num_steps` and `num_images`."""
     return _made_up
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def info() -> ShardInfo:
     return INFO
+
+
+@pytest.fixture(scope="package")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `config` of `small_data_sets` generates; tests leave it as it is."""
+    return generate(config(tmp_path_factory.mktemp("whole")))
 
 
 @pytest.fixture(scope="package")

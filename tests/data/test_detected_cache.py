@@ -149,11 +149,6 @@ def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> 
     assert path.read_bytes() == whole
 
 
-def test_whole_frames_have_no_boxes(demos: Path) -> None:
-    with pytest.raises(DatasetError, match="whole frames have none"):
-        open_object_cache(Dataset(demos), "frames", boxes=CLUMSY)
-
-
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["data", "preprocess", str(copy), "--boxes", HOOK]
     assert main(words) == 0

@@ -28,11 +28,6 @@ from worker_jobs import holding
 NUM_KILLS = 3  # for each of two beginnings
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return generate(config(tmp_path_factory.mktemp("whole")))
-
-
 class Server:
     """The program of `generation_server`."""
 
@@ -130,40 +125,34 @@ def _whole_shards(folder: Path, expected: dict[str, bytes]) -> set[str]:
     return {name for name, content in found.items() if content == expected[name]}
 
 
-def test_a_run_stopped_by_hand_leaves_whole_files_and_is_continued(whole: Path, tmp_path: Path) -> None:
+def test_an_extension_stopped_by_hand_leaves_whole_files_and_is_continued(
+    whole: Path, tmp_path: Path
+) -> None:
     def stop(done: int, total: int, note: str) -> None:
         if done == 3:  # in the middle of the writing of the second shard
             raise KeyboardInterrupt
 
+    generate(config(tmp_path, tasks=("rotate",), episodes=1))
     with pytest.raises(KeyboardInterrupt):
         generate(config(tmp_path), stop)
-    assert contents(tmp_path).keys() == {"rotate-train-00000.arrow"}
+    assert contents(tmp_path).keys() - {"index.parquet"} == {"rotate-train-00000.arrow"}
     with pytest.raises(DatasetError, match="not finished"):
         Dataset(tmp_path)
     generate(config(tmp_path))
     assert contents(tmp_path) == contents(whole)
 
 
-def test_what_a_killed_writer_left_is_removed(whole: Path, tmp_path: Path) -> None:
-    (tmp_path / ".rotate-train-00000.arrow.123.tmp").write_bytes(b"half")
-    (tmp_path / ".index.parquet.123.tmp").write_bytes(b"half")
-    generate(config(tmp_path))
-    assert contents(tmp_path) == contents(whole)
-
-
-def test_a_lost_shard_is_written_again(whole: Path, tmp_path: Path) -> None:
-    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
-    (tmp_path / "rotate-train-00001.arrow").unlink()
-    with pytest.raises(DatasetError, match=r"lacks 1 of 4 shards, first rotate-train-00001\.arrow"):
-        Dataset(tmp_path)
-    generate(config(tmp_path))
-    assert contents(tmp_path) == contents(whole)
-
-
-@pytest.mark.parametrize("name", ["index.parquet", "dataset.json"])
-def test_a_lost_index_or_manifest_is_written_again(whole: Path, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["index.parquet", "dataset.json", "rotate-train-00001.arrow"])
+def test_a_lost_file_is_written_again_and_what_a_killed_writer_left_removed(
+    whole: Path, tmp_path: Path, name: str
+) -> None:
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     (tmp_path / name).unlink()
+    for left in ("rotate-train-00000.arrow", "index.parquet"):
+        (tmp_path / f".{left}.123.tmp").write_bytes(b"half")
+    if name.endswith(".arrow"):
+        with pytest.raises(DatasetError, match=rf"lacks 1 of 4 shards, first {name}"):
+            Dataset(tmp_path)
     generate(config(tmp_path))
     assert contents(tmp_path) == contents(whole)
 
@@ -277,8 +266,7 @@ def test_a_second_process_that_preprocesses_is_refused(source: Path, capsys) -> 
     assert contents(cache) == before
 
 
-def test_disjoint_ranges_are_written_together_and_finished_by_the_last(tmp_path: Path) -> None:
-    whole = contents(generate(config(tmp_path / "whole")))
+def test_disjoint_ranges_are_written_together_and_finished_by_the_last(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with holding(out, 0, 2):
         generate(config(out, shard_range=(2, 4)))
@@ -291,4 +279,4 @@ def test_disjoint_ranges_are_written_together_and_finished_by_the_last(tmp_path:
                 generate(config(out, shard_range=shard_range))
     assert not (out / "dataset.json").exists()
     generate(config(out, shard_range=(0, 2)))
-    assert contents(out) == whole
+    assert contents(out) == contents(whole)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.data import Demonstration, ShardWriter
+from openvima.data import Demonstration
 from openvima.data.encoding import ShardInfo
 from openvima.data.lerobot import LerobotConfig, export_lerobot
-from openvima.data.manifest import finish_folder
 from openvima.scene import RenderedPrompt
+from small_data_sets import write_folder
 
 LENGTHS = (2, 1, 3)  # steps of the episodes of `demos`
 NUM_IMAGES = (2, 0, 1)  # images in their prompts
@@ -23,7 +23,7 @@ def with_joints(demo: Demonstration) -> Demonstration:
     return replace(demo, joint_paths=tuple(rng.random((3, 6), np.float32) for _ in demo.actions))
 
 
-@pytest.fixture
+@pytest.fixture(scope="package")
 def demos(made_up: Callable[..., Demonstration]) -> list[Demonstration]:
     """Three episodes of random pictures; the first and the last have the same prompt."""
     made = [
@@ -39,21 +39,16 @@ def demos(made_up: Callable[..., Demonstration]) -> list[Demonstration]:
 @pytest.fixture
 def store(tmp_path: Path, info: ShardInfo) -> Callable[[Sequence[Demonstration]], Path]:
     """A function that makes a data set of demonstrations."""
-
-    def _store(demos: Sequence[Demonstration]) -> Path:
-        folder = tmp_path / "demos"
-        folder.mkdir()
-        shard = folder / "stack-train-00000.arrow"
-        with ShardWriter(shard, info) as writer:
-            for demo in demos:
-                writer.write(demo)
-        finish_folder(folder, [shard], command="openvima generate", config={}, versions=info.versions)
-        return folder
-
-    return _store
+    return lambda demos: write_folder(tmp_path / "demos", info, [demos])
 
 
-@pytest.fixture
-def export(tmp_path: Path, demos: list[Demonstration], store: Callable[..., Path]) -> Path:
+@pytest.fixture(scope="package")
+def source(tmp_path_factory: pytest.TempPathFactory, info: ShardInfo, demos: list[Demonstration]) -> Path:
+    """A data set of `demos`."""
+    return write_folder(tmp_path_factory.mktemp("lerobot") / "demos", info, [demos])
+
+
+@pytest.fixture(scope="package")
+def export(source: Path) -> Path:
     """The export of `demos`."""
-    return export_lerobot(LerobotConfig(store(demos), tmp_path / "out"))
+    return export_lerobot(LerobotConfig(source, source.parent / "out"))

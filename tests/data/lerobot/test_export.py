@@ -283,8 +283,9 @@ def test_large_exports_are_spread_over_several_files(
 def test_without_joint_paths_the_state_is_the_tool_alone(
     tmp_path: Path, demos: list[Demonstration], store: Callable[..., Path]
 ) -> None:
-    demos[1] = replace(demos[1], joint_paths=())
-    export = export_lerobot(LerobotConfig(store(demos), tmp_path / "out"))
+    first, second, third = demos
+    without = [first, replace(second, joint_paths=()), third]
+    export = export_lerobot(LerobotConfig(store(without), tmp_path / "out"))
     frames = table(export, "data/chunk-000/file-000.parquet")
     assert frames["observation.state"].type == pa.float32()
     assert frames["observation.state"].to_pylist() == [1.0] * 6
@@ -292,26 +293,24 @@ def test_without_joint_paths_the_state_is_the_tool_alone(
     assert info["features"]["observation.state"]["names"] == ["end_effector"]
 
 
-def test_the_same_export_twice_has_the_same_bytes(tmp_path: Path, export: Path) -> None:
-    again = export_lerobot(LerobotConfig(tmp_path / "demos", tmp_path / "again"))
+def test_a_second_export_has_the_same_bytes_and_is_replaced_only_by_force(
+    tmp_path: Path, source: Path, export: Path
+) -> None:
+    again = export_lerobot(LerobotConfig(source, tmp_path / "again"))
     assert digests(again) == digests(export)
-
-
-def test_an_export_is_replaced_only_by_force(tmp_path: Path, export: Path) -> None:
-    before = digests(export)
-    config = LerobotConfig(tmp_path / "demos", export, pixels="yuv420p")
+    config = LerobotConfig(source, again, pixels="yuv420p")
     with pytest.raises(DatasetError, match="is there already; give another folder, or --force"):
         export_lerobot(config)
-    assert digests(export) == before
+    assert digests(again) == digests(export)
     export_lerobot(replace(config, force=True))
-    assert digests(export) != before
+    assert digests(again) != digests(export)
 
 
 def test_the_command_exports_and_names_the_folder(
-    tmp_path: Path, export: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, source: Path, export: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "by command"
-    assert main(["data", "export-lerobot", str(tmp_path / "demos"), str(out), "--tasks", "stack"]) == 0
+    assert main(["data", "export-lerobot", str(source), str(out), "--tasks", "stack"]) == 0
     assert capsys.readouterr().out.strip() == str(out)
     differing = {name for name, digest in digests(out).items() if digests(export)[name] != digest}
     assert differing == {"meta/openvima.json"}  # which names the tasks that were asked for

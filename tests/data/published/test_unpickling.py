@@ -2,6 +2,7 @@
 
 import functools
 import io
+import itertools
 import os
 import pickle
 import struct
@@ -97,18 +98,12 @@ def test_numbers_of_numpy_come_back(number: np.generic) -> None:
 
 def test_objects_become_inert() -> None:
     episode = published_data.MadeEpisode()
-    for generation in (published_data.PUBLISHED, published_data.TODAY):
-        fields = read_pickle(published_data.pickled(episode.trajectory(generation)))
+    generations = (published_data.PUBLISHED, published_data.TODAY)
+    for generation, protocol in itertools.product(generations, (4, 5)):
+        fields = read_pickle(published_data.pickled(episode.trajectory(generation), protocol))
         info = fields["obj_id_to_info"][5]
         for name in ("obj_size_range", "obj_profile", "obj_replace_fn"):
             assert type(info[name]) is Inert
-
-
-def test_both_protocols_hold_the_same_objects() -> None:
-    trajectory = published_data.MadeEpisode().trajectory(published_data.TODAY)
-    read = [read_pickle(published_data.pickled(trajectory, protocol)) for protocol in (4, 5)]
-    assert read[0].keys() == read[1].keys()
-    assert read[0]["obj_id_to_info"].keys() == read[1]["obj_id_to_info"].keys()
 
 
 class Calls:
