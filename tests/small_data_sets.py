@@ -155,7 +155,7 @@ def outcomes(num_solved: int) -> tuple[EpisodeOutcome, ...]:
     return tuple(EpisodeOutcome(i, i < num_solved, 2, *(() if i < num_solved else failed)) for i in range(10))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def results() -> Results:
     """Three policies on two tasks at L1 and one at L3; `mine` solves 9 and 6 of 10 at L1."""
     solved = {
@@ -186,7 +186,7 @@ def prompt_image(name: str, rows: slice, columns: slice, colour: tuple[int, int,
     return PromptImage(name, "object", dict.fromkeys(views, rgb), dict.fromkeys(views, segm), (record,))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def prompt() -> RenderedPrompt:
     """A prompt with a green and a red picture."""
     images = {
@@ -196,7 +196,7 @@ def prompt() -> RenderedPrompt:
     return RenderedPrompt("Put the {a} into the {b}.", images)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def clip() -> Clip:
     """A filmed failure; the film itself is not a real one."""
     picture = png(Image.new("RGB", (40, 20), (10, 120, 200)))

@@ -1,24 +1,23 @@
-"""Damaged data sets: every accident is found, and reading gives the same content or one clear error."""
+"""Damaged data sets and hostile names in them: all are found, and reading gives the same content or an error."""
 
-import contextlib
-import pickle
+import hashlib
+import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
-from openvima.data import Dataset, Demonstration, Shard, VerifyConfig, verify
+from openvima.data import Dataset, Demonstration, Shard, ShardWriter, VerifyConfig, verify
 from openvima.data.encoding import ShardInfo
-from openvima.data.schema import COLUMNS
-from openvima.errors import DatasetError
-from small_data_sets import (
-    edit_manifest,
-    read_all,
-    with_plain_images,
-    write_folder,
-)
+from openvima.data.lerobot import LerobotConfig, export_lerobot
+from openvima.data.object_cache import open_object_cache
+from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
+from openvima.errors import DatasetError, OpenVimaError
+from small_data_sets import contents, edit_manifest, read_all, with_plain_images, write_folder
 
 MadeUp = Callable[..., Demonstration]
 NO_REPLAY = VerifyConfig(replay=0)
@@ -119,32 +118,90 @@ def test_a_shard_of_another_version_is_named_with_both(folder: Path) -> None:
         Shard(folder / FIRST)
 
 
-def test_nothing_in_a_shard_is_run(folder: Path, tmp_path: Path) -> None:
-    """Old versions of pyarrow unpickled the types of fields that say they are made by Python."""
-    trap = pickle.dumps(_Trap(tmp_path / "sprung"))
-    metadata = {b"ARROW:extension:name": b"arrow.py_extension_type", b"ARROW:extension:metadata": trap}
-    shard = Shard(folder / FIRST)
-    fields = [field.with_metadata(metadata) if field.name == "seed" else field for field in COLUMNS]
-    schema = pa.schema(fields, shard.info.to_metadata())
-    batches = [shard.batch(row) for row in range(len(shard))]
-    with pa.OSFile(str(folder / FIRST), "wb") as sink, pa.ipc.new_file(sink, schema) as writer:
-        for batch in batches:
-            writer.write_batch(pa.record_batch(batch.columns, schema=schema))
-    assert not verify(folder, NO_REPLAY).is_clean
-    with contextlib.suppress(DatasetError):  # older versions of pyarrow show another type
-        _ = Shard(folder / FIRST)[0]
-    assert not (tmp_path / "sprung").exists()
-
-
-class _Trap:
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __reduce__(self) -> tuple:
-        return Path.touch, (self._path,)
-
-
 def _replace(path: Path, before: bytes, after: bytes) -> None:
     content = path.read_bytes()
     assert before in content
     path.write_bytes(content.replace(before, after))
+
+
+NAMES = [
+    "../outside/a.arrow",
+    "{outside}/a.arrow",
+    "sub/a.arrow",
+    "..\\a.arrow",
+    "C:a.arrow",
+    "",
+    ".",
+    "..",
+    "a\0.arrow",
+    "a\n.arrow",
+    ".hidden.arrow",
+    "dataset.json",
+    "a" * 300 + ".arrow",
+]
+
+
+def forge(folder: Path, name: str) -> None:
+    """Rename the shard in manifest and index, both with valid checksums."""
+    index = pq.read_table(folder / "index.parquet")
+    place = index.column_names.index("shard")
+    index = index.set_column(place, index.schema.field(place), pa.array([name] * len(index)))
+    pq.write_table(index, folder / "index.parquet")
+    content = (folder / "index.parquet").read_bytes()
+
+    def edit(manifest: dict) -> None:
+        manifest["shards"] = {name: manifest["shards"].pop(FIRST)}
+        manifest["index"] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+    edit_manifest(folder, edit)
+
+
+def commands(folder: Path) -> dict[str, Callable[[], object]]:
+    """All that follows the names in a data folder."""
+    out = folder.parent / "out"
+    return {
+        "read": lambda: list(Dataset(folder)),
+        "preprocess": lambda: open_object_cache(Dataset(folder)),
+        "merge": lambda: merge(MergeConfig((folder,), out)),
+        "sample": lambda: sample(SubsetConfig(folder, out), 1.0),
+        "split": lambda: split(SubsetConfig(folder, out), Splits({"a": 0.5, "b": 0.5})),
+        "export": lambda: export_lerobot(LerobotConfig(folder, out)),
+    }
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_that_is_none_of_a_file_in_the_folder_is_refused(folder: Path, name: str) -> None:
+    (folder.parent / "outside").mkdir()
+    (folder.parent / "outside" / "a.arrow").write_text("precious")
+    forge(folder, name.format(outside=folder.parent / "outside"))
+    before = contents(folder.parent)
+    for command in commands(folder).values():
+        with pytest.raises(DatasetError, match=r"dataset\.json: it names the shard .*, which is no plain"):
+            command()
+    assert contents(folder.parent) == before
+    assert not verify(folder, NO_REPLAY).is_clean
+    assert contents(folder.parent) == before
+
+
+def test_a_link_within_the_folder_is_followed(folder: Path) -> None:
+    os.replace(folder / FIRST, folder / "elsewhere")
+    (folder / FIRST).symlink_to("elsewhere")
+    (folder.parent / "link").symlink_to(folder)
+    assert len(list(Dataset(folder.parent / "link"))) == 4
+
+
+@pytest.mark.parametrize("field", ["task", "level", "domain", "assets"])
+def test_a_shard_that_calls_itself_a_path_is_refused(
+    tmp_path: Path, info: ShardInfo, made_up: Callable[..., Demonstration], field: str
+) -> None:
+    path = tmp_path / "a.arrow"
+    with ShardWriter(path, replace(info, **{field: "../../outside/x"})) as writer:
+        writer.write(with_plain_images(made_up(0)))
+    with pytest.raises(DatasetError, match=rf"its {field} is '\.\./\.\./outside/x', which is no plain name"):
+        Shard(path)
+
+
+@pytest.mark.parametrize("change", [{"number": "x"}, {"versions": 3}, {"images": [1]}, {"task": None}])
+def test_a_shard_whose_description_has_other_types_is_refused(info: ShardInfo, change: dict) -> None:
+    with pytest.raises(OpenVimaError, match="what it says of itself is damaged"):
+        ShardInfo.from_metadata(replace(info, **change).to_metadata())

@@ -81,9 +81,7 @@ def test_files_without_images_are_small(tmp_path: Path, recorded: Demonstration)
     assert sizes[0] < 18_000 < sizes[1]
 
 
-def test_a_difference_names_versions_or_other_causes(
-    tmp_path: Path, recorded: Demonstration
-) -> None:
+def test_a_difference_names_versions_or_other_causes(tmp_path: Path, recorded: Demonstration) -> None:
     equal, other = info_of(recorded, EnvConfig()), replace(recorded, seed=1)  # the scenes of another seed
     with pytest.raises(DatasetError, match=r"all versions as installed.*the task or the asset pack"):
         _ = stored(tmp_path / "a.arrow", other, equal)[0]

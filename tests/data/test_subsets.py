@@ -197,7 +197,7 @@ def test_a_merge_holds_all_episodes_in_either_order_of_the_sources(
     folder = merge(MergeConfig((first, second), tmp_path / "all"))
     assert episodes(folder) == sorted(episodes(first) + episodes(second))
     assert [demo.seed for demo in Dataset(folder, tasks=["rotate"])] == list(range(9))
-    other = merge(MergeConfig((second, first), tmp_path / "again", workers=2))
+    other = merge(MergeConfig((second, first), tmp_path / "again"))
     assert contents(other) == contents(folder)
 
 

@@ -128,12 +128,6 @@ def test_a_video_contains_the_prompt_the_start_the_arm_and_the_end(env, tmp_path
     )
 
 
-def test_equal_episodes_give_equal_videos(env, tmp_path):
-    for name in ("a.mp4", "b.mp4"):
-        record_episode(env, OracleRolloutPolicy(), 1, tmp_path / name, with_prompt=False, enlarge=1)
-    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
-
-
 def test_the_image_of_an_episode_has_prompt_start_and_end(tmp_path):
     env = TabletopEnv("visual_manipulation")
     path = tmp_path / "new" / "look.png"

@@ -10,11 +10,10 @@ from openvima.cli.main import main
 from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv, save_episode
 from openvima.errors import ConfigError, OracleError, PolicyError, PromptError, UnknownPolicyError
-from openvima.evaluation import EvaluationConfig, Results, play, rollout
+from openvima.evaluation import EvaluationConfig, Results, play
 from openvima.evaluation.ablations import ABLATIONS, EXAMPLE_PROMPTS, IN_CONTEXT, ORACLE_DEMONSTRATION, ablate
 from openvima.evaluation.config import cells
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, in_context_prompt
-from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
 from openvima.policies import RandomPolicy
@@ -165,15 +164,6 @@ def test_an_episode_is_played_from_its_file(tmp_path: Path) -> None:
         play(episode, "oracle", video="a.avi")
 
 
-def test_demo_takes_a_task_or_a_file(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo"]) == 2 and main(["demo", "rotate", "--episode", "x.yaml"]) == 2
-    assert "either a TASK or --episode FILE" in capsys.readouterr().err
-    assert main(["demo", "--episode", "x.yaml", "--seed", "3"]) == 2
-    assert "leave them out" in capsys.readouterr().err
-    assert main(["demo", "--episode", "missing.yaml"]) == 2
-    assert "missing.yaml" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("task", IN_CONTEXT_TASKS)
 def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
     env = TabletopEnv(task, level=task_spec(task).levels[-1], domain="eval")
@@ -211,17 +201,3 @@ def test_an_oracle_that_finds_no_action_shows_what_it_did_until_then(monkeypatch
     prompt = ablate(env, ORACLE_DEMONSTRATION).prompt
     assert list(prompt.images) == ["frame_0", "frame_1"]
     np.testing.assert_array_equal(prompt.images["frame_1"].rgb["top"], whole.images["frame_1"].rgb["top"])
-
-
-class Noting(RandomPolicy):
-    """Notes what it is told."""
-
-    def reset(self, prompts):
-        super().reset(prompts)
-        self.prompts = prompts
-
-
-def test_the_motion_is_the_prompt_of_a_policy() -> None:
-    policy, env = Noting(), TabletopEnv("twist", level="L1", domain="eval")
-    rollout.play([env], [0], PromptedRolloutPolicy(policy, ORACLE_DEMONSTRATION))
-    assert policy.prompts[0].text.startswith("Follow this motion: {frame_0} {frame_1}")

@@ -156,12 +156,7 @@ def test_what_is_no_policy_is_named_before_anything_is_played(body, message, fil
     assert not Path("evaluation", "parts").exists()
 
 
-def test_code_that_cannot_be_loaded_is_wrong_usage_of_each_verb(file, capsys):
-    for words in (["evaluate", "--policy", "none.py:make"], ["demo", "rotate", "--policy", "none.py:make"]):
-        assert main(words) == 2
-        assert "policy names 'none.py', and there is no such Python file" in capsys.readouterr().err
-    assert main(["evaluate", "--policy", str(file)]) == 2
-    assert "name a function as MODULE:FUNCTION or FILE.py:FUNCTION" in capsys.readouterr().err
+def test_code_extracts_objects_itself(file):
     with pytest.raises(ConfigError, match="extracts objects itself"):
         load_policy(f"{file}:make", extractor=object())
 
@@ -243,9 +238,3 @@ def test_a_server_that_does_not_start_is_named_with_its_last_line(tmp_path: Path
         ServerError, match=r"pretrained_model: No module named lerobot_env_openvima\. plugins"
     ):
         evaluate(settings(tmp_path, SOURCE, python=python))
-
-
-def test_names_are_those_of_runs_and_repositories() -> None:
-    named = policy_sources((SOURCE, "lerobot:owner/act@v1", "mine=lerobot:owner/act", "lerobot:some/folder"))
-    assert [source.name for source in named] == ["act_rotate", "act-v1", "mine", "folder"]
-    assert {source.kind for source in named} == {"lerobot"}

@@ -1,7 +1,8 @@
-"""Whole evaluations: same bytes for any number of workers, resumed where they stopped."""
+"""Whole evaluations: same bytes whoever plays the batches and however large they are, resumed where they stopped."""
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -9,7 +10,7 @@ from openvima.env import EnvConfig
 from openvima.errors import AssetError, ConfigError, FolderLockedError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 from openvima.evaluation.config import plan
-from worker_jobs import holding
+from worker_jobs import forget_ray, holding
 
 ORACLE = EvaluationConfig(
     ("oracle",), ("rotate", "sweep_without_exceeding"), ("L2",), episodes=3, seed=40, batch=2
@@ -31,10 +32,9 @@ def test_the_oracle_solves_its_episodes(first):
     assert [outcome.seed for outcome in results.rows[0].outcomes] == [40, 41, 42]
     assert results.policies == {"oracle": {"kind": "oracle"}}
     assert "torch" not in results.versions
-
-
-def test_two_workers_give_the_same_bytes(first, tmp_path):
-    assert evaluate(replace(ORACLE, out=tmp_path, workers=2)).read_bytes() == first.read_bytes()
+    assert "seconds" not in first.read_text()
+    log = json.loads((first.parent / "evaluation_log.json").read_text())
+    assert log["seconds"] > 0 and log["engine"] == "processes"
 
 
 def test_jobs_that_share_a_folder_give_the_same_bytes(first, tmp_path):
@@ -73,13 +73,6 @@ def test_a_job_plays_its_own_batches_only(tmp_path, monkeypatch):
     assert played == [("rotate", 40), ("rotate", 42)]
     evaluate(config)
     assert len(played) == 4
-
-
-def test_results_hold_no_times_and_the_log_apart_does(first):
-    assert "seconds" not in first.read_text()
-    log = json.loads((first.parent / "evaluation_log.json").read_text())
-    assert log["seconds"] > 0
-    assert log["engine"] == "processes"
 
 
 def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, monkeypatch):
@@ -122,19 +115,17 @@ def test_parts_of_other_assets_are_not_kept(tmp_path, monkeypatch):
     assert len(list((tmp_path / "out/parts").iterdir())) == 4
 
 
-@pytest.mark.parametrize("damaged", [lambda text: text[:-20], lambda text: "[]", lambda text: "{}"])
-def test_a_damaged_part_is_played_again(damaged, first, tmp_path):
+def test_damaged_parts_are_played_again(first, tmp_path):
     def stop(done, total, note):
-        if done == 3:
+        if done == 5:
             raise KeyboardInterrupt
 
     config = replace(ORACLE, out=tmp_path)
     with pytest.raises(KeyboardInterrupt):
         evaluate(config, stop)
     parts = list((tmp_path / "parts").iterdir())
-    assert len(parts) == 2
-    for part in parts:
-        part.write_text(damaged(part.read_text()))
+    for part, content in zip(parts, (parts[0].read_text()[:-20], "[]", "{}"), strict=True):
+        part.write_text(content)
     assert evaluate(config).read_bytes() == first.read_bytes()
 
 
@@ -146,13 +137,6 @@ def test_finished_results_are_kept_and_others_not_overwritten(first, monkeypatch
     with pytest.raises(ConfigError, match="--force"):
         evaluate(replace(config, seed=41))
     assert first.read_bytes() == before
-
-
-def test_force_overwrites_other_results(tmp_path):
-    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=1, out=tmp_path)
-    evaluate(config)
-    path = evaluate(replace(config, seed=5, force=True))
-    assert [outcome.seed for outcome in Results.read(path).rows[0].outcomes] == [5]
 
 
 def test_progress_counts_episodes_up_to_all_of_them(tmp_path):
@@ -174,3 +158,62 @@ def test_a_second_evaluation_in_a_folder_is_refused_at_once(tmp_path):
         pytest.raises(FolderLockedError, match=rf"by process {process.pid}\b"),
     ):
         evaluate(replace(ORACLE, out=tmp_path))
+
+
+NETWORK = EvaluationConfig(
+    ("untrained",),
+    ("visual_manipulation", "rearrange"),
+    ("L1",),
+    episodes=4,
+    seed=7,
+    batch=2,
+    ablations=("no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects", "random"),
+)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("torch")
+    return evaluate(replace(NETWORK, out=tmp_path_factory.mktemp("whole")))
+
+
+@pytest.mark.slow
+def test_two_workers_do_not_change_a_byte(whole: Path, tmp_path: Path) -> None:
+    assert evaluate(replace(NETWORK, out=tmp_path, workers=2)).read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_bytes_and_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch")
+    ray = pytest.importorskip("ray")
+    monkeypatch.chdir(tmp_path)
+    small = replace(NETWORK, tasks=NETWORK.tasks[:1], ablations=("no_prompt",))
+    path = evaluate(replace(small, out=Path("processes")))
+    try:
+        by_ray = evaluate(replace(small, out=Path("ray"), workers=2, engine="ray"))
+    finally:
+        forget_ray()
+    assert by_ray.read_bytes() == path.read_bytes()
+    assert not ray.is_initialized()
+
+
+@pytest.mark.slow
+def test_batches_of_one_give_the_same_outcomes(whole: Path, tmp_path: Path) -> None:
+    single = Results.read(evaluate(replace(NETWORK, out=tmp_path, batch=1)))
+    assert single.rows == Results.read(whole).rows
+
+
+def test_each_ablation_has_rows_of_its_own_alike_where_a_policy_does_not_look(whole: Path) -> None:
+    results = Results.read(whole)
+    played = list(dict.fromkeys((row.policy, row.ablation) for row in results.rows))
+    assert played == [
+        ("untrained", ""),
+        *(("untrained", ablation) for ablation in NETWORK.ablations[:4]),
+        ("random", ""),
+    ]
+    seeds = {tuple(outcome.seed for outcome in row.outcomes) for row in results.rows}
+    assert seeds == {(7, 8, 9, 10)}
+    assert results.config["ablations"] == list(NETWORK.ablations)
+    for task in NETWORK.tasks:
+        plain, shuffled = (results.row("untrained", task, "L1", name) for name in ("", "shuffled_objects"))
+        assert plain is not None and shuffled is not None and shuffled.outcomes == plain.outcomes

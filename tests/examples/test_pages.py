@@ -1,5 +1,6 @@
-"""Pages quote their examples as they stand, and the Python blocks of every page run from top to bottom."""
+"""Pages quote their examples, their Python blocks run, and docs/performance.md is made of the results."""
 
+import json
 import re
 from pathlib import Path
 
@@ -8,6 +9,8 @@ from PIL import Image
 
 from openvima.data import GenerateConfig, generate
 from openvima.tasks import registry
+from performance_table import PAGE, RowError
+from performance_table import page as performance_page
 from user_shapes import restored_assets
 
 ROOT = Path(__file__).parents[2]
@@ -89,3 +92,47 @@ def test_the_page_begins_with_its_example(page: str, example: str) -> None:
     code = (ROOT / "examples" / f"{example}.py").read_text(encoding="utf-8")
     assert len(code.splitlines()) <= 55
     assert text.split("```")[1] == f"python\n{code}"
+
+
+ENTRY = {
+    "what": "decision",
+    "value": 12.5,
+    "unit": "ms",
+    "command": "python benchmarks/sim.py",
+    "commit": "abc",
+}
+
+
+def record(folder: Path, name: str, *entries: dict) -> None:
+    (folder / name).write_text(json.dumps({"performance": entries}), encoding="utf-8")
+
+
+def test_the_page_is_made_from_the_results() -> None:
+    made = performance_page(ROOT / "results")
+    assert PAGE.read_text(encoding="utf-8") == made, "run python benchmarks/performance_table.py"
+
+
+def test_a_newer_result_replaces_the_row(tmp_path: Path) -> None:
+    gone = {"what": "gone", "command": "python benchmarks/that_is_gone.py"}
+    record(tmp_path, "2026-01-01_a.json", ENTRY, ENTRY | {"what": "other", "value": "9 to 27"}, ENTRY | gone)
+    ratio = {"what": "in turns", "unit": "×", "against": "def"}
+    record(tmp_path, "2026-01-02_b.json", ENTRY | {"value": 1.5, "unit": "×"}, ENTRY | ratio)
+    assert performance_page(tmp_path).splitlines()[-3:] == [
+        "|---|---:|",
+        "| other | [9 to 27 ms](../results/2026-01-01_a.md) |",
+        "| decision | [1.5×](../results/2026-01-02_b.md) |",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ([ENTRY, ENTRY], "'decision' is in 2026-01-01_a.json of the same day"),
+        ([ENTRY | {"speed": 1}], "does not have the fields what, value, unit, command, commit, against"),
+        ([ENTRY | {"command": "a | b"}], "has a bar"),
+    ],
+)
+def test_an_entry_that_does_not_fit_is_named(tmp_path: Path, entries: list[dict], message: str) -> None:
+    record(tmp_path, "2026-01-01_a.json", *entries)
+    with pytest.raises(RowError, match=message):
+        performance_page(tmp_path)

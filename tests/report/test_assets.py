@@ -53,13 +53,10 @@ def test_the_table_is_printed_before_any_video(tmp_path, monkeypatch, capsys):
     assert "success rates" in printed[0] and "100.0" in printed[0]
 
 
-def test_without_trained_policies_all_are_recorded(results):
+def test_without_trained_policies_all_are_recorded_and_none_unless_requested(results):
+    assert report_videos.recording_jobs(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
     jobs = report_videos.recording_jobs(EvaluationConfig(("random",)), VideoSelection(), results)
     assert {job.batch.policy for job in jobs} == {"random"}
-
-
-def test_no_videos_are_recorded_if_none_are_requested(results):
-    assert report_videos.recording_jobs(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
 
 
 def test_requested_episodes_are_recorded_of_every_policy(results):

@@ -42,16 +42,14 @@ def program(*words: str, **variables: str) -> Iterator[subprocess.Popen[str]]:
             started.kill()
 
 
-def serve_words(*words: str) -> tuple[str, ...]:
-    return ("-m", "openvima", "serve", *words)
-
-
-def test_serve_prints_its_address_answers_and_ends_with_ctrl_c() -> None:
-    with program(*serve_words("random", "--port", "0", "--name", "dice")) as server:
+def test_serve_prints_its_address_answers_and_ends_with_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("-m", "openvima", "serve", "random", "--port", "0", "--name", "dice")
+    with program(*words, **{TOKEN_VARIABLE: "secret"}) as server:
         assert server.stdout is not None and server.stderr is not None
         url = server.stdout.readline().strip()
         with urlopen(url.replace("ws", "http", 1) + "/healthz") as response:
             assert (response.status, response.read()) == (200, b"OK\n")
+        monkeypatch.setenv(TOKEN_VARIABLE, "secret")
         policy = RemotePolicy(url)
         assert policy.metadata["policy"] == {"name": "dice", "kind": "random", "device": "cpu"}
         assert set(policy.metadata["versions"]) == {"openvima", "numpy"}
@@ -60,31 +58,6 @@ def test_serve_prints_its_address_answers_and_ends_with_ctrl_c() -> None:
         logged = server.stderr.read()
         assert "connected" in logged and logged.endswith("goodbye.\n") and "Traceback" not in logged
         policy.close()
-
-
-def test_serve_takes_the_token_from_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
-    with program(*serve_words("random", "--port", "0"), **{TOKEN_VARIABLE: "secret"}) as server:
-        assert server.stdout is not None
-        url = server.stdout.readline().strip()
-        monkeypatch.setenv(TOKEN_VARIABLE, "secret")
-        RemotePolicy(url).close()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["randm"], "there is no policy 'randm'. Did you mean 'random'?"),
-        (["random", "--host", "0.0.0.0"], "give a token"),
-        (["random", "--port", "70000"], "port is at most 65535"),
-        (["random", "--token", "two words"], "without spaces"),
-    ],
-)
-def test_wrong_use_of_serve_is_one_line_and_status_2(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["serve", *words]) == 2
-    error = capsys.readouterr().err.strip()
-    assert message in error and "\n" not in error
 
 
 def test_evaluating_a_server_that_is_not_there_is_status_1(

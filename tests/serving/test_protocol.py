@@ -1,6 +1,5 @@
 """Prompts, observations and actions in messages."""
 
-import pickle
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -18,7 +17,6 @@ from openvima.serving import RemotePolicy, serve_in_thread
 from openvima.serving.protocol import (
     DTYPES,
     MAX_LENGTH,
-    check_protocol,
     check_token,
     decode_action,
     decode_observation,
@@ -57,11 +55,6 @@ def test_an_episode_comes_out_of_messages_as_it_went_in() -> None:
         np.testing.assert_array_equal(sent[key], array, strict=True)
 
 
-def test_none_stands_for_an_episode_that_has_ended() -> None:
-    assert encode_observation(None) is decode_observation(None) is None
-    assert encode_action(None) is decode_action(None) is None
-
-
 def test_a_prompt_may_be_text_alone_and_an_observation_lack_the_segmentation() -> None:
     assert decode_prompt({"text": "Rotate."}).images == {}
     message = made_up_observation(1)
@@ -76,19 +69,15 @@ def test_a_prompt_may_be_text_alone_and_an_observation_lack_the_segmentation() -
         (("text",), ..., "lacks 'text'"),
         (("images",), {}, "images is a dict; it must be a list"),
         (("colour",), 3, "'colour', which nobody knows"),
-        (("images", 0), 7, "images 0 is 7; it must be a map"),
         (("images", 0, "name"), None, "images 0: name is None"),
         (("images", 0, "kind"), "photo", "allowed: object, scene"),
-        (("images", 0, "kind"), [], "allowed: object, scene"),
         (("images", 0, "kind"), np.zeros(3), "allowed: object, scene"),
-        (("images", 0, "rgb"), [1], "rgb is a list; it must be a map"),
         (("images", 0, "rgb", "top"), b"", "rgb: top is b''; it must be an array"),
         (("images", 0, "rgb", "top"), np.zeros((4, 8), np.uint8), r"uint8 \(3, any, any,\)"),
         (("images", 0, "rgb", "top"), np.zeros((3, 4, 8), np.float32), "float32"),
         (("images", 0, "segm", "top"), np.zeros((4, 9), np.uint8), "as large as rgb"),
         (("images", 0, "objects", 0), 3, "objects 0 is 3; it must be a map"),
         (("images", 0, "objects", 0, "object_id"), True, "object_id is True; it must be a whole number"),
-        (("images", 0, "objects", 0, "texture"), None, "texture is None"),
     ],
 )
 def test_what_is_wrong_in_a_prompt_is_said(path: tuple, value: object, message: str) -> None:
@@ -113,7 +102,6 @@ def test_two_images_of_one_name_are_refused() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"ee": None}, "ee is None"),
         ({"ee": True}, "ee is True"),
         ({"ee": 0.0}, "ee is 0.0"),
         ({"rgb": {"top": 3}}, "rgb: top is 3"),
@@ -123,13 +111,6 @@ def test_two_images_of_one_name_are_refused() -> None:
 def test_what_is_wrong_in_an_observation_is_said(change: dict, message: str) -> None:
     with pytest.raises(MessageError, match=message):
         decode_observation(made_up_observation(1) | change)
-
-
-def test_other_versions_are_named() -> None:
-    with pytest.raises(MessageError, match=re.escape("it speaks 'openvima-policy/2', I 'openvima-policy/1'")):
-        check_protocol("openvima-policy/2", theirs="it", ours="I")
-    with pytest.raises(MessageError, match="speaks None"):
-        check_protocol(None, theirs="it", ours="I")
 
 
 @pytest.mark.parametrize("token", ["", "two words", "line\nbreak", "ümlaut"])
@@ -253,8 +234,6 @@ def test_an_array_has_the_form_that_other_servers_of_the_field_use() -> None:
     ("value", "message"),
     [
         (np.array([None]), r"'\|O'"),
-        (np.array(["text"]), "dtype"),
-        (np.zeros(2, "c8"), "c8"),
         (np.zeros(2, "M8[s]"), "dtype"),
         ({"x": object()}, "type object cannot be sent"),
         ({1, 2}, "type set"),
@@ -270,34 +249,20 @@ def test_what_cannot_be_sent_is_named(value: object, message: str) -> None:
     ("data", "message"),
     [
         (b"", "no whole MessagePack"),
-        (b"\xc1", "no whole MessagePack"),
         (pack({"a": 1})[:-1], "no whole MessagePack"),
         (pack(1) + pack(2), "no whole MessagePack"),
-        (b"\xa2\xff\xfe", "no whole MessagePack"),
         (msgpack.packb({1: 2}), "no whole MessagePack"),
         (msgpack.packb(msgpack.ExtType(5, b"x")), "no whole MessagePack"),
-        (msgpack.packb(msgpack.Timestamp(1)), "no whole MessagePack"),
-        (pickle.dumps({"a": 1}), "no whole MessagePack"),
         (b"\x91" * 5000 + b"\xc0", "no whole MessagePack"),
         (b"\xdd\xff\xff\xff\xff", "no whole MessagePack"),
-        (b"\xc6\xff\xff\xff\xff" + b"x", "no whole MessagePack"),
         (array_message(dtype="|O"), "one of the dtypes .*u1"),
-        (array_message(dtype="O"), "dtype"),
-        (array_message(dtype="<U3"), "dtype"),
-        (array_message(dtype="V6"), "dtype"),
-        (array_message(dtype="u1,u1"), "dtype"),
         (array_message(dtype=["u1"]), "dtype"),
-        (array_message(dtype=None), "dtype"),
         (array_message(data="\0" * 6), "an array is damaged"),
-        (array_message(data=[0] * 6), "an array is damaged"),
         (array_message(data=b"\0" * 5), "an array is damaged"),
-        (array_message(shape=[2**40]), "shape"),
-        (array_message(shape=[2**31 - 1] * 4), "an array is damaged"),
         (array_message(shape=[2**31 - 1] * 8), "an array is damaged"),
         (array_message(shape=[-2, -3]), "shape"),
         (array_message(shape=[6.0]), "shape"),
         (array_message(shape=[True, 6]), "shape"),
-        (array_message(shape={}), "shape"),
         (array_message(shape=6), "shape"),
         (msgpack.packb({b"__ndarray__": True}), "must have the entries"),
         (b"\xdc" + MAX_LENGTH.to_bytes(2, "big") + b"\x80" * MAX_LENGTH + b"!", "no whole MessagePack"),

@@ -17,7 +17,7 @@ from openvima.errors import ConfigError, MessageError, PolicyError, ServerError
 from openvima.evaluation import score
 from openvima.policies import RandomPolicy
 from openvima.serving import PROTOCOL, RemotePolicy, serve, serve_in_thread
-from openvima.serving.protocol import decode_observation, encode_observation, encode_prompt, pack, unpack
+from openvima.serving.protocol import encode_observation, encode_prompt, pack, unpack
 from openvima.serving.server import ServerConfig, check_can_listen, is_own_page
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, scripted_server, told
 
@@ -176,19 +176,21 @@ def test_a_policy_without_sessions_serves_one_client_at_a_time() -> None:
             later.reset([made_up_prompt(3)])
 
 
-def test_health_is_answered_over_http_with_and_without_a_token(url: str) -> None:
+def test_health_is_answered_over_http(url: str) -> None:
     assert fetch(url, "/healthz") == (200, b"OK\n")
     assert fetch(url, "/")[0] == 426  # Upgrade Required
-    with serve_in_thread(Telltale(), **SETTINGS, token="secret") as guarded:
-        assert fetch(guarded, "/healthz") == (200, b"OK\n")
 
 
-@pytest.mark.parametrize("header", [None, "Bearer", "Bearer ", "Bearer wrong", "secret", "Bearer secret2"])
-def test_who_does_not_know_the_token_is_turned_away(header: str | None) -> None:
+def test_who_does_not_know_the_token_is_turned_away() -> None:
     with serve_in_thread(Telltale(), **SETTINGS, token="secret") as url:
-        headers = {"Authorization": header} if header else None
-        with pytest.raises(InvalidStatus, match="401"), connect(url, additional_headers=headers, proxy=None):
-            pass
+        for header in (None, "Bearer", "Bearer ", "Bearer wrong", "secret", "Bearer secret2"):
+            headers = {"Authorization": header} if header else None
+            with (
+                pytest.raises(InvalidStatus, match="401"),
+                connect(url, additional_headers=headers, proxy=None),
+            ):
+                pass
+        assert fetch(url, "/healthz") == (200, b"OK\n")
         for scheme in ("Bearer", "Api-Key"):
             headers = {"Authorization": f"{scheme} secret"}
             with connect(url, additional_headers=headers, proxy=None) as connection:
@@ -257,16 +259,16 @@ def test_a_taken_port_is_an_error() -> None:
 
 
 class WithJoints(RandomPolicy):
-    """Keeps what it sees."""
+    """Keeps what it sees first."""
 
     modalities = ("rgb", "joints")
-    seen: list[Mapping]
+    seen: Sequence[Mapping] = ()
 
     def new_session(self) -> "WithJoints":
         return self
 
     def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
-        self.seen = [one for one in observations if one is not None]
+        self.seen = self.seen or [one for one in observations if one is not None]
         return super().act(observations)
 
 
@@ -277,18 +279,11 @@ def test_joints_are_sent_to_a_policy_that_asks_for_them_and_segmentation_is_not(
         score({"remote": remote}, tasks=("rotate",), levels=("L1",), episodes=1)
     assert set(policy.seen[0]) == {"rgb", "joints", "ee"}
     env = TabletopEnv("rotate", level="L1", domain="eval", modalities=("joints",))
-    assert policy.seen[0]["joints"].shape == env.reset(seed=0)[0]["joints"].shape
-
-
-def test_joints_pass_unchanged() -> None:
-    sent = {**made_up_observation(1), "joints": np.arange(6, dtype=np.float32)}
-    assert decode_observation(encode_observation(sent)) == sent
+    assert np.array_equal(policy.seen[0]["joints"], env.reset(seed=0)[0]["joints"])
 
 
 @pytest.mark.parametrize("asked", ["rgb", ["depth", "rgb"], ["segm"], 3, [["rgb"]]])
 def test_a_server_that_asks_for_what_is_not_sent_is_refused(asked: object) -> None:
-    from openvima.serving import PROTOCOL
-
     first = {"protocol": PROTOCOL, "modalities": asked}
     with scripted_server(metadata=first) as url, pytest.raises(ServerError, match="has modalities"):
         RemotePolicy(url)

@@ -1,5 +1,6 @@
-"""Stages of studies: what is shared, seeds, checks before any work."""
+"""Studies: stages, seeds, checks before any work; interrupted, resumed, folders of others refused."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,8 @@ import pytest
 
 pytest.importorskip("torch")
 
-from openvima.errors import ConfigError
+from openvima.atomic_io import folder_lock
+from openvima.errors import ConfigError, FolderLockedError
 from openvima.studies import (
     STUDIES,
     Demonstrations,
@@ -17,6 +19,7 @@ from openvima.studies import (
     StudyInputs,
     check_options,
     make_study,
+    run_study,
     scale_named,
 )
 from openvima.studies.plan import plan_study
@@ -121,3 +124,59 @@ def test_the_example_of_the_documentation_can_be_planned(tmp_path: Path) -> None
     study = make_study(f"{tmp_path / 'learning_rates.py'}:learning_rates", INPUTS)
     plan = plan_study(study, INPUTS, OUT, seeds=2)
     assert [training.config.preset for training in plan.trainings] == ["vima-nano"] * 4
+
+
+STUDY = Study(
+    "test",
+    "Does it resume?",
+    "fraction",
+    (Run("all", init={"schedule.steps": 1}), Run("half", data_fraction=0.5)),
+    EvaluationSettings(("rotate",), ("L1",), 1),
+    Demonstrations(("rotate",), 2),
+    {
+        "preset": "midas-nano",
+        "schedule.steps": 2,
+        "schedule.checkpoint_every": 1,
+        "loader.validation_fraction": 0.0,
+    },
+)
+
+
+def points(folder: Path) -> list:
+    return json.loads((folder / "study.json").read_text(encoding="utf-8"))["points"]
+
+
+class Interrupted(BaseException):
+    """Stands for Ctrl-C, at a stage."""
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::openvima.errors.UnknownWordWarning")  # of words beyond these few
+def test_an_interrupted_study_ends_with_the_same_points(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    page = run_study(STUDY, INPUTS, whole)
+    assert "Does it resume?" in page.read_text(encoding="utf-8")
+    for stage in (2, 4):
+
+        def interrupt(done: int, total: int, note: str, at: int = stage) -> None:
+            if done == at and ":" in note:  # amid a training
+                raise Interrupted
+
+        with pytest.raises(Interrupted):
+            run_study(STUDY, INPUTS, resumed, report=interrupt)
+        assert not (resumed / "study.json").exists()
+    run_study(STUDY, INPUTS, resumed)
+    assert points(resumed) == points(whole)
+    costs = json.loads((resumed / "study.json").read_text(encoding="utf-8"))["costs"]
+    assert [cost["demonstrations"] for cost in (*costs["all"], *costs["half"])] == [2, 1]
+
+
+def test_a_folder_of_another_study_or_of_another_process_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    study = replace(STUDY, runs=(Run("oracle", policy="oracle"),))
+    run_study(study, INPUTS, tmp_path)
+    with pytest.raises(ConfigError, match=r"evaluation\.episodes is 1 there and 2 here"):
+        run_study(replace(study, evaluation=replace(study.evaluation, episodes=2)), INPUTS, tmp_path)
+    with folder_lock(tmp_path), pytest.raises(FolderLockedError):
+        run_study(study, INPUTS, tmp_path)

@@ -1,4 +1,4 @@
-"""You, Compose and Browse in a real browser: clicks, scenes of one's own, failures played again."""
+"""The studio in a real browser: episodes played and explained, clicks, scenes of one's own, failures again."""
 
 import math
 from collections.abc import Callable
@@ -20,6 +20,7 @@ from openvima.tasks import sample_episode
 pytestmark = pytest.mark.slow
 
 TASKS = ("rotate", "visual_manipulation")
+NO_POLICY = "no_such_policy"
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +60,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def studio(browser: Any, open_studio: Callable, results: Path, recorded: Path) -> Any:
     return open_studio(path=results, record=recorded)
+
+
+@pytest.fixture(scope="module")
+def plain_studio(browser: Any, open_studio: Callable) -> Any:
+    return open_studio()
 
 
 @pytest.fixture
@@ -262,3 +268,60 @@ def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, tmp_path:
     settle(session)
     demo = Dataset(demos)[0]
     assert np.array_equal(session.table.shown.joints, demo.joint_paths[0][-1])
+
+
+def test_an_episode_is_played_to_success_taken_back_and_explained(
+    plain_studio: Any, open_page: Callable
+) -> None:
+    page = open_page(plain_studio.url)
+    page.wait_for("0 steps of at most")
+    page.press("play")
+    page.wait_for("solved in")
+    session = newest(plain_studio)
+    session.submit(lambda: session.back(1)).result()
+    page.wait_for("1 step of at most")
+    page.tab("Why")
+    page.check("show why")
+    page.wait_for("probab")
+    assert session.prompt_weights and session.current.propose().explanation is not None
+    page.choose("compare with", "random")
+    page.wait_for("No difference so far.")  # both begin anew
+    page.tab("Play")
+    page.press("step")
+    page.wait_for("1 step of at most")
+    page.tab("Why")
+    page.wait_for("first difference")
+    assert session.current.num_steps == session.compared.num_steps == 1
+
+
+def test_what_fails_is_said_and_the_page_lives_on(plain_studio: Any, open_page: Callable) -> None:
+    page = open_page(plain_studio.url)
+    page.wait_for("0 steps of at most")
+    page.choose("policy", "other …")
+    page.fill("source", NO_POLICY)
+    page.wait_for(f"there is no policy '{NO_POLICY}'")
+    page.choose("policy", "oracle")
+    page.press("play")
+    page.wait_for("solved in")
+
+
+def test_two_browsers_have_sessions_of_their_own(plain_studio: Any, open_page: Callable) -> None:
+    first = open_page(plain_studio.url)
+    first.wait_for("0 steps of at most")
+    one = newest(plain_studio)
+    second = open_page(plain_studio.url)
+    second.wait_for("0 steps of at most")
+    other = newest(plain_studio)
+    second.choose("task", "visual_manipulation")
+    second.press("step")
+    second.wait_for("solved in")
+    assert other.current.num_steps == 1 and other.current.episode.task == "visual_manipulation"
+    assert one.current.num_steps == 0 and one.current.episode.task == "rearrange"
+    first.press_at_once("step", "pause")  # each counts, however fast
+    first.wait_for("1 step of at most")
+
+
+def test_pages_of_other_sites_show_nothing(browser: Any, open_studio: Callable, open_page: Callable) -> None:
+    studio = open_studio()
+    open_page(studio.url.replace("127.0.0.1", "elsewhere.localhost")).wait_for("No entry")
+    assert not studio.sessions

@@ -129,24 +129,13 @@ def attack(touch: str) -> dict[str, bytes]:
     eat = f"__import__('os').system({touch!r})"
     return {
         "os.system": PROTO + named("os", "system") + text(touch) + b"\x85R.",
-        "a call by __reduce__": pickle.dumps(Calls(os.system, touch), 4),
         "builtins.eval": pickle.dumps(Calls(eval, eat), 4),
-        "builtins.exec, old protocol": pickle.dumps(Calls(exec, eat), 2),
         "oldest protocol": pickle.dumps(Calls(os.system, touch), 0),
         "INST": b"(X" + struct.pack("<I", len(touch)) + touch.encode() + b"ios\nsystem\n.",
-        "OBJ": b"(cos\nsystem\nX" + struct.pack("<I", len(touch)) + touch.encode() + b"o.",
-        "GLOBAL": b"cos\nsystem\nX" + struct.pack("<I", len(touch)) + touch.encode() + b"\x85R.",
-        "NEWOBJ": PROTO + named("subprocess", "Popen") + text(touch) + b"}" + text("shell") + b"\x88s\x92.",
-        "getattr": PROTO
-        + named("builtins", "getattr") + named("os", "path") + text("os") + b"\x86R0"
-        + named("os", "system") + text(touch) + b"\x85R.",
         "a dotted name": PROTO + named("shutil", "os.system") + text(touch) + b"\x85R.",
-        "a call, protocol 5": pickle.dumps(Calls(os.system, touch), 5),
         "a call in an array, protocol 5": pickle.dumps(np.array([Calls(os.system, touch)], dtype=object), 5),
         "functools.partial": pickle.dumps(Calls(functools.partial(os.system, touch)), 4),
         "a call in an array": pickle.dumps(np.array([Calls(os.system, touch)], dtype=object), 4),
-        "a call as a key": PROTO + b"}" + named("os", "system") + text(touch) + b"\x85RK\x01s.",
-        "a call after the mark": PROTO + b"(" + named("os", "system") + text(touch) + b"\x85Rl.",
         "a default that calls": PROTO
         + named("collections", "defaultdict") + named("os", "getcwd") + b"\x85R0"
         + named("os", "system") + text(touch) + b"\x85R.",
@@ -162,9 +151,8 @@ def test_hostile_pickles_are_refused_and_nothing_runs(kind: str, tmp_path: Path)
     ) as error:
         read_pickle(content)
     assert not marker.exists()
-    if kind != "NEWOBJ":  # the shell that it starts would outlive the test
-        pickle.loads(content)
-        assert marker.exists(), "this pickle is not hostile"
+    pickle.loads(content)
+    assert marker.exists(), "this pickle is not hostile"
     if kind in ("os.system", "builtins.eval"):
         assert f"names {kind}," in str(error.value)
 
@@ -181,11 +169,7 @@ SIZE_RANGE = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRan
         (named("numpy", "load"), "names numpy.load,"),
         (named("functools", "partial.__class__"), "names functools.partial.__class__,"),
         (named("numpy", "ndarray.tofile"), "names numpy.ndarray.tofile,"),
-        (named("builtins", "getattr"), "names builtins.getattr,"),
         (b"Pid\n", "no pickle of data"),
-        (b"Nq\x00Q", "no pickle of data"),
-        (b"\x97", "no pickle of data"),
-        (b"\xff", "no pickle of data"),
         (SIZE_RANGE + b")\x81(K\x01e", "'Inert' object has no attribute 'append'"),
     ],
 )
@@ -209,17 +193,12 @@ def array_pickle(shape: object, dtype: str, content: object) -> bytes:
 @pytest.mark.parametrize(
     ("shape", "dtype", "content", "fault"),
     [
-        ((10**12,), "u1", b"abc", "no pickle of data"),
         ((10**30,), "u1", b"abc", "no pickle of data"),
         ((-1, 5), "u1", b"abc", "no pickle of data"),
         ((2.5,), "u1", b"ab", "no pickle of data"),
-        (("x",), "u1", b"ab", "no pickle of data"),
         ((1,) * 100, "u1", b"a", "no pickle of data"),
-        ((1,), "O8", [None], "only numbers"),
         ((1,), "O8", b"12345678", "type 'O8'; only numbers"),
-        ((1,), "V8", b"12345678", "type 'V8'; only numbers"),
         ((1,), "M8", b"12345678", "type 'M8'; only numbers"),
-        ((1,), "u1", "text", "no pickle of data"),
         ((1,), "u1", [1], "no pickle of data"),
         ((3,), "f8", b"abc", "no pickle of data"),
     ],
