@@ -47,18 +47,14 @@ def write(path: Path, text: str) -> None:
             (folder / name).write_text(text)
 
 
-def test_a_folder_appears_with_everything_in_it_and_nothing_beside_it(tmp_path) -> None:
-    write(tmp_path / "made/before/folder", "new")
-    assert content(tmp_path / "made/before/folder") == {"new"}
-    assert [path.name for path in (tmp_path / "made/before").iterdir()] == ["folder"]
-
-
-def test_a_folder_is_replaced_as_a_whole(tmp_path) -> None:
-    write(tmp_path / "folder", "old")
-    (tmp_path / "folder" / "c").write_text("old")
-    write(tmp_path / "folder", "new")
-    assert content(tmp_path / "folder") == {"new"}
-    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+def test_a_folder_appears_and_is_replaced_as_a_whole(tmp_path) -> None:
+    path = tmp_path / "made/before/folder"
+    write(path, "old")
+    assert content(path) == {"old"}
+    (path / "c").write_text("old")
+    write(path, "new")
+    assert content(path) == {"new"}
+    assert [each.name for each in path.parent.iterdir()] == ["folder"]
 
 
 def test_a_failure_leaves_the_old_folder_and_nothing_of_the_new_one(tmp_path) -> None:
@@ -132,17 +128,6 @@ def test_the_lock_of_a_killed_writer_is_free_and_its_files_go(tmp_path) -> None:
         assert sorted(path.name for path in tmp_path.iterdir())[0] == LOCK_NAME
         assert not list(tmp_path.glob("*.tmp"))
     assert not list(tmp_path.iterdir())
-
-
-def test_disjoint_parts_have_a_writer_each_and_exclude_one_of_the_whole(tmp_path) -> None:
-    with holding(tmp_path, 0, 3) as first:
-        with folder_lock(tmp_path, (3, 5)):
-            pass
-        for part in ((2, 4), None):
-            with pytest.raises(FolderLockedError, match=f"process {first.pid}"):
-                folder_lock(tmp_path, part).__enter__()
-    with folder_lock(tmp_path):
-        pass
 
 
 def test_threads_of_one_process_exclude_each_other(tmp_path) -> None:

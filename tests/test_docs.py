@@ -181,7 +181,7 @@ def benchmark_options() -> frozenset[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_link_and_script_of_the_page_exists(page: Path) -> None:
+def test_every_link_anchor_and_script_of_the_page_exists(page: Path) -> None:
     missing = []
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
         targets = [page.parent / target for target in re.findall(r"\]\((?!\w+:)([^)#\s]+)", line)]
@@ -191,13 +191,6 @@ def test_every_link_and_script_of_the_page_exists(page: Path) -> None:
             if script != "benchmarks/NAME.py"
         ]
         missing += [f"{page.relative_to(ROOT)}:{number}: {path}" for path in targets if not path.exists()]
-    assert not missing, "\n".join(missing)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_anchor_of_the_page_is_a_heading(page: Path) -> None:
-    missing = []
-    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
         for target, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*)#([^)\s]+)\)", line):
             other = page.parent / target if target else page
             if other.suffix == ".md" and anchor not in anchors(other):

@@ -136,11 +136,9 @@ def test_packages_list_their_public_names_without_importing_them() -> None:
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize(
-    "module", ["openvima.env", "openvima.data", "openvima.tasks", "openvima.sim", "openvima.render"]
-)
-def test_the_simulation_half_works_without_torch(module: str) -> None:
-    code = f"import sys; sys.modules['torch'] = None; import {module}"
+def test_the_simulation_half_works_without_torch() -> None:
+    modules = ", ".join(f"openvima.{name}" for name in ("render", "sim", "tasks", "env", "data"))
+    code = f"import sys; sys.modules['torch'] = None; import {modules}"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
 

@@ -216,6 +216,8 @@ def test_a_gallery_prints_its_page(tmp_path, monkeypatch, capsys):
 
 
 def test_an_import_says_how_many_files_it_took(tmp_path, monkeypatch, capsys):
+    assert main(["assets", "info"]) == 0
+    assert "`openvima assets import CHECKOUT`" in capsys.readouterr().out
     assert import_small_pack(tmp_path, monkeypatch) == 0
     assert "2 of 2 files imported" in capsys.readouterr().out
     assert main(["assets", "info"]) == 0
@@ -228,11 +230,6 @@ def test_an_incomplete_import_lists_what_it_lacks_and_ends_with_1(tmp_path, monk
     assert "1 of 2 files imported" in printed.out
     assert "1 not imported" in printed.err and "pallet/pallet.urdf differs" in printed.err
     assert len([path for path in original.imported_folder().rglob("*") if path.is_file()]) == 1
-
-
-def test_info_without_an_import_names_the_command(capsys):
-    assert main(["assets", "info"]) == 0
-    assert "`openvima assets import CHECKOUT`" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("words", [["demo", "rotate", "--out", "x.mp4"], ["generate", "--out", "demos"]])

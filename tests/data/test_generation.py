@@ -49,16 +49,6 @@ def test_a_finished_folder_is_left_alone(whole: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in whole.iterdir()} == times
 
 
-def test_growing_shards_extend_to_the_bytes_of_asking_for_all_at_once(tmp_path: Path) -> None:
-    asked = GenerateConfig(out=tmp_path / "at_once", tasks=("rotate",), episodes=22)
-    generate(asked)
-    extended = replace(asked, out=tmp_path / "extended")
-    for episodes in (3, 4, 18, 22):
-        generate(replace(extended, episodes=episodes))
-    assert contents(extended.out) == contents(asked.out)
-    assert [len(Dataset(asked.out)), len(contents(asked.out)) - 2] == [22, 5]
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -88,52 +87,6 @@ def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, ca
     run(*train)  # again: nothing is left to do
     assert (trained / "checkpoints" / "2-cloning-000003" / "model.safetensors").read_bytes() == weights
     assert capsys.readouterr().out.strip().endswith("my runs/trained")
-
-
-def openvima(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "import sys; from openvima.cli.main import main; sys.exit(main())"]
-    return subprocess.run([*command, *words], capture_output=True, text=True, check=False, timeout=120)
-
-
-def test_quickstart_explains_its_options_in_a_process_of_its_own() -> None:
-    shown = openvima("quickstart", "--help")
-    assert shown.returncode == 0, shown.stderr
-    for option in ("--out", "--demonstrations", "--episodes", "--seed", "--workers"):
-        assert option in shown.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::openvima.errors.UnknownWordWarning")  # of words beyond these few
-def test_a_killed_training_goes_on_and_is_scored_with_ablations(tmp_path: Path, capsys) -> None:
-    folder = tmp_path / "my runs"
-    demos, trained, results = folder / "demos", folder / "trained", folder / "results"
-    run("generate", "--tasks", TASKS, "--episodes", 4, "--out", demos)
-    train = ["train", "--data", demos, "--preset", "vima-nano", "--out", trained, "--loader.batch-size", 2]
-    train += ["--schedule.steps", 12, "--schedule.checkpoint-every", 1, "--runtime.threads", 1]
-    train += ["--recipe", "nano", "--pretraining.steps", 0]
-    words = [sys.executable, "-m", "openvima", *(str(word) for word in train)]
-    process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    try:
-        while not any(trained.glob("checkpoints/2-cloning-00000[2-9]")) and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-    finally:
-        process.kill()
-        process.wait()
-    run(*train)
-    lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines if "loss" in line] == list(range(1, 13))
-
-    evaluate = ["evaluate", "--policy", f"mine={trained}", "--ablations", "no_prompt,shuffled_objects"]
-    run(*evaluate, "--tasks", "rotate", "--levels", "L1", "--episodes", 2, "--videos", 0, "--out", results)
-    rows = json.loads((results / "results.json").read_text(encoding="utf-8"))["rows"]
-    assert {row.get("ablation", "") for row in rows} == {"", "no_prompt", "shuffled_objects"}
-    run("report", results, "--runs", trained, "--out", tmp_path / "page.html")
-    assert "mine" in (tmp_path / "page.html").read_text(encoding="utf-8")
-    capsys.readouterr()
-    run("report", results, "--out", tmp_path / "tables.tex")
-    assert "rotate" in (tmp_path / "tables.tex").read_text(encoding="utf-8")
 
 
 TASK_FILE = Path(__file__).parents[2] / "examples" / "custom_task.py"

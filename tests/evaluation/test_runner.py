@@ -1,4 +1,4 @@
-"""Whole evaluations: same bytes whoever plays the batches and however large they are, resumed where they stopped."""
+"""Whole evaluations: the same bytes whoever plays the batches, resumed where they stopped."""
 
 import json
 from dataclasses import replace

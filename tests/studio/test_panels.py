@@ -1,4 +1,4 @@
-"""The studio in a real browser: episodes played and explained, clicks, scenes of one's own, failures again."""
+"""The studio in a real browser: episodes played and explained, clicks, own scenes, failures played again."""
 
 import math
 from collections.abc import Callable
