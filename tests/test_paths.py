@@ -38,47 +38,35 @@ def detector(**settings: Any) -> Any:
     return DetectorTrainingConfig(**{"data": "demos", "out": "run", **settings})
 
 
+HERE = "~/here"
+
+
 @pytest.mark.parametrize("kind", [str, Path])
 @pytest.mark.parametrize(
-    ("make", "name"),
+    ("make", "given"),
     [
-        (lambda **given: EvaluationConfig(("oracle",), **given), "out"),
-        (GenerateConfig, "out"),
-        (lambda **given: ImportConfig(source=Path("a"), **given), "out"),
-        (lambda **given: ImportConfig(out=Path("a"), **given), "source"),
-        (lambda **given: LerobotConfig(data=Path("a"), **given), "out"),
-        (lambda **given: LerobotConfig(out=Path("a"), **given), "data"),
-        (lambda **given: SubsetConfig(source=Path("a"), **given), "out"),
-        (lambda **given: MergeConfig(sources=(Path("a"),), **given), "out"),
-        (training, "out"),
-        (training, "data"),
-        (training, "object_cache"),
-        (detector, "init_from"),
+        (EvaluationConfig, {"policies": "oracle", "tasks": "rotate", "levels": "L1", "out": HERE}),
+        (GenerateConfig, {"out": HERE, "tasks": "rotate"}),
+        (ImportConfig, {"source": HERE, "out": HERE, "tasks": "rotate"}),
+        (LerobotConfig, {"data": HERE, "out": HERE, "tasks": "rotate"}),
+        (SubsetConfig, {"source": HERE, "out": HERE, "tasks": "rotate"}),
+        (MergeConfig, {"sources": (Path("a"),), "out": HERE, "tasks": "rotate"}),
+        (training, {"data": HERE, "out": HERE, "object_cache": HERE}),
+        (detector, {"init_from": HERE}),
     ],
 )
-def test_settings_with_a_path_take_text_and_home(
-    home: Path, make: Callable[..., object], name: str, kind: Callable
+def test_settings_take_text_paths_and_single_names(
+    home: Path, make: Callable, given: dict, kind: Callable
 ) -> None:
-    assert getattr(make(**{name: kind("~/here")}), name) == home / "here"
-    assert getattr(make(**{name: kind("here")}), name) == Path("here")
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (lambda **given: EvaluationConfig(**{"policies": ("oracle",), **given}), "policies"),
-        (lambda **given: EvaluationConfig(("oracle",), **given), "tasks"),
-        (lambda **given: EvaluationConfig(("oracle",), **given), "levels"),
-        (lambda **given: GenerateConfig(Path("a"), **given), "tasks"),
-        (lambda **given: ImportConfig(Path("a"), Path("b"), **given), "tasks"),
-        (lambda **given: LerobotConfig(Path("a"), Path("b"), **given), "tasks"),
-        (lambda **given: SubsetConfig(Path("a"), Path("b"), **given), "tasks"),
-        (lambda **given: MergeConfig((Path("a"),), Path("b"), **given), "tasks"),
-    ],
-)
-def test_settings_with_a_list_take_a_single_name_and_any_list(make: Callable[..., object], name: str) -> None:
-    assert getattr(make(**{name: "rotate"}), name) == ("rotate",)
-    assert getattr(make(**{name: ["rotate", "twist"]}), name) == ("rotate", "twist")
+    paths = {name for name, value in given.items() if value == HERE}
+    lists = {name for name, value in given.items() if isinstance(value, str)} - paths
+    made = make(**{**given, **dict.fromkeys(paths, kind(HERE))})
+    assert {getattr(made, name) for name in paths} == {home / "here"}
+    assert all(getattr(made, name) == (given[name],) for name in lists)
+    several = {name: ["rotate", "twist"] for name in lists}
+    made = make(**{**given, **dict.fromkeys(paths, kind("here")), **several})
+    assert {getattr(made, name) for name in paths} == {Path("here")}
+    assert all(getattr(made, name) == ("rotate", "twist") for name in lists)
 
 
 def test_a_policy_is_loaded_from_text_path_and_home(home: Path) -> None:

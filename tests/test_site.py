@@ -86,11 +86,7 @@ def test_public_names_are_those_of_every_package_and_the_errors() -> None:
     assert {"openvima.data.published", "openvima.evaluation.statistics"} <= names.keys()
     assert "ConfigError" in names["openvima.errors"] and "Iterable" not in names["openvima.errors"]
     assert sum(map(len, names.values())) > 250
-
-
-def test_modules_that_pages_import_are_in_the_reference() -> None:
-    names = public_names()
-    assert {"openvima.wrappers", "openvima.perception.objects"} <= names.keys()
+    assert "openvima.wrappers" in names  # a module that pages import
     assert "ObjectExtractor" in names["openvima.perception.objects"]
 
 

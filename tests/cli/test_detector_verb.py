@@ -42,15 +42,8 @@ def test_evaluate_and_show_accept_a_training_run(data, tiny, tmp_path, monkeypat
     monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
     run = tmp_path / "run"
     words = ["--data", str(data), "--out", str(run), "--schedule.steps", "1", "--loader.batch-size", "2"]
-    more = [
-        "--loader.validation-fraction",
-        "0.4",
-        "--loader.validation-frames",
-        "2",
-        "--runtime.device",
-        "cpu",
-    ]
-    assert main(["detector", "train", *words, *more]) == 0
+    more = "--loader.validation-fraction 0.4 --loader.validation-frames 2 --runtime.device"
+    assert main(["detector", "train", *words, *more.split(), "cpu"]) == 0
     assert capsys.readouterr().out == f"{run}\n"
     assert load_network(run).config == tiny
     words = [str(run), "--data", str(data), "--frames", "4", "--held-out", "0.4", "--json"]

@@ -1,4 +1,4 @@
-"""Damaged data sets and hostile names: each is found, and reading gives the same content or one clear error."""
+"""Damaged data sets and hostile names: each is found, and reading gives the same content or one error."""
 
 import hashlib
 import os

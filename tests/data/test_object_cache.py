@@ -6,7 +6,6 @@ from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from openvima.data import Dataset, GenerateConfig, generate
@@ -109,18 +108,6 @@ def test_a_damaged_row_is_named_where_others_are_read(copy: Path, part: str) -> 
     assert_equal(damaged[0], cache[0])
     with pytest.raises(DatasetError, match=r"00000\.arrow .* row 1 of 2 is wrong.*`openvima data"):
         damaged[1]
-
-
-def test_any_tool_that_reads_arrow_reads_a_file(demos: Path) -> None:
-    cache = open_object_cache(Dataset(demos, tasks=["rotate"]))
-    table = pa.ipc.open_file(cache.folder / "rotate-train-00000.arrow").read_all()
-    row, episode = table.slice(1, 1).to_pylist()[0], cache[1]
-    assert (row["task"], row["seed"], row["text"]) == ("rotate", episode.seed, episode.prompt.text)
-    assert [each["objects.ids"] for each in row["objects"]] == episode.objects.ids.tolist()
-    boxes = np.array([each["objects.boxes"] for each in row["objects"]]).reshape(-1, 2, 4)
-    assert np.array_equal(boxes, episode.objects.boxes)
-    images = np.array([each["images"] for each in row["images"]]).reshape(-1, 3, 32, 32)
-    assert np.array_equal(images, episode.images)
 
 
 def test_a_prompt_is_split_into_texts_and_images() -> None:

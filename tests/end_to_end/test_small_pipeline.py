@@ -45,29 +45,11 @@ def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, ca
     folder = tmp_path / "my runs"  # a space in all names
     demos, trained, results = folder / "demos", folder / "trained", folder / "results"
     run("generate", "--tasks", TASKS, "--episodes", 3, "--out", demos)
-    train = [
-        "train",
-        "--data",
-        demos,
-        "--preset",
-        tiny,
-        "--out",
-        trained,
-        "--loader.batch-size",
-        4,
-        "--schedule.steps",
-        3,
-    ]
-    train += [
-        "--recipe",
-        "nano",
-        "--pretraining.steps",
-        0,
-        "--schedule.checkpoint-every",
-        2,
-        "--runtime.threads",
-        1,
-    ]
+    options = (
+        "--loader.batch-size 4 --schedule.steps 3 --recipe nano --pretraining.steps 0 --runtime.threads 1"
+    )
+    train = ["train", "--data", demos, "--preset", tiny, "--out", trained, *options.split()]
+    train += ["--schedule.checkpoint-every", 2]
     run(*train)
     assert f"--policy '{trained}' --out" in capsys.readouterr().err
     policies = f"mine={trained},oracle,random"

@@ -58,7 +58,6 @@ def test_all_problems_of_the_settings_are_named_together():
         ({"boxes": "extractor:make"}, "only the ablation detected_boxes"),
         ({"precision": "float16"}, "allowed are float64, float32, bfloat16"),
         ({"engine": "threads"}, "allowed are processes and ray"),
-        ({"address": "10.0.0.1:6379"}, "only 'ray' takes one"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings, message):

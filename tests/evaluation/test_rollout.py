@@ -11,7 +11,6 @@ from openvima.evaluation.rollout import (
     WRONG_PICKED,
     play,
 )
-from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.scene import RenderedPrompt
 
 
@@ -130,33 +129,12 @@ def test_an_oracle_without_an_action_fails_the_episode():
     assert (outcome.kind, outcome.reason) == (NO_ORACLE_ACTION, "object 5 cannot be seen")
 
 
-def test_policies_get_prompts_and_observations():
-    class Policy:
-        def reset(self, prompts):
-            self.texts = [prompt.text for prompt in prompts]
-
-        def act(self, observations):
-            self.seen = observations
-            return ["go"] * len(observations)
-
-    policy = Policy()
-    play([Env({"success": True})], [3], PromptedRolloutPolicy(policy))
-    assert policy.texts == ["Wait."]
-    assert policy.seen == [{"seed": 3, "step": 0}]
-
-
-def test_whoever_watches_sees_every_step():
-    env, seen = Env({}, {}, {"success": True}), []
-    play([env], [0], RolloutPolicy(), after_step=lambda env: seen.append(env.steps))
-    assert seen == [1, 2, 3]
-
-
-def test_whoever_watches_sees_no_action_that_was_refused():
+def test_whoever_watches_sees_every_step_but_no_action_that_was_refused():
     class BadAtLast(RolloutPolicy):
         def decide(self, observations):
             super().decide(observations)
-            return ["go" if len(self.asked) == 1 else "bad"]
+            return ["go" if len(self.asked) < 3 else "bad"]
 
-    env, seen = Env({}, {}), []
+    env, seen = Env({}, {}, {}), []
     (outcome,) = play([env], [0], BadAtLast(), after_step=lambda env: seen.append(env.steps))
-    assert (outcome.kind, outcome.steps, seen) == (BAD_ACTION, 1, [1])
+    assert (outcome.kind, outcome.steps, seen) == (BAD_ACTION, 2, [1, 2])

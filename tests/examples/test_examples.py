@@ -109,17 +109,7 @@ def test_a_task_file_is_all_that_demonstrations_and_scores_need(tmp_path: Path) 
 
     names = [entry["name"] for entry in json.loads(openvima("tasks", "--json"))]
     assert "put_between" in names
-    openvima(
-        "generate",
-        "--tasks",
-        "put_between",
-        "--episodes",
-        "6",
-        "--workers",
-        "2",
-        "--out",
-        str(tmp_path / "d"),
-    )
+    openvima("generate", "--tasks=put_between", "--episodes=6", "--workers=2", f"--out={tmp_path / 'd'}")
     assert len(Dataset(tmp_path / "d")) == 6
     scores = openvima(
         *("evaluate", "--policy", "oracle", "--tasks", "put_between", "--levels", "L1,L2,L3"),
