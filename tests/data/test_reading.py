@@ -91,15 +91,6 @@ def test_the_content_hash_notices_any_change(made_up: MadeUp) -> None:
     assert len({demo.content_hash(), *(other.content_hash() for other in changed)}) == 1 + len(changed)
 
 
-def test_no_prefix_of_a_shard_reads_as_whole(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
-    whole = write(tmp_path / "a.arrow", info, [made_up(1), made_up(2)]).path.read_bytes()
-    part = tmp_path / "part.arrow"
-    for length in (0, 5, 8, len(whole) // 2, len(whole) - 100, len(whole) - 6, len(whole) - 1):
-        part.write_bytes(whole[:length])
-        with pytest.raises(DatasetError, match=r"part\.arrow.*truncated"):
-            Shard(part)
-
-
 def test_a_foreign_or_missing_file_is_named(tmp_path: Path) -> None:
     table = pa.table({"a": [1]})
     with pa.OSFile(str(tmp_path / "f.arrow"), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:

@@ -12,7 +12,6 @@ from openvima.env import TabletopEnv, save_episode
 from openvima.errors import ConfigError, OracleError, PolicyError, PromptError, UnknownPolicyError
 from openvima.evaluation import EvaluationConfig, Results, play
 from openvima.evaluation.ablations import ABLATIONS, EXAMPLE_PROMPTS, IN_CONTEXT, ORACLE_DEMONSTRATION, ablate
-from openvima.evaluation.config import cells
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, in_context_prompt
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
@@ -85,11 +84,6 @@ def test_all_leaves_out_prompts_with_an_example() -> None:
     assert not {*EXAMPLE_PROMPTS} & {
         *EvaluationConfig(("untrained",), ablations=("all",)).ablations_of(source)
     }
-
-
-def test_by_default_the_tasks_are_those_with_an_edited_prompt() -> None:
-    config = EvaluationConfig(("untrained",), ablations=(IN_CONTEXT,))
-    assert {task for task, _ in cells(config)} == {*IN_CONTEXT_TASKS}
 
 
 def test_the_command_plays_the_held_out_tasks_with_either_prompt(tmp_path) -> None:

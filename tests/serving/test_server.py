@@ -100,18 +100,6 @@ def test_single_observations_are_answered_with_the_bare_action(connection: Clien
     assert told(ask(connection, first)) == (2, 3, 1)
 
 
-def test_two_clients_at_once_do_not_mix(url: str) -> None:
-    with RemotePolicy(url) as one, RemotePolicy(url) as two:
-        one.reset([made_up_prompt(1), made_up_prompt(2)])
-        two.reset([made_up_prompt(9)])
-        for step in (1, 2, 3):
-            assert [told(a) for a in two.act([made_up_observation(8)])] == [(9, 8, step)]
-            seen = [made_up_observation(3), made_up_observation(4)]
-            assert [told(a) for a in one.act(seen)] == [(1, 3, step), (2, 4, step)]
-        two.reset([made_up_prompt(7)])
-        assert [told(a) for a in one.act(seen)] == [(1, 3, 4), (2, 4, 4)]
-
-
 @pytest.mark.parametrize(
     ("request_", "refusal"),
     [

@@ -49,12 +49,6 @@ def test_videos_suit_browsers(tmp_path):
     assert content.index(b"moov") < content.index(b"mdat"), "the index must come first"
 
 
-def test_equal_frames_give_equal_bytes(tmp_path):
-    frames = [plain((i, 2 * i, 255 - i)) for i in range(40)]
-    first, second = (write_video(tmp_path / name, frames).read_bytes() for name in ("a.mp4", "b.mp4"))
-    assert first == second
-
-
 def test_a_frame_can_be_repeated(tmp_path):
     with VideoWriter(tmp_path / "still.mp4", 64, 48) as video:
         video.write(plain((1, 2, 3)), repeat=7)

@@ -48,19 +48,6 @@ def film(export: Path, key: str) -> np.ndarray:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
-def test_the_files_have_the_names_of_the_format(export: Path) -> None:
-    assert set(digests(export)) == {
-        "meta/info.json",
-        "meta/stats.json",
-        "meta/tasks.parquet",
-        "meta/episodes/chunk-000/file-000.parquet",
-        "meta/openvima.json",
-        "meta/openvima.parquet",
-        "data/chunk-000/file-000.parquet",
-        *(f"videos/{key}/chunk-000/file-000.mp4" for key in VIDEO_KEYS),
-    }
-
-
 def test_info_says_what_there_is(export: Path) -> None:
     info = json.loads((export / "meta/info.json").read_text())
     features = info.pop("features")
