@@ -85,6 +85,21 @@ def read_all(folder: Path) -> list[str] | None:
         return None
 
 
+def flip_bit(path: Path, place: int | None = None) -> None:
+    """Damage a file at a place, or in the middle."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 if place is None else place] ^= 1
+    path.write_bytes(content)
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    """All frames of a video, shape (H, W, 3) each."""
+    import av
+
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
 TASKS = ("rotate", "sweep_without_exceeding")
 
 

@@ -17,7 +17,7 @@ from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.errors import DatasetError, OpenVimaError
-from small_data_sets import contents, edit_manifest, read_all, with_plain_images, write_folder
+from small_data_sets import contents, edit_manifest, flip_bit, read_all, with_plain_images, write_folder
 
 MadeUp = Callable[..., Demonstration]
 NO_REPLAY = VerifyConfig(replay=0)
@@ -61,11 +61,7 @@ def test_a_file_that_is_missing_is_found(folder: Path, name: str) -> None:
 
 
 def test_a_damaged_record_is_named_and_the_others_are_read(folder: Path, demos: list[Demonstration]) -> None:
-    path = folder / FIRST
-    content = bytearray(path.read_bytes())
-    place = Dataset(folder).index.column("offset")[1].as_py() + 5000
-    content[place] ^= 1
-    path.write_bytes(content)
+    flip_bit(folder / FIRST, Dataset(folder).index.column("offset")[1].as_py() + 5000)
     problem, *others = verify(folder, NO_REPLAY).problems
     assert others == []
     assert problem.file == FIRST

@@ -30,7 +30,7 @@ from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import ConfigError, DatasetError, OracleError, SamplingError, UnknownTaskError
 from openvima.scene import Outcome
 from openvima.tasks.sampling import MAX_SEED
-from small_data_sets import TASKS, config, contents
+from small_data_sets import TASKS, config, contents, flip_bit
 
 
 def test_a_folder_holds_shards_index_and_manifest(whole: Path) -> None:
@@ -234,9 +234,8 @@ def test_extending_copies_what_is_there_and_gives_the_same_bytes(
 def test_a_damaged_record_is_not_copied_into_a_larger_shard(tmp_path: Path) -> None:
     settings = {"tasks": ("rotate",), "shard_size": 4}
     generate(config(tmp_path, episodes=3, **settings))
-    content = bytearray((tmp_path / SHARD).read_bytes())
-    content[Dataset(tmp_path).index.column("offset")[1].as_py() + 5000] ^= 1
-    (tmp_path / SHARD).write_bytes(content)
+    flip_bit(tmp_path / SHARD, Dataset(tmp_path).index.column("offset")[1].as_py() + 5000)
+    content = (tmp_path / SHARD).read_bytes()
     with pytest.raises(DatasetError, match="record 1 "):
         generate(config(tmp_path, episodes=4, **settings))
     assert (tmp_path / SHARD).read_bytes() == content

@@ -13,6 +13,7 @@ from openvima.data.object_cache import CacheFile, ObjectCache, open_object_cache
 from openvima.data.preprocessed import preprocess
 from openvima.errors import DatasetError
 from openvima.perception.preprocessing import KINDS, image_names, split_prompt
+from small_data_sets import flip_bit
 
 TASKS = ("rotate", "rearrange_then_restore")
 
@@ -119,10 +120,7 @@ def test_a_prompt_is_split_into_texts_and_images() -> None:
 
 
 def test_no_cache_is_made_of_damaged_demonstrations(copy: Path) -> None:
-    shard = copy / "rotate-train-00001.arrow"
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    shard.write_bytes(content)
+    flip_bit(copy / "rotate-train-00001.arrow")
     with pytest.raises(DatasetError, match=r"rotate-train-00001\.arrow: record .*\(its checksum is wrong\)"):
         open_object_cache(Dataset(copy))
     with pytest.raises(DatasetError, match="lacks"):

@@ -19,6 +19,7 @@ from openvima.data.manifest import INDEX_SCHEMA, finish_folder
 from openvima.data.records import pixels, planes
 from openvima.data.schema import ARRAYS, COLUMNS, SCHEMA_VERSION
 from openvima.errors import DatasetError
+from small_data_sets import flip_bit
 
 MadeUp = Callable[..., Demonstration]
 
@@ -163,9 +164,7 @@ def test_a_data_set_reads_columns_by_episode_and_notices_damage_in_any(
     assert [dataset.read(number, ["seed"])["seed"] for number in (2, 0, -2)] == [2, 0, 1]
     with pytest.raises(IndexError, match="episode 3 of 3"):
         dataset.read(3, ["seed"])
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
+    flip_bit(path)
     with pytest.raises(DatasetError, match="checksum"):
         Dataset(tmp_path).read(1, ["seed"])
 

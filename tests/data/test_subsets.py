@@ -27,7 +27,7 @@ from openvima.data.subsets import (
     split,
 )
 from openvima.errors import ConfigError, DatasetError
-from small_data_sets import contents
+from small_data_sets import contents, flip_bit
 
 MadeUp = Callable[..., Demonstration]
 WriteFolder = Callable[..., Path]
@@ -237,10 +237,7 @@ def test_equal_seeds_of_another_setup_are_no_duplicates(tmp_path: Path, write_fo
 
 def test_damage_of_a_source_is_noticed_and_nothing_is_left(tmp_path: Path, write_folder: WriteFolder) -> None:
     source = write_folder(tmp_path / "demos", range(3))
-    shard = source / "stack-train-00000.arrow"
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    shard.write_bytes(content)
+    flip_bit(source / "stack-train-00000.arrow")
     with pytest.raises(DatasetError, match=r"demos.stack-train-00000\.arrow"):
         merge(MergeConfig((source,), tmp_path / "out"))
     with pytest.raises(DatasetError, match=r"demos.stack-train-00000\.arrow"):

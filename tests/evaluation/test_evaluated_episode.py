@@ -4,7 +4,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -19,6 +18,7 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from openvima.policies.naming import CHECKPOINTS_FOLDER
 from openvima.video.recorder import SceneRenderer
+from small_data_sets import frames_of
 
 
 @pytest.fixture(scope="module")
@@ -104,14 +104,9 @@ def env():
     return TabletopEnv("rotate", level="L1", domain="eval", realtime=True)
 
 
-def read(path) -> list[np.ndarray]:
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-
-
 def test_a_video_contains_the_prompt_the_start_the_arm_and_the_end(env, tmp_path):
     outcome = record_episode(env, OracleRolloutPolicy(), 0, tmp_path / "video.mp4", title="rotate", enlarge=2)
-    frames = read(tmp_path / "video.mp4")
+    frames = frames_of(tmp_path / "video.mp4")
     assert outcome.success
     assert 3 < len(frames) / 30 < 15
     rows, columns, _ = frames[0].shape

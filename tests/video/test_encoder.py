@@ -11,6 +11,7 @@ from openvima.errors import ShapeError
 from openvima.scene import RenderedPrompt
 from openvima.video.encoder import VideoWriter
 from openvima.video.prompt_strip import draw_prompt_strip, prompt_pieces, thumbnail
+from small_data_sets import frames_of
 
 
 def plain(colour: tuple[int, int, int], height: int = 48, width: int = 64) -> np.ndarray:
@@ -24,15 +25,10 @@ def write_video(path: Path, frames: Sequence[np.ndarray]) -> Path:
     return path
 
 
-def read(path) -> list[np.ndarray]:
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-
-
 def test_frames_come_back_in_order_with_their_colours(tmp_path):
     colours = [(220, 30, 30), (30, 200, 40), (30, 40, 210)]
     path = write_video(tmp_path / "video.mp4", [plain(colour) for colour in colours for _ in range(5)])
-    frames = read(path)
+    frames = frames_of(path)
     assert len(frames) == 15
     for index, colour in enumerate(colours):
         assert np.abs(frames[5 * index + 2].mean(axis=(0, 1)) - colour).max() < 6
@@ -52,7 +48,7 @@ def test_videos_suit_browsers(tmp_path):
 def test_a_frame_can_be_repeated(tmp_path):
     with VideoWriter(tmp_path / "still.mp4", 64, 48) as video:
         video.write(plain((1, 2, 3)), repeat=7)
-    assert len(read(tmp_path / "still.mp4")) == 7
+    assert len(frames_of(tmp_path / "still.mp4")) == 7
 
 
 def test_odd_sizes_are_refused_before_a_file_is_made(tmp_path):

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
@@ -18,6 +17,7 @@ from openvima.scene.explanation import Explanation, ObjectProbability, PlaceProb
 from openvima.video.explanation import ENLARGE, HEIGHT, PICK, PLACE, WIDTH, draw_panel
 from openvima.video.prompt_strip import draw_prompt_strip
 from openvima.video.recorder import EpisodeRecorder, SceneRenderer
+from small_data_sets import frames_of
 
 
 @pytest.fixture
@@ -104,8 +104,7 @@ def test_the_video_of_an_explained_episode_has_the_panel_beside_the_scene(tmp_pa
     start = SceneRenderer(env).draw(env.scene).astype(int)
     with EpisodeRecorder(env, tmp_path / "video.mp4", explain=lambda: explanation) as recorder:
         recorder.record_step(env)
-    with av.open(str(tmp_path / "video.mp4")) as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    frames = frames_of(tmp_path / "video.mp4")
     assert frames[0].shape[1] == 768 + 8 + WIDTH
     bottom = frames[-1][-HEIGHT:].astype(int)
     assert np.abs(bottom[: len(start), :768] - start).mean() < 4
@@ -133,8 +132,7 @@ def test_an_explained_episode_without_a_step_has_a_video_of_its_start(tmp_path: 
     path = tmp_path / "video.mp4"
     outcome = record_episode(env, PromptedRolloutPolicy(Wrong()), 0, path, title="rotate", explain=True)
     assert (outcome.kind, outcome.steps) == (BAD_ACTION, 0)
-    with av.open(str(path)) as container:
-        assert next(container.decode(video=0)).width == 768
+    assert frames_of(path)[0].shape[1] == 768
 
 
 def test_words_stand_below_the_table_with_their_points(env: TabletopEnv) -> None:

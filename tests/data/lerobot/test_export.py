@@ -21,6 +21,7 @@ from openvima.data.records import rollout_oracle
 from openvima.data.verification import find_difference
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import DatasetError
+from small_data_sets import frames_of
 
 VIDEO_KEYS = [
     f"observation.images.{name}"
@@ -44,8 +45,7 @@ def episodes(export: Path) -> list[dict]:
 
 
 def film(export: Path, key: str) -> np.ndarray:
-    with av.open(str(export / f"videos/{key}/chunk-000/file-000.mp4")) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+    return np.stack(frames_of(export / f"videos/{key}/chunk-000/file-000.mp4"))
 
 
 def test_info_says_what_there_is(export: Path) -> None:
@@ -261,8 +261,7 @@ def test_large_exports_are_spread_over_several_files(
     for row in rows:
         path = export / f"videos/{key}/chunk-000/file-{row[f'videos/{key}/file_index']:03d}.mp4"
         start = int(row[f"videos/{key}/from_timestamp"])
-        with av.open(str(path)) as container:
-            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        frames = frames_of(path)
         shown = made_up(row["episode_index"], num_steps=4, num_images=0).rgb["front"]
         assert np.abs(np.moveaxis(frames[start], -1, 0).astype(int) - shown[0]).max() <= 2
 
