@@ -166,6 +166,10 @@ FAULTS: dict[str, tuple[Callable[[], Files], str]] = {
         lambda: with_file("rgb_top/0.jpg", JPEG.replace(b"\0\x80\1\0", b"\xff\xff\xff\xff")),
         r"rgb_top/0\.jpg is",
     ),
+    "gray image": (
+        lambda: with_file("rgb_top/0.jpg", jpeg(FRAME[..., 0])),
+        r"rgb_top/0\.jpg is \(256, 128\), L",
+    ),
     "missing image": (
         lambda: with_file("rgb_front/0.jpg", None),
         "rgb_front has 1 images for 1 actions",
@@ -184,12 +188,18 @@ FAULTS: dict[str, tuple[Callable[[], Files], str]] = {
         lambda: with_actions(pose1_position=np.array([[0.5, 0.6]], np.float32)),
         r"pose1_position is .* within \(0\.25, -0\.5\)",
     ),
+    "actions of unequal number": (
+        lambda: with_actions(pose1_rotation=np.ones((2, 4), np.float32)),
+        r"action\.pkl is .*another form .*longer",
+    ),
     "shape of actions": (
         lambda: with_actions(pose0_rotation=np.ones((1, 3))),
         r"it must be of shape \(T, 4\)",
     ),
     "text as actions": (lambda: with_file("action.pkl", {"pose0_position": "x"}), "'x' where an array"),
+    "steps": (lambda: changed(steps=4), "steps is 4; 1 is needed"),
     "failed": (lambda: changed(success=False), "success is False; True"),
+    "difficulty": (lambda: changed(difficulty="hard"), "difficulty is 'hard'"),
     "seed": (lambda: changed(seed=-1), "a number is -1; a whole one"),
     "seed as text": (lambda: changed(seed="x" * 500), r"a number is 'x{59};"),
     "prompt without image": (lambda: changed(prompt_assets={}), "names images"),
@@ -230,6 +240,12 @@ def test_a_source_that_vanishes_is_no_pile_of_broken_episodes(tmp_path: Path) ->
     shutil.rmtree(tmp_path / "a")
     with pytest.raises(FileNotFoundError):
         list(data.demonstrations())
+
+
+def test_unknown_textures_are_kept(tmp_path: Path) -> None:
+    made = MadeEpisode(objects={5: ("bowl", "velvet"), 6: ("letter A", "wooden")})
+    data = PublishedData(write_zip(tmp_path / "a.zip", {"rotate/000000": made.files(PUBLISHED)}))
+    assert data[0].objects[0].texture == "velvet"
 
 
 @pytest.mark.parametrize("task", ["visual_manipulation", "sweep_without_exceeding", "rearrange"])
