@@ -16,7 +16,6 @@ from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.chat import UNREADABLE, ChatFormat, demo_turns, encode_picture, family_of
 from openvima.data.chat_export import export_chat
 from openvima.data.chat_settings import POINTS
-from openvima.data.records import rollout_oracle
 from openvima.env import EnvConfig
 from openvima.errors import AnswerError, ConfigError, DatasetError
 from openvima.perception.objects import GROUND_TRUTH
@@ -136,15 +135,6 @@ def test_boxes_are_those_of_the_view() -> None:
         assert np.isin(inside, ids).any()
 
 
-def test_a_demonstration_is_a_conversation() -> None:
-    demo = rollout_oracle(make_env("pick_in_order_then_restore"), 0)
-    turns = demo_turns(demo, FORM)
-    assert [turn.role for turn in turns] == ["user", "assistant"] * demo.num_steps
-    assert FORM.read_answer(turns[1].parts[0], "suction").pose0_position == pytest.approx(  # type: ignore[arg-type]
-        demo.actions[0].pose0_position, abs=1.1e-3
-    )
-
-
 def test_families_point_in_their_way() -> None:
     found = {name: family_of(name).points for name in (
         "Qwen/Qwen3-VL-8B-Instruct", "Qwen/Qwen2.5-VL-7B-Instruct", "gemini-3-flash", "gpt-5", "mine",
@@ -213,6 +203,7 @@ def test_what_is_trained_is_what_is_asked(conversed: Path, chats: Path) -> None:
     written = iter(steps)
     for demo in Dataset(conversed):
         turns = demo_turns(demo, EXPORTED)
+        assert [turn.role for turn in turns] == ["user", "assistant"] * demo.num_steps
         for end in range(2, len(turns) + 1, 2):
             example = next(written)
             asked = [json.loads(turn.message) for turn in turns[:end]]
@@ -225,7 +216,9 @@ def test_what_is_trained_is_what_is_asked(conversed: Path, chats: Path) -> None:
                         file = chats / next(images)
                         assert part["type"] == "image_url" and file.is_file()
             assert next(images, None) is None
-            assert EXPORTED.read_answer(example["messages"][-1]["content"][0]["text"], demo.end_effector)
+            answer = EXPORTED.read_answer(example["messages"][-1]["content"][0]["text"], demo.end_effector)
+            action = demo.actions[end // 2 - 1]
+            assert answer.pose0_position == pytest.approx(action.pose0_position, abs=1.1e-3)
     assert next(written, None) is None
     view = np.asarray(Image.open(chats / steps[0]["images"][-1]))
     assert view.shape == (256, 512, 3)
