@@ -43,7 +43,7 @@ def test_help_of_training_shows_what_most_runs_set_and_help_all_the_rest(capsys)
 
 def test_help_of_training_tells_the_defaults_of_the_recipe(capsys) -> None:
     shown = help_of(capsys, "train", "--preset", "vima-nano", "--help")
-    assert re.search(r"--schedule\.steps INT [^-]*\(default:\s*16000\)", shown)
+    assert re.search(r"--schedule\.steps INT [^-]*\(default:\s*12000\)", shown)
 
 
 def test_help_of_evaluation_is_grouped(capsys) -> None:

@@ -90,7 +90,7 @@ _PAPERS_FRAMES: Mapping[str, Any] = {
 _PAPERS: Mapping[str, Any] = {
     **_PAPERS_FRAMES,
     "preset": "vima-nano",
-    "schedule.steps": 16000,
+    "schedule.steps": 12000,
     "pretraining.steps": 1600,
     "pretraining.num_scenes": 5000,
     **_VARIED_PAIRS,
