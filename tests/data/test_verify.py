@@ -24,9 +24,10 @@ from openvima.data import (
     verify,
 )
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import finish_folder
+from openvima.data.manifest import MANIFEST_NAME, finish_folder
 from openvima.data.planning import COMMAND
 from openvima.data.verification import Verification
+from openvima.errors import DatasetError
 from openvima.scene import Action, Outcome
 from small_data_sets import TASKS, contents, finish, with_plain_images, write_folder
 
@@ -87,6 +88,18 @@ def test_what_killed_writers_left_is_noted_and_what_the_manifest_does_not_list_i
     assert ".rotate-train-00000.arrow.17.tmp: a process was killed" in found.notes[0]
     shutil.copy(folder / FIRST, folder / "rotate-train-00009.arrow")
     assert causes(verify(folder, NONE)) == {"rotate-train-00009.arrow": ["the manifest does not list it"]}
+
+
+def test_an_edited_manifest_is_refused(folder: Path) -> None:
+    path = folder / MANIFEST_NAME
+    manifest = json.loads(path.read_text(encoding="utf-8"))
+    manifest["config"]["start_seed"] += 1
+    path.write_text(json.dumps(manifest), encoding="utf-8")
+    assert causes(verify(folder, NONE)) == {
+        MANIFEST_NAME: ["it is damaged or was edited (its checksum is wrong)"]
+    }
+    with pytest.raises(DatasetError, match="was edited"):
+        Dataset(folder)
 
 
 def test_a_content_hash_that_is_not_that_of_the_content_is_found(
