@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from openvima.render.camera import VIEWS
 from openvima.scene import (
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
@@ -205,3 +206,9 @@ def full_repr(value: Any) -> str:
         )
         return f"{type(value).__qualname__}({', '.join(parts)})"
     return repr(value)
+
+
+def noise(seed: int = 0, shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
+    """A picture of each view in which every pixel is drawn."""
+    rng = np.random.default_rng(seed)
+    return {view: rng.integers(0, 256, (3, *shape), dtype=np.uint8) for view in VIEWS}

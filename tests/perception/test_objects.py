@@ -22,15 +22,11 @@ from openvima.perception.objects import (
 )
 from openvima.render.camera import CAMERAS, unproject
 from openvima.scene import ObjectRecord, PromptImage
+from task_cases import noise
 
 VIEWS = ("front", "top")
 ID = 9
 GOLDEN = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model" / "preprocess.npz"
-
-
-def noise(seed: int = 0, shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return {view: rng.integers(0, 256, (3, *shape), dtype=np.uint8) for view in VIEWS}
 
 
 def empty(shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ from openvima.perception.objects import (
     observe_prompt_image,
 )
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
-from task_cases import REPRESENTATIVE_TASKS
+from task_cases import REPRESENTATIVE_TASKS, noise
 
 SHAPE = (128, 256)
 VIEWS = ("front", "top")
@@ -44,11 +44,6 @@ def perfect(segm: dict[str, np.ndarray], first: int, *, masks: bool = True) -> F
         return found if masks else replace(found, masks=None)
 
     return Fixed(seen("front"), seen("top"))
-
-
-def noise(seed: int = 0) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return {view: rng.integers(0, 256, (3, *SHAPE), dtype=np.uint8) for view in VIEWS}
 
 
 def observation(rgb: dict[str, np.ndarray] | None = None) -> dict:

@@ -13,6 +13,7 @@ from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.processor import Processor
 from openvima.scene import RenderedPrompt
+from task_cases import noise
 
 VIEWS = ("front", "top")
 FRAMES = {"layout": "frames", "image_size": (64, 128), "tokens_per_image": 16}
@@ -26,11 +27,6 @@ class Scripted:
 
     def detect(self, rgb: np.ndarray, view: str) -> Detections:
         return Detections(np.array(self.steps.pop(0), np.int64).reshape(-1, 4))
-
-
-def noise(seed: int = 0, shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return {view: rng.integers(0, 256, (3, *shape), dtype=np.uint8) for view in VIEWS}
 
 
 def seen(**parts: object) -> dict:
