@@ -9,7 +9,7 @@ from PIL import Image
 
 from openvima.data import GenerateConfig, generate
 from openvima.tasks import registry
-from performance_table import PAGE, RowError
+from performance_table import PAGE
 from performance_table import page as performance_page
 from user_shapes import restored_assets
 
@@ -122,17 +122,3 @@ def test_a_newer_result_replaces_the_row(tmp_path: Path) -> None:
         "| other | [9 to 27 ms](../results/2026-01-01_a.md) |",
         "| decision | [1.5×](../results/2026-01-02_b.md) |",
     ]
-
-
-@pytest.mark.parametrize(
-    ("entries", "message"),
-    [
-        ([ENTRY, ENTRY], "'decision' is in 2026-01-01_a.json of the same day"),
-        ([ENTRY | {"speed": 1}], "does not have the fields what, value, unit, command, commit, against"),
-        ([ENTRY | {"command": "a | b"}], "has a bar"),
-    ],
-)
-def test_an_entry_that_does_not_fit_is_named(tmp_path: Path, entries: list[dict], message: str) -> None:
-    record(tmp_path, "2026-01-01_a.json", *entries)
-    with pytest.raises(RowError, match=message):
-        performance_page(tmp_path)

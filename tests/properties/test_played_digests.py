@@ -1,8 +1,7 @@
 """What the oracle does in the first episodes of every published task and level, by version of MuJoCo.
 
 Bytes of played episodes may change with MuJoCo, those of sampled ones (`test_digests.py`) may not. Running
-this file as a script records the installed version, `benchmarks/lowest_versions.py --mujoco` others. Do so
-after a meant change, and note it in CHANGELOG.md.
+this file as a script records the installed version. Do so after a meant change, and note it in CHANGELOG.md.
 """
 
 import hashlib
