@@ -132,7 +132,7 @@ def policy_at(url):
             action = msgpack.unpackb(answer, object_hook=_unpack)
             return {part: np.array(value, np.float32) for part, value in action.items()}
 
-        yield {key: value for key, value in about.items() if key != "limits"}, ask
+        yield about, ask
 
 
 def play_cell(args, level, task):

@@ -59,8 +59,8 @@ def test_the_token_comes_from_the_variable_or_is_given(monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("metadata", "message"),
     [
-        ({"protocol": "openvima-policy/2"}, f"speaks 'openvima-policy/2', this client '{PROTOCOL}'"),
-        ({"hello": "other server"}, "speaks None, this client"),
+        ({"protocol": "openvima-policy/2"}, f"protocol is 'openvima-policy/2'; allowed: {PROTOCOL}"),
+        ({"hello": "other server"}, "protocol is None"),
         ([1], "is a list; it must be a map"),
         ("not now", "refuses: not now"),
         ({"protocol": PROTOCOL, "mean": np.zeros(3)}, "other than plain, finite values"),
@@ -69,7 +69,6 @@ def test_the_token_comes_from_the_variable_or_is_given(monkeypatch: pytest.Monke
             {"protocol": PROTOCOL, "policy": {"scores": [1.0, float("-inf")]}},
             "other than plain, finite values",
         ),
-        ({"protocol": PROTOCOL, "notes": "x" * 2**16}, "metadata has 65,[0-9]+ bytes; 65,536 are allowed"),
     ],
 )
 def test_a_server_of_another_protocol_is_told_apart(metadata: object, message: str) -> None:
@@ -83,11 +82,10 @@ def test_a_server_of_another_protocol_is_told_apart(metadata: object, message: s
         ("no, thanks", "refuses: no, thanks"),
         (b"\xc1", f"does not keep to {PROTOCOL}"),
         ([], "is a list; it must be a map"),
-        ({"type": "reset"}, "has type 'reset'"),
+        ({"type": "reset"}, "type of the answer is 'reset'; allowed: act"),
         ({"type": "act"}, "lacks 'actions'"),
         ({"type": "act", "actions": []}, "must be 1"),
         ({"type": "act", "actions": [3]}, "action 0 is 3; it must be a map"),
-        ({"type": "act", "actions": [{"pose0_position": [0.5, 0.5]}]}, "'pose0_position' is a list"),
         ({"type": "act", "actions": [None], "near_ties": 3}, "near_ties"),
         ({"type": "act", "actions": [None], "extra": 3}, "'extra', which nobody knows"),
         (b"\0" * (17 * 2**20), "has ended the connection"),
@@ -142,14 +140,14 @@ def test_a_server_that_falls_silent_is_given_up() -> None:
     ):
         policy.reset([made_up_prompt(1)])
         shorten(policy, 0.1)
-        with pytest.raises(ServerError, match=r"has not answered within 0\.1 s"):
+        with pytest.raises(ServerError, match="has not answered in time"):
             policy.act([made_up_observation(1)])
 
 
 def test_a_server_that_is_silent_before_the_handshake_is_named_with_the_time() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         url = f"ws://127.0.0.1:{listening.getsockname()[1]}"
-        with pytest.raises(ServerError, match=rf"{url}: no handshake within 0\.2 s"):
+        with pytest.raises(ServerError, match=rf"{url} \(timed out"):
             RemotePolicy(url, timeout_s=0.2)
 
 
@@ -179,16 +177,19 @@ def test_what_a_hostile_server_says_is_cut_and_cleaned() -> None:
         assert_harmless(error.value)
 
 
-def test_batches_above_the_limits_are_refused_before_they_are_sent() -> None:
-    limits = {"max_episodes": 2, "max_message_bytes": 1024}
-    with serve_in_thread(Telltale(), **limits) as url, RemotePolicy(url) as policy:
-        with pytest.raises(PolicyError, match=r"at most 2 episodes at once, got 3.*--max-episodes"):
+def test_batches_above_the_limits_are_refused() -> None:
+    with serve_in_thread(Telltale(), max_episodes=2) as url, RemotePolicy(url) as policy:
+        with pytest.raises(ServerError, match=r"3 prompts; at most 2 are allowed.*--max-episodes"):
             policy.reset([made_up_prompt(1)] * 3)
-        with pytest.raises(PolicyError, match=r"prompts take [\d,]+ bytes.*--max-message-mb"):
-            policy.reset([made_up_prompt(1)] * 2)
         policy.reset([made_up_prompt(1)])
         with pytest.raises(PolicyError, match="got 2 observations for 1 prompts"):
             policy.act([made_up_observation(1)] * 2)
+    with (
+        serve_in_thread(Telltale(), max_message_bytes=1024) as url,
+        RemotePolicy(url) as policy,
+        pytest.raises(ServerError, match="1009"),
+    ):
+        policy.reset([made_up_prompt(1)] * 9)
 
 
 def test_near_ties_are_passed_on_where_the_server_tells_them() -> None:

@@ -112,7 +112,7 @@ def test_a_slow_sender_within_the_time_is_served(url: str) -> None:
         slow.recv()
         for start in range(0, len(frame), 50):
             slow.socket.sendall(frame[start : start + 50])
-        assert unpack(slow.recv())["episodes"] == 2  # type: ignore[arg-type]
+        assert unpack(slow.recv()) == {"type": "reset"}  # type: ignore[arg-type]
 
 
 def test_a_client_that_goes_while_the_policy_thinks_is_forgotten() -> None:
@@ -186,7 +186,7 @@ def test_a_policy_that_reads_language_is_served_descriptions() -> None:
     session = Session(policy, 64, "text")
     request = session.read(pack({"type": "reset", "prompts": [encode_prompt(made_up_prompt(3))]}))
     assert not isinstance(request, str)
-    assert session.reply(request) == pack({"type": "reset", "episodes": 1})
+    assert session.reply(request) == pack({"type": "reset"})
     (prompt,) = policy.prompts
     assert (prompt.text, prompt.images) == ("Look at the red swirl bowl, number 3.", {})
     long = prompt_with(objects=[{"object_id": 2, "object": "x" * 201, "texture": "red"}])
@@ -227,8 +227,6 @@ def test_a_policy_states_its_own_limits() -> None:
     class Terse(ForMany):
         prompt_limits = PromptLimits(chars=30)
 
-    with serve_in_thread(Terse()) as url, RemotePolicy(url) as policy:
-        assert policy.metadata["limits"]["prompt_chars"] == 30
     sent = {
         "type": "reset",
         "prompts": [encode_prompt(RenderedPrompt("Put it back where it was before.", {}))],
@@ -270,7 +268,6 @@ def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCap
     answers += [
         refusal({"type": hostile}),
         refusal({"type": "reset", hostile: 1}),
-        refusal({"type": "reset", "protocol": hostile, "prompts": []}),
         refusal({"type": "reset", "prompts": [prompt_with(kind=hostile)]}),
     ]
     for answer in answers:

@@ -101,7 +101,6 @@ def test_an_evaluation_through_a_server_has_the_outcomes_of_one_without(
     assert remote.rows == local.rows
     assert remote.policies["tiny"]["kind"] == "remote"
     assert remote.policies["tiny"]["metadata"]["policy"] == ABOUT["policy"]
-    assert "limits" not in remote.policies["tiny"]["metadata"]
     assert url not in there.read_text()
 
 

@@ -9,7 +9,6 @@ import os
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -231,7 +230,7 @@ class ChatClient:
             except (openai.BadRequestError, openai.UnprocessableEntityError) as error:
                 optional = [name for name in _OPTIONAL if name in settings and name not in left_out]
                 if not optional:
-                    raise self._refusal(error, messages) from None
+                    raise self._refusal(error) from None
                 left_out = [*left_out, optional[0]]
                 continue
             except openai.APIStatusError as error:
@@ -258,20 +257,18 @@ class ChatClient:
         name, text = echo(str(_found(said, "model") or self.model)), text[-MOST_CHARACTERS:]
         return Answer(request, text, name, tokens_in, tokens_out, round(seconds, 3), left_out)
 
-    def _refusal(self, error: Any, messages: bytes = b"") -> ServerError:
+    def _refusal(self, error: Any) -> ServerError:
         """Compose the error for a request that the server refused."""
         status = error.status_code
-        key = f"the key is that of the environment variable {KEY_VARIABLE}"
-        hint = {
-            401: key,
-            403: key,
-            404: f"is {echo(self.model)!r} a model of it, and --base-url complete, such as http://HOST:PORT/v1?",
-            429: "it is busy, or what was paid for is used up; the same command goes on where this ended",
-        }.get(status, "")
-        if messages or status == 413:
-            images = messages.count(b'"image_url": ') or "the"
+        if status in (401, 403):
+            hint = f"the key is that of the environment variable {KEY_VARIABLE}"
+        elif status == 404:
+            hint = f"is {echo(self.model)!r} a model of it, and --base-url complete, such as http://HOST:PORT/v1?"
+        elif status in (400, 413, 422):
             enlarge = self.config.options.enlarge
-            hint = f"can the model see, and take {images} images, the view {enlarge} times enlarged?"
+            hint = f"can the model see, and take as many images, the view {enlarge} times enlarged?"
+        else:
+            hint = "the same command goes on where this ended"
         said = self._shown(error)
         return ServerError(f"{self.config.server} refuses the request (HTTP {status}: {said}); {hint}.")
 
@@ -334,7 +331,7 @@ class VlmPolicy(Policy):
         self._chats = [_Chat(prompt, []) for prompt in prompts]
 
     def act(self, observations: Sequence[Mapping | None]) -> list[Any]:
-        """Ask for the next action of every episode, of several at a time.
+        """Ask for the next action of every episode.
 
         Raises:
             PolicyError: `reset` was not called, or with another number of prompts.
@@ -342,10 +339,7 @@ class VlmPolicy(Policy):
         """
         if len(observations) != len(self._chats):
             raise PolicyError(f"got {len(observations)} observations for {len(self._chats)} prompts.")
-        if len(observations) == 1:  # in the thread of an evaluation
-            return [self._act(self._chats[0], observations[0])]
-        with ThreadPoolExecutor(self.client.config.options.concurrency) as pool:
-            return list(pool.map(self._act, self._chats, observations))
+        return [self._act(*both) for both in zip(self._chats, observations, strict=True)]
 
     def explain(self) -> list[Explanation | None]:
         """Return the last action and words of each episode."""

@@ -4,43 +4,35 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from contextlib import contextmanager, suppress
+from typing import Any
 from urllib.parse import urlsplit
 
 from openvima.errors import MessageError, PolicyError, PolicyRaisedError, ServerError, echo
 from openvima.policies.base import Policy
 from openvima.scene import RenderedPrompt
-from openvima.scene.action import PRIMITIVES
+from openvima.scene.action import CONTROLS, PRIMITIVES
 from openvima.serving.protocol import (
     DEFAULT_MODALITIES,
     POLICY_FAILED,
     PROTOCOL,
     TOKEN_VARIABLE,
     check_address,
-    check_control,
     check_form,
     check_modalities,
-    check_protocol,
-    check_token,
     decode_action,
     encode_observation,
     encode_prompt,
     is_loopback,
     pack,
     require_extra,
-    type_of,
     unpack,
 )
-
-if TYPE_CHECKING:
-    from websockets.sync.connection import Connection as Socket
 
 CONNECT_S = 10.0
 CLOSE_S = 2.0
 TIMEOUT_S = 300.0
-MAX_REPLY_BYTES = 16 * 2**20  # actions are small
-MAX_METADATA_BYTES = 2**16  # all of it gets into results
+MAX_REPLY_BYTES = 16 * 2**20  # actions are small, and metadata gets into results
 
 
 class RemotePolicy(Policy):
@@ -64,19 +56,18 @@ class RemotePolicy(Policy):
     """
 
     def __init__(self, url: str, *, token: str | None = None, timeout_s: float = TIMEOUT_S) -> None:
-        self._open = ExitStack()  # websockets gives connections as context managers
         require_extra()
         check_address(url)
         self.url, self._timeout_s = url, timeout_s
-        self._token = token or os.environ.get(TOKEN_VARIABLE) or None
-        check_token(self._token)
+        self._token = token or os.environ.get(TOKEN_VARIABLE)
         self._num_episodes = 0
         self.near_ties: list[bool] = []  # see `NetworkPolicy.near_ties`; empty where the server does not say
         self.metadata = self._connect()
         with self._closed_by_errors():
             asked = self.metadata.get("modalities", DEFAULT_MODALITIES)
             self.modalities = check_modalities(asked, "the policy")
-            self.control = check_control(self.metadata.get("control", PRIMITIVES), "the policy")
+            control = self.metadata.get("control", PRIMITIVES)
+            self.control = check_form(control, CONTROLS, "control of the policy")
 
     def __enter__(self) -> "RemotePolicy":
         return self
@@ -88,33 +79,21 @@ class RemotePolicy(Policy):
         with suppress(Exception):  # at the end of the program parts of it are gone
             self.close()
 
-    def record(self) -> dict[str, Any]:
-        """What the policy is, for results: all that the server says about it, apart from its limits."""
-        return _without_limits(self.metadata)
-
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
         """Begin a batch of episodes.
 
         Raises:
-            PolicyError: The batch is larger than the server allows.
             ServerError: The server is lost, or refuses; or there is another policy at its address now.
         """
         from websockets.protocol import State
 
         self._num_episodes, self.near_ties = 0, []
         if self._socket.state is not State.OPEN:
-            before, self.metadata = self.record(), self._connect()
-            if self.record() != before:
+            before, self.metadata = self.metadata, self._connect()
+            if self.metadata != before:
                 self.close()
                 raise ServerError(f"{self.url} serves another policy than before; begin a new evaluation.")
-        most = self._limit("episodes")
-        if len(prompts) > most:
-            raise PolicyError(
-                f"{self.url} takes at most {most} episodes at once, got {len(prompts)}; lower --batch, or "
-                "serve with a higher --max-episodes."
-            )
-        sent = [encode_prompt(prompt) for prompt in prompts]
-        self._ask({"type": "reset", "protocol": PROTOCOL, "prompts": sent})
+        self._ask({"type": "reset", "prompts": [encode_prompt(prompt) for prompt in prompts]})
         self._num_episodes = len(prompts)
 
     def act(self, observations: Sequence[Mapping | None]) -> list[Any]:
@@ -147,25 +126,42 @@ class RemotePolicy(Policy):
 
     def close(self) -> None:
         """Say goodbye to the server."""
-        self._open.close()
+        self._socket.close()
 
     def _connect(self) -> dict[str, Any]:
         """Open a connection; return the first frame, which says what is served and in which protocol."""
-        wait_s = min(CONNECT_S, self._timeout_s)
-        self._socket = self._open.enter_context(_opened(self.url, self._token, wait_s))
-        with self._closed_by_errors(f"sent no first frame within {wait_s:g} s after the handshake"):
+        from websockets.exceptions import InvalidStatus, WebSocketException
+        from websockets.sync.client import connect
+
+        url, wait_s = self.url, min(CONNECT_S, self._timeout_s)
+        try:
+            self._socket = connect(
+                url,
+                compression=None,
+                max_size=MAX_REPLY_BYTES,
+                open_timeout=wait_s,
+                close_timeout=CLOSE_S,
+                ping_interval=None,  # a server may compute for longer than a ping may take
+                proxy=None if is_loopback(urlsplit(url).hostname or "") else True,
+                additional_headers={"Authorization": f"Bearer {self._token}"} if self._token else None,
+            )
+        except InvalidStatus as error:
+            said = (error.response.body or b"").decode(errors="replace").strip()
+            raise ServerError(
+                f"{url} refuses the connection (HTTP {error.response.status_code}: {echo(said)}); a token "
+                f"can be given in the environment variable {TOKEN_VARIABLE}."
+            ) from None
+        except (OSError, WebSocketException) as error:
+            reason = echo(str(error)) or type(error).__name__
+            raise ServerError(
+                f"no policy server answers at {url} ({reason}); start one with: openvima serve RUN"
+            ) from error
+        with self._closed_by_errors():
             data = self._socket.recv(timeout=wait_s)
             if isinstance(data, str):
-                raise ServerError(f"{self.url} refuses: {echo(data)}")
-            if len(data) > MAX_METADATA_BYTES:
-                raise MessageError(
-                    f"its metadata has {len(data):,} bytes; {MAX_METADATA_BYTES:,} are allowed"
-                )
+                raise ServerError(f"{url} refuses: {echo(data)}")
             metadata = check_form(unpack(data), dict, "the first frame")
-            try:
-                check_protocol(metadata.get("protocol"), theirs=self.url, ours="this client")
-            except MessageError as error:
-                raise ServerError(str(error)) from None
+            check_form(metadata.get("protocol"), (PROTOCOL,), "the protocol")
             try:
                 json.dumps(metadata, allow_nan=False)  # it gets into results.json
             except (TypeError, ValueError, RecursionError) as error:
@@ -177,25 +173,17 @@ class RemotePolicy(Policy):
 
         Raises:
             ServerError: The server is lost, refuses, or answers what it must not.
-            PolicyError: The request is too large, the policy refuses, or it raised.
+            PolicyError: The policy refuses, or it raised.
         """
-        request, most = pack(message), self._limit("message_bytes")
-        if len(request) > most:
-            raise PolicyError(
-                f"the {list(message)[-1]} take {len(request):,} bytes, {self.url} allows {most:,}; lower "
-                "--batch, or serve with a higher --max-message-mb."
-            )
-        with self._closed_by_errors(f"has not answered within {self._timeout_s:g} s"):
+        request = pack(message)
+        with self._closed_by_errors():
             self._socket.send(request)
             data = self._socket.recv(timeout=self._timeout_s)
         if isinstance(data, str):  # a refusal; the connection stays as it is
             raise self._refusal(data)
         with self._closed_by_errors():
             answer = check_form(unpack(data), dict, "the answer")
-            if type_of(answer) != message["type"]:
-                raise MessageError(
-                    f"the answer to {message['type']!r} has type {str(type_of(answer))[:40]!r}"
-                )
+            check_form(answer.get("type"), (message["type"],), "the type of the answer")
         return answer
 
     def _refusal(self, text: str) -> ServerError | PolicyError:
@@ -207,12 +195,8 @@ class RemotePolicy(Policy):
         return ServerError(f"{self.url} refuses: {echo(text)}")
 
     @contextmanager
-    def _closed_by_errors(self, silence: str = "is silent") -> Iterator[None]:
-        """Close the connection if the block fails: answers that come later would be taken for others.
-
-        Args:
-            silence: What the error says of a server that sends nothing.
-        """
+    def _closed_by_errors(self) -> Iterator[None]:
+        """Close the connection if the block fails: answers that come later would be taken for others."""
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -224,59 +208,13 @@ class RemotePolicy(Policy):
             elif isinstance(error, ConnectionClosed):
                 said = f"the policy server at {self.url} has ended the connection ({echo(str(error))})."
             elif isinstance(error, TimeoutError):
-                said = f"the policy server at {self.url} {silence}."
+                said = f"the policy server at {self.url} has not answered in time."
             else:
                 raise
             raise ServerError(said) from error
-
-    def _limit(self, name: str) -> float:
-        limits = self.metadata.get("limits")
-        most = limits.get(name) if isinstance(limits, dict) else None
-        return most if isinstance(most, int) else float("inf")
-
-
-@contextmanager
-def _opened(url: str, token: str | None, timeout_s: float) -> "Iterator[Socket]":
-    from websockets.exceptions import InvalidStatus, WebSocketException
-    from websockets.sync.client import connect
-
-    with ExitStack() as stack:
-        try:
-            opening = connect(
-                url,
-                compression=None,
-                max_size=MAX_REPLY_BYTES,
-                open_timeout=timeout_s,
-                close_timeout=CLOSE_S,
-                ping_interval=None,  # a server may compute for longer than a ping may take
-                proxy=None if is_loopback(urlsplit(url).hostname or "") else True,
-                additional_headers={"Authorization": f"Bearer {token}"} if token else None,
-            )
-            connection = stack.enter_context(opening)
-        except InvalidStatus as error:
-            said = (error.response.body or b"").decode(errors="replace").strip()
-            raise ServerError(
-                f"{url} refuses the connection (HTTP {error.response.status_code}: {echo(said)}); a token "
-                f"can be given in the environment variable {TOKEN_VARIABLE}."
-            ) from None
-        except TimeoutError as error:
-            raise ServerError(
-                f"no policy server answers at {url}: no handshake within {timeout_s:g} s; start one with: "
-                "openvima serve RUN"
-            ) from error
-        except (OSError, WebSocketException) as error:
-            reason = echo(str(error)) or type(error).__name__
-            raise ServerError(
-                f"no policy server answers at {url} ({reason}); start one with: openvima serve RUN"
-            ) from error
-        yield connection
-
-
-def _without_limits(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in metadata.items() if key != "limits"}
 
 
 def describe(url: str) -> dict[str, Any]:
     """Ask a server what it serves; see `RemotePolicy` for the errors."""
     with RemotePolicy(url) as policy:
-        return policy.record()
+        return policy.metadata

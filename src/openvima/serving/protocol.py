@@ -18,11 +18,11 @@ from openvima.imports import import_extra
 from openvima.policies.naming import SERVER_SCHEMES
 from openvima.render.camera import VIEWS
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
-from openvima.scene.action import COMMAND_NAMES, CONTROLS, END_EFFECTOR, PRIMITIVES
+from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES
 
 DTYPES = {
-    dtype.str: dtype
-    for dtype in map(np.dtype, ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f2", "f4", "f8"))
+    name: np.dtype(name)
+    for name in ["|u1", "<u2", "<u4", "<u8", "|i1", "<i2", "<i4", "<i8", "<f2", "<f4", "<f8"]
 }
 MAX_LENGTH = 4096  # of a list or map: older versions of msgpack set memory aside for what one claims to hold
 
@@ -153,16 +153,6 @@ def check_address(url: str) -> None:
         raise ConfigError(f"the address of a policy server is {shown}; it must be ws://HOST:PORT or wss://….")
 
 
-def check_token(token: str | None) -> None:
-    """Check that a token can be sent in a header.
-
-    Raises:
-        ConfigError: It is empty, or holds spaces or other than plain characters.
-    """
-    if token is not None and not (token and token.isascii() and token.isprintable() and " " not in token):
-        raise ConfigError("the token must be of printable ASCII characters without spaces, and not empty.")
-
-
 Check = Callable[[Any, str], None]
 Form = type | tuple[str, ...] | list | dict | Check
 _NAMES = {dict: "a map", list: "a list", str: "a text", int: "a whole number", np.ndarray: "an array"}
@@ -275,8 +265,7 @@ def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
         MessageError: It is no prompt; the message says what is wrong.
     """
     fields, by_name = check_form(message, _PROMPT, where), {}
-    for number, image in enumerate(fields.get("images", [])):
-        _check_sizes(image, f"{where}: image {number}")
+    for image in fields.get("images", []):
         objects = tuple(ObjectRecord(**record) for record in image.get("objects", ()))
         by_name[image["name"]] = PromptImage(**{**image, "objects": objects})
     if len(by_name) < len(fields.get("images", [])):
@@ -308,24 +297,14 @@ def decode_observation(
     """
     if message is None:
         return None
-    fields = check_form(message, _OBSERVATION | ({"tool": _TOOL} if control == END_EFFECTOR else {}), where)
-    _check_sizes(fields, where)
-    return fields
+    return check_form(message, _OBSERVATION | ({"tool": _TOOL} if control == END_EFFECTOR else {}), where)
 
 
-def encode_action(action: Any, control: str = PRIMITIVES) -> Any:
-    """Turn an action of a policy into arrays; None stays None.
-
-    Raises:
-        MessageError: It is not of the form of the control.
-    """
-    if action is None:
-        return None
-    if control == END_EFFECTOR:
-        return decode_action(action if isinstance(action, Mapping) else np.asarray(action), control=control)
-    if not isinstance(action, Mapping):
-        raise MessageError(f"action is {_shown(action)}; it must be a map.")
-    return {str(key): np.asarray(value) for key, value in action.items()}
+def encode_action(action: Any) -> Any:
+    """Turn an action of a policy into arrays; None stays None."""
+    if isinstance(action, Mapping):
+        return {str(key): np.asarray(value) for key, value in action.items()}
+    return None if action is None else np.asarray(action)
 
 
 def decode_action(message: Any, where: str = "action", *, control: str = PRIMITIVES) -> Any:
@@ -342,24 +321,9 @@ def decode_action(message: Any, where: str = "action", *, control: str = PRIMITI
     Raises:
         MessageError: It is something else.
     """
-    if message is None or control == END_EFFECTOR:
-        return message if message is None else check_form(message, np.ndarray, where)
-    for key, value in check_form(message, dict, where).items():
-        check_form(value, np.ndarray, f"{where}: {_shown(key)}")
-    return message
-
-
-def check_control(control: object, whose: str) -> str:
-    """Return the control that a policy declares.
-
-    Args:
-        control: What it declares.
-        whose: How to name the policy in the error.
-
-    Raises:
-        MessageError: There is no such control.
-    """
-    return check_form(control, CONTROLS, f"control of {whose}")
+    return (
+        None if message is None else check_form(message, dict if control == PRIMITIVES else np.ndarray, where)
+    )
 
 
 def check_modalities(names: object, whose: str) -> tuple[str, ...]:
@@ -378,37 +342,6 @@ def check_modalities(names: object, whose: str) -> tuple[str, ...]:
             f"{whose} has modalities {echo(repr(names))}; servers get rgb and, if asked, segm and joints."
         )
     return tuple(name for name in MODALITIES if name in listed)
-
-
-def check_protocol(protocol: object, *, theirs: str, ours: str) -> None:
-    """Check that both sides speak the same version of the protocol.
-
-    Args:
-        protocol: What the other side says that it speaks.
-        theirs: How to name the other side in the error.
-        ours: How to name this side.
-
-    Raises:
-        MessageError: It is another one, or none that is known.
-    """
-    if not isinstance(protocol, str) or protocol != PROTOCOL:  # an array is not compared
-        raise MessageError(
-            f"{theirs} speaks {_shown(protocol)}, {ours} {PROTOCOL!r}; use versions of openvima that speak "
-            "the same on both sides."
-        )
-
-
-def type_of(message: object) -> str | None:
-    """The type of a request or reply; None where it names none, or one that is no text."""
-    kind = message.get("type") if isinstance(message, dict) else None
-    return kind if isinstance(kind, str) else None
-
-
-def _check_sizes(fields: Mapping[str, Any], where: str) -> None:
-    """Check that segmentations are as large as the images."""
-    for view, segm in fields.get("segm", {}).items():
-        if view in fields["rgb"] and segm.shape != fields["rgb"][view].shape[1:]:
-            raise MessageError(f"{where}: segm {view!r} is {segm.shape}; it must be as large as rgb.")
 
 
 def _shown(value: object) -> str:

@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -21,25 +21,20 @@ from openvima.errors import ConfigError, MessageError, OpenVimaError, echo
 from openvima.policies.base import Policy, PromptLimits
 from openvima.policies.loading import checked_policy
 from openvima.scene import RenderedPrompt
-from openvima.scene.action import PRIMITIVES
+from openvima.scene.action import CONTROLS, PRIMITIVES
 from openvima.serving.protocol import (
     DEFAULT_MODALITIES,
-    MAX_LENGTH,
     POLICY_FAILED,
     PROTOCOL,
     TOKEN_VARIABLE,
-    check_control,
     check_form,
     check_modalities,
-    check_protocol,
-    check_token,
     decode_observation,
     decode_prompt,
     encode_action,
     is_loopback,
     pack,
     require_extra,
-    type_of,
     unpack,
 )
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, describe
@@ -65,7 +60,7 @@ class ServerConfig:
     Args:
         host: Interface to listen on. Any but the loopback interface needs a token.
         port: TCP port; 0 takes a free one.
-        token: Clients must know it. None lets in everyone who reaches the port.
+        token: Clients must know it. None, or an empty one, lets in everyone who reaches the port.
         max_message_bytes: Size of the largest message. A prompt image takes 0.26 MB, and so does an
             observation.
         max_episodes: Episodes of the largest batch, for which 128 MiB are enough.
@@ -92,22 +87,14 @@ class ServerConfig:
     prompts: str = "multimodal"
 
     def __post_init__(self) -> None:
-        numbers = ("port", "max_message_bytes", "max_episodes", "max_connections", "idle_s", "num_threads")
-        problems = [
-            f"{name} is {value:g}; it must be a positive number."
-            for name in numbers
-            if (value := getattr(self, name)) < 0 or (value == 0 and name != "port")
-        ]
-        if max(self.port - 65535, self.max_episodes - MAX_LENGTH) > 0:
-            problems.append(f"port is at most 65535 and max_episodes at most {MAX_LENGTH}.")
-        if self.token is None and not is_loopback(self.host):
-            problems.append(
+        for name in ("max_message_bytes", "max_episodes", "max_connections", "idle_s", "num_threads"):
+            if (value := getattr(self, name)) <= 0:
+                raise ConfigError(f"{name} is {value:g}; it must be a positive number.")
+        if not self.token and not is_loopback(self.host):
+            raise ConfigError(
                 f"host is {self.host!r}, which other machines may reach; give a token with --token or "
                 f"{TOKEN_VARIABLE}, or serve on 127.0.0.1 and let clients in through `ssh -L`."
             )
-        if problems:
-            raise ConfigError(" ".join(problems))
-        check_token(self.token)
         check_prompts(self.prompts)
 
 
@@ -173,7 +160,7 @@ class Session:
         except OpenVimaError as error:
             return _refusal(error)
         except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
-            where = "\n".join(map(echo, traceback.format_exc().splitlines()[-40:]))
+            where = "\n".join(map(echo, traceback.format_exc().splitlines()))
             _LOG.error("the policy failed\n%s", where)
             return f"{POLICY_FAILED}{type(error).__name__}: {echo(str(error))}"
 
@@ -181,31 +168,26 @@ class Session:
         if isinstance(data, str):
             raise MessageError("a text frame came in; requests are binary frames of MessagePack.")
         message = unpack(data)
-        kind = type_of(message)
-        if kind == "reset":
-            check_protocol(message.get("protocol", PROTOCOL), theirs="the client", ours="this server")
-            sent = self._listed(message, {"type": str, "prompts": list, "protocol?": str}, "prompts")
-            return partial(self._begin, self._decoded(sent))
-        if kind == "act":
-            seen = self._listed(message, {"type": str, "observations": list}, "observations")
-            observations = [
-                decode_observation(one, f"observation {n}", control=self._control)
-                for n, one in enumerate(seen)
-            ]
-            return partial(self._act, observations)
-        if isinstance(message, dict) and "type" not in message:
+        if "type" not in check_form(message, dict, "the request"):
             prompt = message.pop("prompt", None)
             sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
             observation = decode_observation(message, control=self._control)
             return partial(self._infer, observation, self._decoded(sent))
-        raise MessageError(
-            f"a request must be a map with type 'reset' or 'act', or an observation ({PROTOCOL})."
-        )
+        if check_form(message["type"], ("reset", "act"), "type of the request") == "reset":
+            return partial(self._begin, self._decoded(self._listed(message, "prompts")))
+        seen = self._listed(message, "observations")
+        observations = [
+            decode_observation(one, f"observation {n}", control=self._control) for n, one in enumerate(seen)
+        ]
+        return partial(self._act, observations)
 
-    def _listed(self, message: object, form: dict, field: str) -> list:
-        values = check_form(message, form, "the request")[field]
+    def _listed(self, message: object, field: str) -> list:
+        values = check_form(message, {"type": str, field: list}, "the request")[field]
         if len(values) > self._max_episodes:
-            raise MessageError(f"there are {len(values)} {field}; at most {self._max_episodes} are allowed.")
+            raise MessageError(
+                f"there are {len(values)} {field}; at most {self._max_episodes} are allowed. Lower --batch, "
+                "or serve with a higher --max-episodes."
+            )
         return values
 
     def _decoded(self, sent: Sequence[object]) -> list[RenderedPrompt]:
@@ -220,7 +202,7 @@ class Session:
         self._num_episodes = 0  # should the policy fail, there is nothing to go on with
         self.policy.reset(prompts)
         self._num_episodes = len(prompts)
-        return {"type": "reset", "episodes": self._num_episodes}
+        return {"type": "reset"}
 
     def _act(self, observations: Sequence[dict[str, Any] | None]) -> dict[str, Any]:
         actions = self._actions(observations)
@@ -236,7 +218,7 @@ class Session:
                 f"act has {len(observations)} observations for {self._num_episodes} prompts; send one for "
                 "each, and nil for episodes that have ended."
             )
-        actions = [encode_action(action, self._control) for action in self.policy.act(observations)]
+        actions = [encode_action(action) for action in self.policy.act(observations)]
         if len(actions) != len(observations):
             raise MessageError(
                 f"the policy gave {len(actions)} actions for {len(observations)} observations."
@@ -349,25 +331,11 @@ class _PolicyServer:
         self._new_policy: Callable[[], Policy] = getattr(policy, "new_session", lambda: policy)
         self._max_connections = config.max_connections if hasattr(policy, "new_session") else 1
         self._num_connections = 0
-        limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
-        prompt_limits = {f"prompt_{name}": number for name, number in asdict(limits).items()}
-        self._metadata = pack(
-            {
-                "protocol": PROTOCOL,
-                "versions": {"openvima": __version__},
-                **about,
-                "modalities": check_modalities(
-                    getattr(policy, "modalities", DEFAULT_MODALITIES), "the policy"
-                ),
-                "control": check_control(getattr(policy, "control", PRIMITIVES), "the policy"),
-                "limits": {
-                    "message_bytes": config.max_message_bytes,
-                    "episodes": config.max_episodes,
-                    "idle_s": config.idle_s,
-                    **prompt_limits,
-                },
-            }
-        )
+        modalities = check_modalities(getattr(policy, "modalities", DEFAULT_MODALITIES), "the policy")
+        control = check_form(getattr(policy, "control", PRIMITIVES), CONTROLS, "control of the policy")
+        versions = {"openvima": __version__}
+        about = {"protocol": PROTOCOL, "versions": versions, **about}
+        self._metadata = pack({**about, "modalities": modalities, "control": control})
 
     async def run(self, ready: Callable[[str], None], stop: asyncio.Event) -> None:
         """Serve until `stop` is set, or this is cancelled."""
@@ -406,13 +374,10 @@ class _PolicyServer:
         """Answer health checks, and turn away who does not know the token."""
         if request.path == HEALTH_PATH:
             return connection.respond(http.HTTPStatus.OK, "OK\n")
-        token = self._config.token
-        if token is None:
-            return None
+        token = self._config.token or ""
         given = " ".join(request.headers.get_all("Authorization")).partition(" ")[2]  # scheme, then token
-        if hmac.compare_digest(given.encode(errors="replace"), token.encode()):
+        if not token or hmac.compare_digest(given.encode(errors="replace"), token.encode()):
             return None
-        _LOG.warning("%s: wrong token, or none", _name(connection))
         return connection.respond(
             http.HTTPStatus.UNAUTHORIZED, "this server wants a token: Authorization: Bearer TOKEN\n"
         )
@@ -425,7 +390,6 @@ class _PolicyServer:
         if self._num_connections >= self._max_connections:
             count = "one client" if self._max_connections == 1 else f"{self._max_connections} clients"
             text = f"this server has its {count} at the moment; try again later."
-            _LOG.warning("%s: refused, the server is full", _name(connection))
             await connection.send(text)
             await connection.close(CloseCode.TRY_AGAIN_LATER, text)
             return
