@@ -13,7 +13,7 @@ from openvima.catalog.bodies import build_geometry
 from openvima.catalog.geometry import CollisionBox, CollisionHull
 from openvima.catalog.meshes import signed_area, triangulate
 from openvima.catalog.objects import object_spec
-from openvima.errors import AssetError, ShapeError, UnknownNameError
+from openvima.errors import ShapeError, UnknownNameError
 from openvima.scene import Placement, Pose, Scene
 from openvima.sim.bodies import Bodies
 from openvima.sim.primitive_state import Settling
@@ -103,11 +103,7 @@ def test_a_long_line_never_repeats_its_texture():
     assert uvs.min() >= 0 and uvs.max() <= 1
 
 
-def test_unusable_sizes_and_objects_are_refused():
-    with pytest.raises(AssetError, match="first 3 lengths must be above 0"):
-        build_geometry("block", (0.07, 0.07, 0.0))
-    with pytest.raises(AssetError, match="factors must be above 0"):
-        build_geometry("ring", (0.1, 0.1, 0.1), (1.0, 0.0, 1.0))
+def test_unknown_objects_are_refused():
     with pytest.raises(UnknownNameError, match="Did you mean 'ring'"):
         build_geometry("rign", (0.1, 0.1, 0.1))
 
@@ -157,9 +153,7 @@ def test_triangles_of_any_star_shaped_outline_cover_it(radii):
     assert sum(covered) == pytest.approx(signed_area(loop))
 
 
-def test_a_loop_that_runs_the_wrong_way_round_and_a_hole_outside_its_outline_are_refused():
-    with pytest.raises(ShapeError, match="the first must be positive"):
-        triangulate([SQUARE[::-1]])
+def test_a_hole_outside_its_outline_is_refused():
     surrounding = np.array([(-1.0, -1.0), (-1.0, 5.0), (5.0, 5.0), (5.0, -1.0)])
     with pytest.raises(ShapeError):
         triangulate([SQUARE, surrounding])

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from openvima.catalog import OBJECTS, TEXTURES, load_assets, original
-from openvima.catalog.original import OriginalAssets, PackFiles, import_pack, imported_folder
+from openvima.catalog.original import OriginalAssets, import_pack, imported_folder
 from openvima.errors import AssetError
 from task_cases import frozen
 
@@ -86,7 +86,7 @@ def test_missing_and_damaged_files_are_named_and_the_rest_is_imported(checkout):
         assets.geometry("cross", SIZE)
     with pytest.raises(AssetError, match=rf"texture 'granite'.*textures/granite\.png is missing.*{command}"):
         assets.texture("granite")
-    for pack in (OriginalAssets(PackFiles.imported()), OriginalAssets(checkout)):
+    for pack in (OriginalAssets(imported_folder()), OriginalAssets(checkout)):
         assert len(pack.problems()) == 2
         with pytest.raises(AssetError, match=r"kitting/cross\.obj is missing"):
             pack.geometry("cross", SIZE)
@@ -111,7 +111,7 @@ def test_an_import_that_fails_leaves_the_last_one(checkout, tmp_path, monkeypatc
         in_pack(checkout, path).write_bytes(b"damaged")
     with pytest.raises(AssetError, match="none of the 5 files"):
         import_pack(checkout)
-    assert OriginalAssets(PackFiles.imported()).problems() == []
+    assert OriginalAssets(imported_folder()).problems() == []
 
 
 def test_a_changed_byte_of_an_import_is_noticed(checkout):

@@ -10,10 +10,7 @@ import pytest
 from PIL import Image
 
 from openvima.catalog import (
-    OBJECTS,
-    Pool,
     load_assets,
-    pool,
     register_object,
     register_texture,
     registration,
@@ -21,7 +18,7 @@ from openvima.catalog import (
 )
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.original import OriginalAssets
-from openvima.errors import AssetError, ConfigError
+from openvima.errors import AssetError
 from user_shapes import CORNERS, TRIANGLES, boxes, restored_assets
 
 SIZE = (0.06, 0.04, 0.02)
@@ -95,15 +92,14 @@ def test_registering_an_equal_object_again_changes_nothing_and_another_one_is_re
     [
         ("bowl", "object 'bowl' already"),
         ("l shaped Block", "object 'L-shaped block' already"),
-        ("", "1 … 40 characters"),
-        ("a" * 41, "1 … 40 characters"),
-        (3, "1 … 40 characters"),
+        ("", "single spaces"),
+        (3, "single spaces"),
         ("a  b", "single spaces"),
         ("\x1b[31m", "letters, digits"),
         ("random shape 7", "reserved"),
     ],
 )
-def test_a_name_is_new_plain_and_short(name: Any, message: str) -> None:
+def test_a_name_is_new_and_plain(name: Any, message: str) -> None:
     with pytest.raises(AssetError, match=message):
         register_brick(name)
     assert name not in registration.REGISTERED_OBJECTS
@@ -124,7 +120,6 @@ def test_a_texture_has_a_name_of_its_own(name: str) -> None:
         ((CORNERS, TRIANGLES + 1), "name vertices 1 … 8; it has 0 … 7"),
         ((CORNERS, TRIANGLES - 1), "name vertices -1"),
         ((CORNERS, np.zeros((20_001, 3), int)), "20001 triangles"),
-        ((np.zeros((60_001, 3)), TRIANGLES), "60001 vertices"),
         ((CORNERS * (1, 1, 0), TRIANGLES), "is flat"),
         ((CORNERS, TRIANGLES[1:]), "is open: 3 edges"),
         ((CORNERS, np.concatenate([TRIANGLES[:1, ::-1], TRIANGLES[1:]])), "inverted triangles"),
@@ -170,10 +165,9 @@ def test_an_open_mesh_is_drawn_from_both_sides_on_request() -> None:
         ({"size_max": (0.05, 0.05, 0.05)}, "no side may be shorter"),
         ({"symmetry_deg": 0}, "symmetry_deg of object 'brick' is 0; it must be above 0, up to 360"),
         ({"friction": 2}, "within 0.05 … 1"),
-        ({"mass_kg": "heavy"}, "mass_kg of object 'brick' is a str"),
         ({"profile": "oval"}, "profile"),
         ({"aliases": ("bowl",)}, "object 'bowl' already"),
-        ({"aliases": None}, "aliases of object 'brick' are None; give a list"),
+        ({"aliases": "tile"}, "aliases of object 'brick' are 'tile'; give a list"),
         ({"collision": (CORNERS + 100, TRIANGLES)}, "part 0 of the collision"),
         ({"collision": (CORNERS * (1, 1, 0), TRIANGLES)}, "is flat"),
     ],
@@ -181,26 +175,6 @@ def test_an_open_mesh_is_drawn_from_both_sides_on_request() -> None:
 def test_numbers_out_of_bounds_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(AssetError, match=message):
         register_brick(**changes)
-
-
-def test_published_tasks_keep_their_pools() -> None:
-    before = pool("rotate", "train")
-    with pytest.raises(ConfigError, match="published task 'rotate'"):
-        register_brick(tasks=("rotate",))
-    with pytest.raises(ConfigError, match="no level 'L9'"):
-        register_brick(tasks=("mine",), levels=("L9",))
-    for names in ({"tasks": None}, {"levels": None}, {"tasks": "mine"}):
-        with pytest.raises(ConfigError, match=r"tasks and levels of object 'brick' are .*; give lists"):
-            register_brick(**names)
-    register_brick(tasks=("mine",), levels=("train",), container=True)
-    register_brick("plate", tasks=("mine",))
-    assert pool("rotate", "train") == before and "brick" not in OBJECTS
-    mine = Pool(("heart",), (), ("red",), ())
-    assert registration.with_registered(mine, "mine", "train") == Pool(
-        ("heart", "plate"), ("brick",), ("red",), ()
-    )
-    assert registration.with_registered(mine, "mine", "L1") == Pool(("heart", "plate"), (), ("red",), ())
-    assert registration.with_registered(mine, "other", "train") == mine
 
 
 def png(mode: str, size: tuple[int, int]) -> bytes:

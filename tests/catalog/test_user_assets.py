@@ -1,6 +1,5 @@
 """Assets by the function that makes them; records name it and never run it."""
 
-import contextlib
 import os
 import pickle
 import subprocess
@@ -16,12 +15,12 @@ from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate, rerender, verification
 from openvima.data.verification import VerifyConfig, verify
 from openvima.env import EnvConfig, TabletopEnv
-from openvima.errors import AssetError, ConfigError, UnknownNameError
+from openvima.errors import AssetError, UnknownNameError
 from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.evaluation.config import plan
 from openvima.evaluation.verification import verify_results
 from openvima.scene import AtPose, ObjectImage, Pose, Problem, Prompt, Tolerance
-from openvima.tasks import TableSampler, register_task, registry, sample_episode
+from openvima.tasks import TableSampler, register_task, registry
 from openvima.tasks.sampling import check_task_options, has_text_form
 
 FILE = Path(__file__).parents[1] / "user_shapes.py"
@@ -109,34 +108,6 @@ def test_demonstrations_of_own_assets_are_read_drawn_anew_and_replayed(
     assert any("code that is not run" in note for note in found.notes)
     assert "test bar" not in registration.REGISTERED_OBJECTS
     assert verify(folder, VerifyConfig(assets=BAR)).is_clean
-
-
-def test_the_first_episode_has_the_pool_of_all_others(tmp_path: Path) -> None:
-    file = tmp_path / "toys.py"
-    file.write_text(
-        "from openvima.catalog import register_object\n"
-        "from user_shapes import CORNERS, TRIANGLES\n\n"
-        "def toys():\n"
-        "    mesh, size = (CORNERS, TRIANGLES), (0.12, 0.08, 0.04)\n"
-        "    register_object('test toy', mesh, size=size, tasks=('choose',))\n",
-        encoding="utf-8",
-    )
-    pools = []
-
-    @register_task(
-        "choose",
-        family="own",
-        template="Move {it}.",
-        oracle_max_steps=1,
-        pools={"train": Pool(("heart",), (), ("red",), ())},
-    )
-    def sample(table: TableSampler) -> Problem:
-        pools.append(table.pool.dragged_objects)
-        return registry.task_spec("rotate").sample(table)
-
-    with contextlib.suppress(ConfigError):  # the objects do not suit that task
-        sample_episode("choose", seed=0, assets=f"{file}:toys")
-    assert pools == [("heart", "test toy")]
 
 
 def test_runs_check_text_forms_and_options_with_the_assets_of_the_run(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_goals_by_name() -> None:
         ("in", "a", "b"),
         ("at", "a", (0.6, 0.1)),
         ("at", "a", (0.6, 0.1), 90),
-        {"goal": "rotated", "a": 0, "degrees": 60},
+        ("rotated", 0, 60),
     ]
     inside, at, turned, rotated = compose(OBJECTS, PROMPT, goals=given).problem.goals
     assert isinstance(inside, AtPose) and (inside.object_id, inside.relative_to) == (5, 6)

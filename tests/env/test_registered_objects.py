@@ -27,8 +27,8 @@ TRAY = boxes(
 def registered() -> Iterator[None]:
     size = (0.2, 0.2, 0.05)
     with restored_assets():
-        register_object("test tray", TRAY, size=size, collision=TRAY, container=True, aliases=("salver",))
-        register_object("test lid", TRAY, size=size, container=True)
+        register_object("test tray", TRAY, size=size, collision=TRAY, aliases=("salver",))
+        register_object("test lid", TRAY, size=size)
         yield
 
 
@@ -46,7 +46,10 @@ class Inside(NamedTuple):
 
 
 def placed_height_m(container: str) -> float:
-    objects = [("block", "red", (0.5, -0.3)), (container, "green", (0.5, 0.2))]
+    objects = [
+        ("block", "red", (0.5, -0.3)),
+        {"object": container, "texture": "green", "position": (0.5, 0.2), "fixed": True},
+    ]
     episode = compose(objects, "Put the {a} into the {b}.", goals=[Inside(5, 6)])
     assert [p.fixed for p in episode.problem.scene.placements] == [False, True]
     env = make("rotate")

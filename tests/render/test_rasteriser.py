@@ -242,8 +242,7 @@ class _Incomplete(ProceduralAssets):
 
 @pytest.mark.slow
 def test_the_page_has_a_card_for_every_object_and_texture_and_says_what_a_pack_lacks(tmp_path) -> None:
-    seen = []
-    page, problems = write_gallery(tmp_path, _Incomplete(), report=lambda *now: seen.append(now[:2]))
+    page, problems = write_gallery(tmp_path, _Incomplete())
     assert set(problems) == {"kitting/heart.obj is missing", "tiles is missing"}
     assert page == tmp_path / "index.html"
     found = cards(page)
@@ -251,7 +250,6 @@ def test_the_page_has_a_card_for_every_object_and_texture_and_says_what_a_pack_l
     lacking = {name for name, card in found.items() if card.count("data:image/png") != 2}
     assert lacking == {"heart", "tiles"} and "heart is missing" in found["heart"]
     assert "9.0 × 10.3 × 3.3 cm" in found["letter A"]
-    assert seen[-1] == (len(OBJECTS) + len(TEXTURES) + 1,) * 2
 
 
 # Point; X and Y (upwards) in the top view; the same in the front view. From the benchmark's own matrices.
@@ -278,11 +276,6 @@ def test_unproject_undoes_project(view, factor) -> None:
     points = rng.uniform((0.2, -0.6, -0.01), (0.8, 0.6, 0.35), (50, 3))
     found = unproject(project(points, camera), camera, z=points[:, 2])
     np.testing.assert_allclose(found, points[:, :2], atol=1e-9)
-
-
-def test_a_point_behind_the_camera_is_refused_by_name() -> None:
-    with pytest.raises(ShapeError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
-        project(np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 1001.0]]), TOP)
 
 
 @pytest.mark.parametrize("leading", [(), (5,), (2, 5)])

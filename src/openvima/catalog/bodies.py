@@ -21,7 +21,6 @@ from openvima.catalog.geometry import (
 )
 from openvima.catalog.meshes import drape, scale_geometry
 from openvima.catalog.objects import object_spec
-from openvima.errors import AssetError
 
 SHEET_THICKNESS_M = 0.001  # of flat marks on the table, whatever their nominal height
 WALL_M = 0.002
@@ -119,19 +118,10 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
 
     Raises:
         UnknownNameError: The catalogue has no such object.
-        AssetError: A size or factor that the object needs is not positive.
     """
-    if not all(factor > 0 for factor in scale):
-        raise AssetError(f"scale of {object_name} is {scale}; all three factors must be above 0.")
     if has_fixed_size(object_name):
         return scale_geometry(fixed_geometry(object_name), scale)
-    build, needed_lengths = BOX_SHAPES[object_name]
-    product = (size[0] * scale[0], size[1] * scale[1], size[2] * scale[2])
-    if not all(length > 0 for length in product[:needed_lengths]):
-        raise AssetError(
-            f"size of {object_name} is {product} m; its first {needed_lengths} lengths must be above 0."
-        )
-    geometry = build(product)
+    geometry = BOX_SHAPES[object_name]((size[0] * scale[0], size[1] * scale[1], size[2] * scale[2]))
     return replace(geometry, visual=drape(geometry.visual))
 
 
@@ -155,13 +145,13 @@ def fixed_geometry(name: str) -> Geometry:
     return Geometry(mesh, tuple(map(CollisionHull, np.split(hulls, ends[:-1]))), float(rest_z_m))
 
 
-BOX_SHAPES: dict[str, tuple[Callable[[Vector3], Geometry], int]] = {
-    "block": (block, 3),
-    "shorter block": (block, 3),
-    "small block": (block, 3),
-    "line": (line, 2),
-    "three-sided rectangle": (three_sided_rectangle, 2),
-    "square": (square, 2),
-    "container": (container, 3),
+BOX_SHAPES: dict[str, Callable[[Vector3], Geometry]] = {
+    "block": block,
+    "shorter block": block,
+    "small block": block,
+    "line": line,
+    "three-sided rectangle": three_sided_rectangle,
+    "square": square,
+    "container": container,
 }
-"""Builders from size times scale, and the number of lengths that they use."""
+"""Builders from size times scale."""

@@ -1,5 +1,6 @@
 """Shapes of asset packs: triangle meshes and convex collision shapes."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Protocol, TypeGuard
 
@@ -35,6 +36,12 @@ class CollisionBox:
 
     half_size: Vector3
     centre: Vector3 = (0.0, 0.0, 0.0)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Its corners, shape (8, 3)."""
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        return np.array(self.centre) + signs * self.half_size
 
 
 @dataclass(frozen=True, slots=True, eq=False)

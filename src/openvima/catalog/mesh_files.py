@@ -32,22 +32,6 @@ class ObjMesh:
     uvs: np.ndarray
     parts: np.ndarray
 
-    def to_array(self) -> np.ndarray:
-        """Return everything as one array, a row a triangle, shape (F, 25), float64."""
-        rows = (self.vertices, self.normals, self.uvs, self.parts)
-        return np.concatenate([part.reshape(len(self.parts), -1) for part in rows], axis=1)
-
-    @classmethod
-    def from_array(cls, array: np.ndarray) -> "ObjMesh":
-        """Invert `to_array`."""
-        vertices, normals, uvs, parts = np.split(array, (9, 18, 24), axis=1)
-        return cls(
-            np.ascontiguousarray(vertices).reshape(-1, 3, 3),
-            np.ascontiguousarray(normals).reshape(-1, 3, 3),
-            np.ascontiguousarray(uvs).reshape(-1, 3, 2),
-            parts[:, 0].astype(np.int32),
-        )
-
 
 def parse_obj(text: str, name: str) -> ObjMesh:
     """Parse the text of an .obj file; materials, smoothing groups and line elements are skipped.
@@ -128,7 +112,6 @@ def face_normals(vertices: np.ndarray) -> np.ndarray:
 
 
 MAX_TRIANGLES = 20_000
-MAX_VERTICES = 60_000
 MAX_OBJ_BYTES = 8 << 20
 MIN_LENGTH_M, MAX_LENGTH_M = 0.001, 0.4  # of each side; the workspace is 0.5 m × 1 m
 MAX_PARTS = 64  # convex parts of a collision body
@@ -263,19 +246,11 @@ def _from_arrays(mesh: object, what: str) -> ObjMesh:
     form = "give an OBJ file, or (vertices, triangles) of shapes (V, 3), numbers, and (F, 3), whole numbers"
     if not isinstance(mesh, tuple | list) or len(mesh) != 2:
         raise ShapeError(f"mesh of {what} is a {type(mesh).__name__}; {form}.")
-    try:
-        vertices, triangles = np.asarray(mesh[0]), np.asarray(mesh[1])
-    except ValueError:
-        raise ShapeError(f"mesh of {what} holds rows of unequal length; {form}.") from None
+    vertices, triangles = np.asarray(mesh[0]), np.asarray(mesh[1])
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
         raise ShapeError(f"vertices of {what} are {vertices.dtype} of shape {vertices.shape}; {form}.")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
         raise ShapeError(f"triangles of {what} are {triangles.dtype} of shape {triangles.shape}; {form}.")
-    if len(vertices) > MAX_VERTICES or len(triangles) > MAX_TRIANGLES:
-        raise AssetError(
-            f"mesh of {what} has {len(vertices)} vertices and {len(triangles)} triangles; at most "
-            f"{MAX_VERTICES} and {MAX_TRIANGLES} are allowed."
-        )
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
         raise AssetError(
             f"triangles of {what} name vertices {triangles.min()} … {triangles.max()}; it has 0 … "

@@ -203,14 +203,11 @@ def triangulate(loops: Sequence[np.ndarray]) -> np.ndarray:
         Shape (T, 3), int64: indices into all loops put one after the other, each triangle counter-clockwise.
 
     Raises:
-        ShapeError: A loop crosses itself or another one, or runs the wrong way round.
+        ShapeError: A loop crosses itself or another one.
     """
     points = [(float(x), float(y)) for loop in loops for x, y in loop]
     starts = np.cumsum([0, *(len(loop) for loop in loops)])
     rings = [list(range(starts[i], starts[i + 1])) for i in range(len(loops))]
-    areas = [signed_area(loop) for loop in loops]
-    if areas[0] <= 0 or any(area >= 0 for area in areas[1:]):
-        raise ShapeError(f"loop areas are {areas}; the first must be positive, those of holes negative.")
     polygon = _without_holes(points, rings)
     return np.array(_clip_ears(points, polygon), dtype=np.int64)
 

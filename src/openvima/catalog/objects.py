@@ -47,7 +47,6 @@ class ObjectSpec:
         kit_scale: Scale s of a kit object: a nominal width of 0.08 s and a height of 0.02 s; None otherwise.
         aliases: Other names for paraphrased instructions; not valid names.
         novel_names: Further names that no task uses yet.
-        container: Registered as something to put others into.
     """
 
     name: str
@@ -65,7 +64,6 @@ class ObjectSpec:
     kit_scale: float | None = None
     aliases: tuple[str, ...] = ()
     novel_names: tuple[str, ...] = ()
-    container: bool = False
 
 
 OBJECTS: dict[str, ObjectSpec] = {

@@ -8,8 +8,7 @@ import contextlib
 import hashlib
 import io
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
@@ -28,80 +27,67 @@ from openvima.errors import AssetError
 from openvima.input_files import cache_dir
 
 PACK_FOLDER = Path("vima_bench/tasks/assets")  # inside a checkout
-_TEXT_SUFFIXES = (".obj", ".urdf")
 
 
-@dataclass(frozen=True, slots=True)
-class PackFiles:
-    """The files of an original pack.
+def find_pack(checkout: str | Path) -> Path:
+    """Return the absolute folder of the pack in a checkout.
 
     Args:
-        folder: The pack's folder, absolute.
+        checkout: Folder of the checkout (it holds `vima_bench/tasks/assets`), or that assets folder.
+
+    Raises:
+        AssetError: The folder holds no asset pack.
     """
-
-    folder: Path
-
-    @staticmethod
-    def within(checkout: str | Path) -> "PackFiles":
-        """Find the pack in a checkout.
-
-        Args:
-            checkout: Folder of the checkout (it holds `vima_bench/tasks/assets`), or that assets folder.
-
-        Raises:
-            AssetError: The folder holds no asset pack.
-        """
-        candidates = (Path(checkout) / PACK_FOLDER, Path(checkout))
-        folder = next((path for path in candidates if (path / "textures").is_dir()), None)
-        if folder is None:
-            raise AssetError(
-                f"{checkout} holds no original asset pack ({PACK_FOLDER}/textures is missing); "
-                "give the folder of a VIMABench checkout."
-            )
-        return PackFiles(folder.resolve())
-
-    @staticmethod
-    def imported() -> "PackFiles":
-        """Find the imported pack.
-
-        Raises:
-            AssetError: None was imported.
-        """
-        if not imported_folder().is_dir():
-            raise AssetError(
-                f"the original asset pack has not been imported ({imported_folder()} is missing). Run "
-                "`openvima assets import CHECKOUT` with the folder of a VIMABench checkout, or use the pack "
-                "'procedural'."
-            )
-        return PackFiles(imported_folder())
-
-    def read(self, relative_path: str) -> bytes:
-        """Return a file's content, as in the original benchmark.
-
-        Args:
-            relative_path: One of `known_hashes`.
-
-        Raises:
-            AssetError: The file is missing, unreadable, damaged or of another version.
-        """
-        path = self.folder / relative_path
-        advice = "restore it from a fresh checkout of VIMABench, or by `openvima assets import CHECKOUT`"
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise AssetError(f"{path} is missing or unreadable; {advice}.") from error
-        original = _as_original(content, relative_path)
-        if original is None:
-            raise AssetError(
-                f"{path} differs from the file of the original benchmark (damaged, or another version); "
-                f"{advice}."
-            )
-        return original
+    for path in (Path(checkout) / PACK_FOLDER, Path(checkout)):
+        if (path / "textures").is_dir():
+            return path.resolve()
+    raise AssetError(
+        f"{checkout} holds no original asset pack ({PACK_FOLDER}/textures is missing); "
+        "give the folder of a VIMABench checkout."
+    )
 
 
 def imported_folder() -> Path:
     """Return where an import keeps its files."""
     return cache_dir() / "original-pack-2"
+
+
+def imported_pack() -> Path:
+    """Return the folder of the imported pack.
+
+    Raises:
+        AssetError: None was imported.
+    """
+    if not imported_folder().is_dir():
+        raise AssetError(
+            f"the original asset pack has not been imported ({imported_folder()} is missing). Run "
+            "`openvima assets import CHECKOUT` with the folder of a VIMABench checkout, or use the pack "
+            "'procedural'."
+        )
+    return imported_folder()
+
+
+def read_original(pack: Path, relative_path: str) -> bytes:
+    """Return a file's content, as in the original benchmark.
+
+    Args:
+        pack: Folder of the pack.
+        relative_path: One of `known_hashes`.
+
+    Raises:
+        AssetError: The file is missing, unreadable, damaged or of another version.
+    """
+    path = pack / relative_path
+    advice = "restore it from a fresh checkout of VIMABench, or by `openvima assets import CHECKOUT`"
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise AssetError(f"{path} is missing or unreadable; {advice}.") from error
+    if hashlib.sha256(content).hexdigest() != known_hashes()[relative_path]:
+        raise AssetError(
+            f"{path} differs from the file of the original benchmark (damaged, or another version); {advice}."
+        )
+    return content
 
 
 @lru_cache(maxsize=1)
@@ -111,24 +97,11 @@ def known_hashes() -> Mapping[str, str]:
     return MappingProxyType(json.loads(text))
 
 
-def _as_original(content: bytes, relative_path: str) -> bytes | None:
-    """The content if it is the known one; Git for Windows may have changed the line ends of text files."""
-    candidates = [content]
-    if relative_path.endswith(_TEXT_SUFFIXES):
-        candidates.append(content.replace(b"\r\n", b"\n"))
-    expected = known_hashes()[relative_path]
-    return next((c for c in candidates if hashlib.sha256(c).hexdigest() == expected), None)
-
-
-Report = Callable[[int, int, str], None]
-
-
-def import_pack(checkout: str | Path, report: Report | None = None) -> list[str]:
+def import_pack(checkout: str | Path) -> list[str]:
     """Import the original asset pack for `load_assets("original")`: copy what has the known hash.
 
     Args:
         checkout: Folder of a checkout of the original benchmark, or its assets folder.
-        report: Called with the number of files done, the total, and the last name.
 
     Returns:
         One sentence for each file that is missing or damaged.
@@ -137,18 +110,15 @@ def import_pack(checkout: str | Path, report: Report | None = None) -> list[str]
         AssetError: The folder contains no asset pack, or only damaged files.
         OSError: The cache cannot be written to.
     """
-    source = PackFiles.within(checkout)
+    source = find_pack(checkout)
     problems: list[str] = []
-    for done, relative_path in enumerate(known_hashes(), start=1):
+    for relative_path in known_hashes():
         try:
-            decode_file(source, relative_path)
-            atomic_write_file(imported_folder() / relative_path, source.read(relative_path))
+            atomic_write_file(imported_folder() / relative_path, read_original(source, relative_path))
         except AssetError as error:
             problems.append(str(error))
-        if report:
-            report(done, len(known_hashes()), relative_path)
     if len(problems) == len(known_hashes()):
-        raise AssetError(f"none of the {len(problems)} files in {source.folder} is sound; {problems[0]}")
+        raise AssetError(f"none of the {len(problems)} files in {source} is sound; {problems[0]}")
     return problems
 
 
@@ -173,8 +143,6 @@ _SPECIAL_IMAGES = {
     "magma": "magma.jpg",
     "rainbow": "rainbow.jpg",
 }
-# Decoded once and cached: JPEG decoders differ by a level or two.
-_IMAGE_GROUP, _MESH_GROUP = "original-images-2", "original-meshes-1"
 _PATTERN_FOLDERS = {
     "stripe": ("stripes", "stripe"),
     "polka_dot_2": ("polka_dots", "polka_dot"),
@@ -187,7 +155,7 @@ class OriginalAssets:
     """The shapes and textures of VIMA-Bench; implements `Assets`.
 
     Args:
-        source: Folder of a checkout of VIMA-Bench, its assets folder, or the files of a pack.
+        source: Folder of a checkout of VIMA-Bench, its assets folder, or that of the import.
 
     Raises:
         AssetError: The folder contains no asset pack.
@@ -195,11 +163,11 @@ class OriginalAssets:
 
     name = "original"
 
-    def __init__(self, source: "str | Path | PackFiles") -> None:
-        self.files = PackFiles.within(source) if isinstance(source, str | Path) else source
+    def __init__(self, source: str | Path) -> None:
+        self.folder = imported_pack() if source == imported_folder() else find_pack(source)
 
     def __repr__(self) -> str:
-        return f"OriginalAssets({self.files!r})"
+        return f"OriginalAssets({str(self.folder)!r})"
 
     def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
         """Return the shape of a catalogue object; see `Assets.geometry`.
@@ -210,7 +178,7 @@ class OriginalAssets:
         """
         if object_name in REGISTERED_OBJECTS:
             return registered_geometry(object_name, size, scale)
-        return _protected_geometry(self.files, object_name, size, scale)
+        return _protected_geometry(self.folder, object_name, size, scale)
 
     def texture(self, texture_name: str) -> np.ndarray:
         """Return the texture's image, shape (H, W, 3), uint8; see `Assets.texture`.
@@ -221,7 +189,7 @@ class OriginalAssets:
         """
         if texture_name in REGISTERED_TEXTURES:
             return registered_texture(texture_name)
-        return _protected_texture(self.files, texture_name)
+        return _protected_texture(self.folder, texture_name)
 
     def problems(self) -> list[str]:
         """Check every file of the pack.
@@ -232,62 +200,46 @@ class OriginalAssets:
         found = []
         for relative_path in known_hashes():
             try:
-                self.files.read(relative_path)
+                read_original(self.folder, relative_path)
             except AssetError as error:
                 found.append(str(error))
         return found
 
 
-def decode_file(files: PackFiles, relative_path: str) -> None:
-    """Check a file of the pack and decode it into the cache, if it is one to be decoded.
-
-    The body descriptions (.urdf) are checked only: the catalogue states their few numbers.
-
-    Raises:
-        AssetError: The file is missing or damaged, or cannot be decoded.
-    """
-    if relative_path.endswith(".obj"):
-        _mesh(files, relative_path)
-    elif relative_path.startswith("textures/"):
-        _image(files, relative_path)
-    else:
-        files.read(relative_path)
-
-
 @lru_cache(maxsize=256)
-def _protected_geometry(files: PackFiles, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+def _protected_geometry(pack: Path, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
     spec = object_spec(object_name)
     try:
-        return protect(_geometry(files, spec, size, scale))
+        return protect(_geometry(pack, spec, size, scale))
     except AssetError as error:
         raise AssetError(f"object {object_name!r} cannot be used: {error}") from error
 
 
-def _geometry(files: PackFiles, spec: ObjectSpec, size: Vector3, scale: Vector3) -> Geometry:
+def _geometry(pack: Path, spec: ObjectSpec, size: Vector3, scale: Vector3) -> Geometry:
     if spec.name in BOX_SHAPES:
-        return BOX_SHAPES[spec.name][0](_product(size, scale))
+        return BOX_SHAPES[spec.name](_product(size, scale))
     if spec.kind == "kit":
-        return _kit(files, spec, scale)
+        return _kit(pack, spec, scale)
     if spec.name == "stand":  # which has no mesh file
         return scale_geometry(fixed_geometry("stand with long rods"), scale)
-    return _fixed_mesh(files, spec.name, scale)
+    return _fixed_mesh(pack, spec.name, scale)
 
 
-def _kit(files: PackFiles, spec: ObjectSpec, scale: Vector3) -> Geometry:
+def _kit(pack: Path, spec: ObjectSpec, scale: Vector3) -> Geometry:
     kit_scale = spec.kit_scale or 1.0
     metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
     name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
-    visual = _scale(_mesh(files, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
+    visual = _scale(_mesh(pack, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
     return Geometry(visual, (_hull(visual.vertices),), 0.0)
 
 
-def _fixed_mesh(files: PackFiles, object_name: str, scale: Vector3) -> Geometry:
+def _fixed_mesh(pack: Path, object_name: str, scale: Vector3) -> Geometry:
     file, metres, rest_z_m = _FIXED_MESHES[object_name]
-    visual = _scale(_mesh(files, file), _product(metres, scale))
+    visual = _scale(_mesh(pack, file), _product(metres, scale))
     collision = (_hull(visual.vertices),)
     if object_name == "bowl":
         parts_file, parts_metres = _BOWL_PARTS
-        parts = _mesh(files, parts_file)
+        parts = _mesh(pack, parts_file)
         vertices = parts.vertices * _product(parts_metres, scale)
         collision = tuple(_hull(vertices[parts.parts == part]) for part in np.unique(parts.parts))
     return Geometry(visual, collision, rest_z_m * scale[2])
@@ -307,40 +259,32 @@ def _product(a: Vector3, b: Vector3) -> Vector3:
 
 
 @lru_cache(maxsize=64)
-def _mesh(files: PackFiles, relative_path: str) -> ObjMesh:
-    content = files.read(relative_path)
-
-    def parsed() -> np.ndarray:
-        return parse_obj(content.decode("utf-8", errors="replace"), relative_path).to_array()
-
-    return ObjMesh.from_array(_cached(_MESH_GROUP, relative_path, parsed))
+def _mesh(pack: Path, relative_path: str) -> ObjMesh:
+    content = read_original(pack, relative_path)
+    return parse_obj(content.decode("utf-8", errors="replace"), relative_path)
 
 
 @lru_cache(maxsize=128)
-def _protected_texture(files: PackFiles, texture_name: str) -> np.ndarray:
+def _protected_texture(pack: Path, texture_name: str) -> np.ndarray:
     spec = texture_spec(texture_name)
     if spec.texel is not None:
         texture = np.array(spec.texel, dtype=np.uint8).reshape(1, 1, 3)
     else:
         try:
-            texture = _image(files, image_file(spec))
+            texture = _image(pack, image_file(spec))
         except AssetError as error:
             raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
     texture.setflags(write=False)
     return texture
 
 
-def _image(files: PackFiles, relative_path: str) -> np.ndarray:
-    content = files.read(relative_path)
-    return _cached(_IMAGE_GROUP, relative_path, lambda: _decode(content, relative_path))
-
-
-def _cached(group: str, relative_path: str, decode: Callable[[], np.ndarray]) -> np.ndarray:
-    """Read what a file decodes to from the cache, or decode and store it; damaged entries are replaced."""
-    path = cache_dir() / group / f"{known_hashes()[relative_path][:32]}.npy"
-    with contextlib.suppress(OSError, ValueError, EOFError):
+def _image(pack: Path, relative_path: str) -> np.ndarray:
+    """Decode an image once, and cache it: decoders of JPEG differ by a level or two."""
+    content = read_original(pack, relative_path)
+    path = cache_dir() / "original-images-2" / f"{known_hashes()[relative_path][:32]}.npy"
+    with contextlib.suppress(OSError, ValueError, EOFError):  # a damaged entry is replaced
         return np.load(path, allow_pickle=False)
-    array = decode()
+    array = _decode(content, relative_path)
     with contextlib.suppress(OSError):  # without write access it is decoded each time
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as file:

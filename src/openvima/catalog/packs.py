@@ -7,7 +7,6 @@ first.
 import os
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -99,9 +98,6 @@ def _loaded_sources() -> list[str]:
     return os.environ.get(_LOADED_VARIABLE, "").splitlines()
 
 
-if TYPE_CHECKING:
-    from openvima.catalog.original import PackFiles
-
 ASSET_PACKS = ("procedural", "original")
 """Named packs; anything else is a function of a user, or the path of a checkout of VIMA-Bench."""
 
@@ -133,9 +129,9 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
     if assets == "procedural":
         return procedural_assets()
     if assets == "original":
-        from openvima.catalog.original import PackFiles
+        from openvima.catalog.original import imported_pack
 
-        return _original(PackFiles.imported())
+        return _original(imported_pack())
     if is_code(str(assets)):
         return load_user_assets(str(assets))
     folder = as_path(assets)
@@ -149,7 +145,7 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
 
 
 @lru_cache(maxsize=4)
-def _original(source: "Path | PackFiles") -> Assets:
+def _original(source: Path) -> Assets:
     from openvima.catalog.original import OriginalAssets  # reads files, which the default pack does not
 
     return OriginalAssets(source)

@@ -1,7 +1,7 @@
 """The default asset pack: shapes made by code, and the images of textures, which are part of the package."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +14,12 @@ from openvima.catalog.textures import REGISTERED_TEXTURES, texture_spec
 
 # One a texture that is no plain colour, in layout and mean colour like that of the original.
 _IMAGES = Path(__file__).with_name("images")
-_GEOMETRIES_KEPT = 256  # containers come in any size, so the memory of shapes needs a bound
 
 
 class ProceduralAssets:
     """The pack of the package. Use `procedural_assets`, which is one per process."""
 
     name = "procedural"
-
-    def __init__(self) -> None:
-        self._textures: dict[str, np.ndarray] = {}
-        self._build = lru_cache(maxsize=_GEOMETRIES_KEPT)(_build_protected)
 
     def __reduce__(self) -> tuple[Callable[[], "ProceduralAssets"], tuple[()]]:
         return procedural_assets, ()
@@ -35,34 +30,35 @@ class ProceduralAssets:
             return registered_geometry(object_name, size, scale)
         if has_fixed_size(object_name):
             size = (0.0, 0.0, 0.0)  # one entry for all sizes
-        return self._build(object_name, size, scale)
+        return _build(object_name, size, scale)
 
     def texture(self, texture_name: str) -> np.ndarray:
         """Return the texture's image; see `Assets.texture`."""
         if texture_name in REGISTERED_TEXTURES:
             return registered_texture(texture_name)
-        if texture_name not in self._textures:
-            texture = _load_texture(texture_name)
-            texture.setflags(write=False)
-            self._textures[texture_name] = texture
-        return self._textures[texture_name]
+        return _load_texture(texture_name)
 
 
-@lru_cache(maxsize=1)
+@cache
 def procedural_assets() -> ProceduralAssets:
-    """Return the pack of this process, which remembers what it made."""
+    """Return the pack of this process."""
     return ProceduralAssets()
 
 
-def _build_protected(object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+@lru_cache(maxsize=256)  # containers come in any size, so the memory of shapes needs a bound
+def _build(object_name: str, size: Vector3, scale: Vector3) -> Geometry:
     return protect(build_geometry(object_name, size, scale))
 
 
+@cache
 def _load_texture(texture_name: str) -> np.ndarray:
     spec = texture_spec(texture_name)
     if spec.texel is not None:
-        return np.array(spec.texel, np.uint8).reshape(1, 1, 3)
-    from PIL import Image  # scenes of plain colours do without
+        texture = np.array(spec.texel, np.uint8).reshape(1, 1, 3)
+    else:
+        from PIL import Image  # scenes of plain colours do without
 
-    with Image.open(_IMAGES / f"{spec.id.lower()}.png") as image:
-        return np.array(image.convert("RGB"))
+        with Image.open(_IMAGES / f"{spec.id.lower()}.png") as image:
+            texture = np.array(image.convert("RGB"))
+    texture.setflags(write=False)
+    return texture

@@ -2,8 +2,9 @@
 
 import hashlib
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,23 +13,18 @@ import numpy as np
 from openvima.catalog.geometry import Geometry, Vector3, protect
 from openvima.catalog.mesh_files import Mesh, UserMesh, check_lengths, read_mesh
 from openvima.catalog.objects import OBJECTS, REGISTERED_OBJECTS, ObjectSpec, Profile
-from openvima.catalog.partitions import LEVELS, PACKAGE_TASKS, Level, Pool
 from openvima.catalog.textures import NEUTRAL_TEXTURE, REGISTERED_TEXTURES, TEXTURES, TextureSpec
 from openvima.errors import (
     AssetError,
-    ConfigError,
     InputFileError,
     ShapeError,
     echo,
-    unknown_name,
 )
 from openvima.input_files import as_path
 
-MAX_NAME = 40  # characters
-MAX_ALIASES = 10
-MAX_REGISTERED = 10_000  # objects, and textures
 MAX_TEXTURE_SIDE = 1024  # pixels
 MAX_PNG_BYTES = 8 << 20
+_NAME = re.compile(r"(?:[^\W_]|['-])+(?: (?:[^\W_]|['-])+)*")
 _MASS_KG = (0.001, 2.0)
 _FRICTION = (0.05, 1.0)  # as in the catalogue, none exceeds 1; see `sim.model`
 
@@ -40,8 +36,6 @@ class _Entry:
     digest: str
     mesh: UserMesh | None = None
     image: np.ndarray | None = None
-    tasks: tuple[str, ...] = ()
-    levels: tuple[Level, ...] = ()
 
 
 _ENTRIES: dict[tuple[str, str], _Entry] = {}  # by "object" or "texture", and name
@@ -60,9 +54,6 @@ def register_object(
     double_sided: bool = False,
     mass_kg: float = 0.1,
     friction: float = 1.0,
-    container: bool = False,
-    tasks: Sequence[str] = (),
-    levels: Sequence[Level] = LEVELS,
 ) -> ObjectSpec:
     """Register an object of your own. Registering an equal one again changes nothing.
 
@@ -80,10 +71,6 @@ def register_object(
         double_sided: Draw both sides of a mesh that is not closed.
         mass_kg: Mass.
         friction: Coulomb friction against the table.
-        container: Others are put into it: it is a base of the pools of `tasks`, and fixed to the table.
-        tasks: Tasks of your own to whose pools it is added, not published ones. A task file may also name it
-            in its pools directly.
-        levels: Levels of these pools.
 
     Returns:
         The catalogue record.
@@ -91,14 +78,11 @@ def register_object(
     Raises:
         AssetError: A name is taken or no plain name, the mesh is unfit, or a number is out of bounds.
         ShapeError: Arrays have a wrong shape or dtype.
-        ConfigError: A task is a published one.
-        ConfigError: There is no such level.
     """
     what = f"object {echo(repr(name))}"
     _check_name(name, what, "object")
-    if isinstance(aliases, str) or not isinstance(aliases, Collection) or len(aliases) > MAX_ALIASES:
-        given = echo(repr(aliases))
-        raise AssetError(f"aliases of {what} are {given}; give a list of at most {MAX_ALIASES} names.")
+    if isinstance(aliases, str):
+        raise AssetError(f"aliases of {what} are {echo(repr(aliases))}; give a list of names.")
     for alias in aliases:
         _check_name(alias, f"alias {echo(repr(alias))} of {what}", "object", alias=True)
     _check_number("symmetry_deg", symmetry_deg, 0.0, 360.0, what)
@@ -106,7 +90,6 @@ def register_object(
     _check_number("friction", friction, *_FRICTION, what)
     if profile not in (None, "square", "circle"):
         raise AssetError(f"profile of {what} is {profile!r:.80}; allowed are None, 'square' and 'circle'.")
-    _check_pools(tasks, levels, what)
     user_mesh = read_mesh(mesh, collision, double_sided=double_sided, what=what)
     smallest = check_lengths(user_mesh.extents if size is None else size, what)
     largest = smallest if size_max is None else check_lengths(size_max, what)
@@ -125,13 +108,9 @@ def register_object(
         mass_kg=float(mass_kg),
         friction=float(friction),
         aliases=tuple(aliases),
-        container=container,
     )
     arrays = (user_mesh.visual.vertices, user_mesh.visual.normals, user_mesh.visual.uvs, *user_mesh.parts)
-    pools = (tuple(tasks), tuple(levels))
-    digest = _digest(repr((spec, pools)), *arrays)
-    entry = _Entry(digest, mesh=user_mesh, tasks=pools[0], levels=pools[1])
-    if _is_new("object", name, entry):
+    if _is_new("object", name, _Entry(_digest(repr(spec), *arrays), mesh=user_mesh)):
         REGISTERED_OBJECTS[name] = spec
     return spec
 
@@ -152,7 +131,7 @@ def register_texture(name: str, image: np.ndarray | str | Path) -> TextureSpec:
     """
     what = f"texture {echo(repr(name))}"
     _check_name(name, what, "texture")
-    pixels = _read_png(as_path(image), what) if isinstance(image, str | Path) else _as_array(image, what)
+    pixels = _read_png(as_path(image), what) if isinstance(image, str | Path) else np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
         raise ShapeError(f"{what} is {pixels.dtype} of shape {pixels.shape}; it must be uint8 of (H, W, 3).")
     if not all(1 <= side <= MAX_TEXTURE_SIDE for side in pixels.shape[:2]):
@@ -185,21 +164,6 @@ def registered_texture(texture_name: str) -> np.ndarray:
     return image
 
 
-def with_registered(pool: Pool, task: str, level: Level) -> Pool:
-    """Add the objects that were registered for a task to its pool at a level."""
-    entries = {name: entry for (kind, name), entry in _ENTRIES.items() if kind == "object" and entry.tasks}
-    added = {n: entry for n, entry in entries.items() if task in entry.tasks and level in entry.levels}
-    if not added:
-        return pool
-    bases = [name for name in added if REGISTERED_OBJECTS[name].container]
-    others = [name for name in added if name not in bases]
-    return replace(
-        pool,
-        dragged_objects=tuple(dict.fromkeys((*pool.dragged_objects, *others))),
-        base_objects=tuple(dict.fromkeys((*pool.base_objects, *bases))),
-    )
-
-
 @lru_cache(maxsize=256)
 def _geometry(entry: _Entry, object_name: str, lengths: Vector3) -> Geometry:
     assert entry.mesh is not None
@@ -207,9 +171,7 @@ def _geometry(entry: _Entry, object_name: str, lengths: Vector3) -> Geometry:
 
 
 def _check_name(name: str, what: str, kind: str, *, alias: bool = False) -> None:
-    if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME:
-        raise AssetError(f"{what}: a name is a text of 1 … {MAX_NAME} characters.")
-    if not all(word and all(c.isalnum() or c in "-'" for c in word) for word in name.split(" ")):
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise AssetError(f"{what}: a name consists of letters, digits, '-' and single spaces.")
     if name.casefold().startswith(("random ", "dark random ")):  # see `random_pack`
         raise AssetError(f"{what}: names that begin with 'random' are reserved; choose another name.")
@@ -226,24 +188,9 @@ def _fold(name: str) -> str:
 
 
 def _check_number(field: str, value: float, least: float, most: float, what: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise AssetError(f"{field} of {what} is a {type(value).__name__}; give a number.")
     if not least <= value <= most or value == 0:  # NaN fails too
         bounds = f"above {least:g}, up to {most:g}" if least == 0 else f"within {least:g} … {most:g}"
         raise AssetError(f"{field} of {what} is {float(value):g}; it must be {bounds}.")
-
-
-def _check_pools(tasks: Sequence[str], levels: Sequence[Level], what: str) -> None:
-    if any(isinstance(names, str) or not isinstance(names, Collection) for names in (tasks, levels)):
-        given = f"{echo(repr(tasks))} and {echo(repr(levels))}"
-        raise ConfigError(f"tasks and levels of {what} are {given}; give lists of names.")
-    if published := [task for task in tasks if task in PACKAGE_TASKS]:
-        raise ConfigError(
-            f"{what} cannot be added to the published task {published[0]!r}: every seed would give another "
-            "episode. Use it in a task of your own."
-        )
-    if unknown := [level for level in levels if level not in LEVELS]:
-        raise ConfigError(f"{what}: {unknown_name('level', unknown[0], LEVELS)}")
 
 
 def _is_new(kind: str, name: str, entry: _Entry) -> bool:
@@ -251,8 +198,6 @@ def _is_new(kind: str, name: str, entry: _Entry) -> bool:
     known = _ENTRIES.get((kind, name))
     if known is not None and known.digest != entry.digest:
         raise AssetError(f"{kind} {name!r} is registered already, and differs; choose another name.")
-    if len(_ENTRIES) >= MAX_REGISTERED:
-        raise AssetError(f"{MAX_REGISTERED} objects and textures are registered, the most that is allowed.")
     _ENTRIES.setdefault((kind, name), entry)
     return known is None
 
@@ -266,15 +211,6 @@ def _digest(text: str, *arrays: np.ndarray) -> str:
 
 def _identifier(name: str) -> str:
     return name.upper().replace(" ", "_").replace("-", "_")
-
-
-def _as_array(image: object, what: str) -> np.ndarray:
-    try:
-        return np.asarray(image)
-    except (TypeError, ValueError):  # such as rows of unequal lengths
-        raise ShapeError(
-            f"{what} is a {type(image).__name__} that NumPy cannot convert; it must be uint8 of (H, W, 3)."
-        ) from None
 
 
 def _read_png(file: Path, what: str) -> np.ndarray:

@@ -6,8 +6,6 @@ from typing import Annotated
 
 import tyro
 
-from openvima.cli.terminal import progress_bar
-
 
 def gallery(*, out: Path, assets: str = "procedural") -> int:
     """Write a web page that shows every object and every texture.
@@ -27,8 +25,7 @@ def gallery(*, out: Path, assets: str = "procedural") -> int:
     from openvima.tasks import list_tasks
 
     list_tasks()  # files of tasks may register objects and textures
-    with progress_bar("pictures") as report:
-        page, problems = write_gallery(out, load_assets(assets), report=report)
+    page, problems = write_gallery(out, load_assets(assets))
     for problem in problems:
         print(problem, file=sys.stderr)
     print(page)
@@ -53,8 +50,7 @@ def import_(
     """
     from openvima.catalog.original import import_pack, imported_folder, known_hashes
 
-    with progress_bar("original assets") as report:
-        problems = import_pack(checkout, report)
+    problems = import_pack(checkout)
     total = len(known_hashes())
     print(f"{total - len(problems)} of {total} files imported into {imported_folder()}")
     _list_problems(problems)
@@ -72,12 +68,12 @@ def info() -> int:
     """
     from openvima.catalog import OBJECTS, TEXTURES
     from openvima.catalog.objects import REGISTERED_OBJECTS
-    from openvima.catalog.original import OriginalAssets, PackFiles, imported_folder, known_hashes
+    from openvima.catalog.original import OriginalAssets, imported_folder, known_hashes
     from openvima.catalog.textures import REGISTERED_TEXTURES
     from openvima.input_files import cache_dir
     from openvima.tasks import list_tasks
 
-    problems = None if not imported_folder().is_dir() else OriginalAssets(PackFiles.imported()).problems()
+    problems = None if not imported_folder().is_dir() else OriginalAssets(imported_folder()).problems()
     print(f"procedural  made by code: {len(OBJECTS)} objects, {len(TEXTURES)} textures")
     list_tasks()  # files of tasks may register objects and textures
     if own := [*REGISTERED_OBJECTS, *REGISTERED_TEXTURES]:

@@ -155,7 +155,7 @@ def default_names() -> Iterator[str]:
 
 def is_fixed_by_default(object_name: str) -> bool:
     """Return whether an object is fixed to the table unless it is said otherwise, as bases are."""
-    return object_name in _FIXED_OBJECTS or object_spec(object_name).container
+    return object_name in _FIXED_OBJECTS
 
 
 ObjectLike = SceneObject | Mapping[str, Any] | Sequence[Any]
@@ -379,8 +379,7 @@ def composed_goals(
     """Make goals of what a user gives.
 
     Args:
-        given: A list of goals, each its name and arguments, a mapping with the key "goal" and the arguments
-            by name, or a goal of `openvima.scene`; None for no goals.
+        given: A list of goals, each its name and arguments, or a goal of `openvima.scene`; None for no goals.
         handles: Objects of the scene.
         end_effector: Tool of the arm.
         assets: Asset pack.
@@ -396,13 +395,9 @@ def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, a
     if is_condition(given):
         return given
     allowed = f"Allowed: {'; '.join(_usage(known) for known in _GOALS)}."
-    if isinstance(given, Mapping):
-        named = dict(given)
-        name, arguments = named.pop("goal", None), ()
-    elif isinstance(given, Sequence) and given and not isinstance(given, str):
-        (name, *arguments), named = entries(given, label), {}
-    else:
+    if not isinstance(given, Sequence) or isinstance(given, str) or not given:
         raise SceneError(f"{label} is {shown(given)}; give a list of goals. {allowed}")
+    name, *arguments = given
     if not isinstance(name, str) or name not in _GOALS:
         raise SceneError(f"{label}: {unknown_name('goal', name, _GOALS, allowed)}")
     make = _GOALS[name]
@@ -411,7 +406,7 @@ def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, a
         raise SceneError(f"{label}: {name!r} needs the end effector {needed}, not {end_effector}.")
     parameters = inspect.signature(make).parameters
     try:
-        bound = inspect.signature(make).bind(*arguments, **named, assets=assets)
+        bound = inspect.signature(make).bind(*arguments, assets=assets)
     except TypeError:
         raise SceneError(f"{label} has other arguments than {_usage(name)}. {allowed}") from None
     for parameter in ("a", "b"):

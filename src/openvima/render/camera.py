@@ -114,10 +114,6 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
         Shape (..., 2), float64: column, then row, row 0 on top. Integers are the sampling
         points of pixels. Nothing is clipped.
 
-    Raises:
-        ShapeError: The last axis of `points` does not have length 3.
-        ShapeError: A point is in or behind the camera plane.
-
     Example:
         >>> project(np.array([0.5, 0.0, 0.0]), TOP)
         array([128.,  63.])
@@ -125,13 +121,8 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     Source: pinhole model with the constants of VIMA-Bench.
     """
     points = np.asarray(points, dtype=np.float64)
-    _check_last_axis("points", points, 3)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     right, up, away = (a * x + b * y + c * z + d for a, b, c, d in (camera.right, camera.up, camera.away))
-    behind = away <= 0
-    if behind.any():
-        first = tuple(float(v) for v in points[behind].reshape(-1, 3)[0])
-        raise ShapeError(f"point {first} is behind the {camera.view} camera; give points near the table.")
     columns = camera.width / 2 + camera.focal_px * right / away
     heights = camera.height / 2 + camera.focal_px * up / away
     return np.stack([columns, camera.height - 1 - heights], axis=-1)
@@ -148,15 +139,11 @@ def unproject(pixels: np.ndarray, camera: Camera, z: float | np.ndarray = 0.0) -
     Returns:
         x, y in metres, shape (..., 2), float64; the inverse of `project`.
 
-    Raises:
-        ShapeError: The last axis of `pixels` does not have length 2.
-
     Example:
         >>> unproject(np.array([128.0, 63.0]), TOP)
         array([0.5, 0. ])
     """
     pixels = np.asarray(pixels, dtype=np.float64)
-    _check_last_axis("pixels", pixels, 2)
     tangent_right = (pixels[..., 0] - camera.width / 2) / camera.focal_px
     tangent_up = (camera.height - 1 - pixels[..., 1] - camera.height / 2) / camera.focal_px
     # right = tangent_right · away and up = tangent_up · away: two linear equations for x and y.
@@ -195,11 +182,6 @@ def points_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
     world_to_camera = np.array([camera.right, camera.up, camera.away])
     seen = np.stack([right, up, away], axis=-1) - world_to_camera[:, 3]
     return seen @ np.linalg.inv(world_to_camera[:, :3]).T
-
-
-def _check_last_axis(name: str, array: np.ndarray, length: int) -> None:
-    if array.shape[-1:] != (length,):
-        raise ShapeError(f"{name} has shape {array.shape}; its last axis must have length {length}.")
 
 
 def channels_last(images: np.ndarray) -> np.ndarray:

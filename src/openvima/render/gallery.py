@@ -10,7 +10,6 @@ from openvima.catalog.objects import REGISTERED_OBJECTS
 from openvima.catalog.textures import REGISTERED_TEXTURES
 from openvima.errors import AssetError
 from openvima.html import render_page, require_extra, thumbnail_uri
-from openvima.multiprocess import Report
 from openvima.render.camera import VIEWS
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
@@ -21,13 +20,12 @@ _ENLARGE, _HEIGHT = 6, 144  # of what is rendered, and pixels of a picture
 _OBJECT_ID = 5
 
 
-def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) -> tuple[Path, tuple[str, ...]]:
+def write_gallery(out: Path, assets: Assets) -> tuple[Path, tuple[str, ...]]:
     """Write index.html; the page loads nothing.
 
     Args:
         out: Folder; an earlier gallery there is overwritten.
         assets: The asset pack.
-        report: Called with entries rendered, entries in all, and the last one's name.
 
     Returns:
         The page, and a sentence for each object and texture that the pack lacks.
@@ -37,14 +35,12 @@ def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) ->
     objects = [(name, name, _SAMPLE_TEXTURE) for name in (*OBJECTS, *REGISTERED_OBJECTS)]
     textures = [(n, _SAMPLE_OBJECT, n) for n in (*TEXTURES, NEUTRAL_TEXTURE, *REGISTERED_TEXTURES)]
     cards = []
-    for done, (name, object_name, texture_name) in enumerate([*objects, *textures], 1):
+    for name, object_name, texture_name in (*objects, *textures):
         try:
             cards.append((name, *_pictures(rasteriser, object_name, texture_name)))
         except AssetError as error:
             problems[str(error)] = None
             cards.append((name, f"{name} is missing", []))
-        if report:
-            report(done, len(objects) + len(textures), name)
     page = render_page(
         "assets", pack=assets.name, objects=cards[: len(objects)], textures=cards[len(objects) :]
     )

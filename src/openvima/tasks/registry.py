@@ -1,6 +1,5 @@
 """Registry of tasks: each task file registers its `sample` function."""
 
-import contextlib
 import functools
 import importlib
 import importlib.metadata
@@ -10,7 +9,7 @@ import json
 import os
 import pkgutil
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +17,6 @@ from typing import Any
 
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
 from openvima.catalog.partitions import PACKAGE_TASKS, PUBLISHED_LEVELS
-from openvima.catalog.registration import with_registered
 from openvima.errors import (
     ConfigError,
     UnknownTaskError,
@@ -99,13 +97,12 @@ class TaskSpec:
         )
 
     def pool(self, level: str | None = None) -> Pool:
-        """Return the objects and textures at a level, by default the first, registered ones included.
+        """Return the objects and textures at a level, by default the first.
 
         Raises:
             ConfigError: There is no such level, or the task is not defined there.
         """
-        level = self.checked_level(level)
-        return with_registered(self.pools[level], self.name, level)
+        return self.pools[self.checked_level(level)]
 
 
 _TASKS: dict[str, TaskSpec] = {}
@@ -270,23 +267,9 @@ def _load_task_files() -> None:
         if not module.name.endswith(".kernels"):  # Numba, imported when an episode is sampled
             importlib.import_module(module.name)
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        with _all_or_no_tasks():
-            load_entry_point(entry_point)
+        load_entry_point(entry_point)
     for path in filter(None, os.environ.get(TASK_FILES_VARIABLE, "").split(os.pathsep)):
-        with _all_or_no_tasks():
-            load_file(Path(path), what=TASK_FILES_VARIABLE)
-
-
-@contextlib.contextmanager
-def _all_or_no_tasks() -> Iterator[None]:
-    """Forget the tasks that code registered before it failed, so that it can be loaded again."""
-    before = dict(_TASKS)
-    try:
-        yield
-    except BaseException:
-        _TASKS.clear()
-        _TASKS.update(before)
-        raise
+        load_file(Path(path), what=TASK_FILES_VARIABLE)
 
 
 ORACLE_FILE = "oracle_success.json"
