@@ -60,7 +60,7 @@ def test_help_of_evaluation_is_grouped(capsys) -> None:
         ("demo rotat", "Did you mean 'rotate'"),
         ("demo rotate --out video.gif", "video.gif"),
         ("demo rotate --task-options num_distractors=9", "num_distractors is 9; give an integer from 0 to 6"),
-        ("demo rotate --task-options twist.num_objects=3", "this run has no twist"),
+        ("demo rotate --task-options twist.num_distractors=3", "this run has no twist"),
         ("demo sweep_without_exceeding --level L3", "not defined at level L3"),
         ("demo rotate --episode x.yaml", "either a TASK or --episode FILE"),
         ("demo --episode x.yaml --seed 3", "leave them out"),

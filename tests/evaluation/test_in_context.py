@@ -49,19 +49,6 @@ def test_the_edited_prompt_shows_images_of_the_tasks_own(task, words, names) -> 
         assert texture not in {record.texture for image in prompt.images.values() for record in image.objects}
 
 
-def test_twist_takes_its_first_pair_whatever_their_number() -> None:
-    env = TabletopEnv("twist", level="L1", num_examples=1)
-    env.reset(seed=0)
-    one = in_context_prompt(env.prompt, "twist")
-    more = TabletopEnv("twist", level="L1", num_examples=2)
-    more.reset(seed=0)
-    two = in_context_prompt(more.prompt, "twist")
-    assert one.text == two.text and list(two.images) == ["before_twist_1", "after_twist_1"]
-    np.testing.assert_array_equal(
-        one.images["after_twist_1"].rgb["top"], two.images["after_twist_1"].rgb["top"]
-    )
-
-
 def test_other_tasks_and_prompts_are_refused() -> None:
     env = TabletopEnv("rotate", level="L1")
     env.reset(seed=0)

@@ -1,12 +1,13 @@
 """Scenes, pictures and outcomes of `rearrange` and `rearrange_then_restore` follow their specification."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
 
 from openvima.catalog import TEXTURE_SETS, Assets, pool
-from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem, in_workspace
+from openvima.scene import AtPose, DistractorsApart, Episode, Outcome, Placement, Pose, Problem, in_workspace
 from openvima.tasks import Progress, TableSampler, advance, begin, oracle_action, sample_episode, task_spec
 from openvima.tasks.table import is_in_the_way
 from task_cases import assert_frequencies, assert_uniform, judged, moves, pictured
@@ -29,6 +30,20 @@ def distractor_of(problem: Problem) -> Placement | None:
     assert isinstance(constraint, DistractorsApart) and constraint.at_end
     ids = constraint.object_ids
     return problem.scene[ids[0]] if ids else None
+
+
+def episodes(
+    task: str, num_objects: int, count: int = 1, *, conflict: bool | None = None, **options: Any
+) -> list[Episode]:
+    """The first episodes with so many objects to move, and with a distractor in the way, or not, if asked."""
+    sampled = (sample_episode(task, seed=seed, **options) for seed in itertools.count())
+    found = (
+        episode
+        for episode in sampled
+        if len(pictured(episode.problem)) == num_objects
+        and conflict in (None, bool(episode.problem.prerequisites))
+    )
+    return list(itertools.islice(found, count))
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +69,8 @@ def test_only_a_single_object_has_a_distractor_and_half_of_these_are_in_its_way(
 @pytest.mark.slow
 def test_a_distractor_has_another_shape_and_any_of_the_49_textures(level: str) -> None:
     distractors = []
-    for seed in range(1000):
-        problem = sample_episode(TASK, level=level, seed=seed, num_objects=1).problem
+    for episode in episodes(TASK, 1, 1000, level=level):
+        problem = episode.problem
         ((target, _),), distractor = moved(problem), distractor_of(problem)
         assert distractor is not None and distractor.object != target.object
         assert target.object in pool(TASK, level).dragged_objects
@@ -68,8 +83,7 @@ def test_a_distractor_has_another_shape_and_any_of_the_49_textures(level: str) -
 
 def test_distractors_can_be_kept_to_the_textures_of_the_level() -> None:
     for level, textures in (("train", "C1"), ("L2", "C2")):
-        for seed in range(30):
-            episode = sample_episode(TASK, level=level, seed=seed, num_objects=1, distractor_textures="pool")
+        for episode in episodes(TASK, 1, 30, level=level, distractor_textures="pool"):
             assert {p.texture for p in episode.problem.scene.placements} <= set(TEXTURE_SETS[textures])
 
 
@@ -116,12 +130,9 @@ def test_the_picture_shows_the_objects_at_their_targets_and_no_distractor(proble
         assert sorted(p.id for p in pictured(problem)) == list(range(2, 2 + len(problem.goals)))
 
 
-def single(
-    task: str, *, conflict: bool, **options: object
-) -> tuple[Problem, Placement, Pose, Placement, float]:
+def single(task: str, *, conflict: bool, **options: Any) -> tuple[Problem, Placement, Pose, Placement, float]:
     """A problem with one object: it at its start, its target, the distractor, which way is inward for it."""
-    options = {"num_objects": 1, "conflict_rate": float(conflict), **options}
-    problem = sample_episode(task, seed=2, **options).problem
+    problem = episodes(task, 1, conflict=conflict, **options)[0].problem
     own, target = moved(problem)[0]
     (other,) = (p for p in problem.scene.placements if p.id != own.id)
     return problem, own, target, other, 1.0 if target.y < 0 else -1.0
@@ -171,8 +182,8 @@ def test_scenes_to_restore_are_those_of_rearrange(assets: Assets) -> None:
 @pytest.mark.slow
 def test_objects_go_back_to_their_starts_in_an_order_of_its_own() -> None:
     orders = []
-    for seed in range(600):
-        problem = sample_episode(RESTORE, seed=seed, num_objects=3).problem
+    for episode in episodes(RESTORE, 3, 600):
+        problem = episode.problem
         arrange, restore = goals_of(problem)
         assert problem.stages == (3, 3)
         arranged = [goal.object_id for goal in arrange]
@@ -183,7 +194,7 @@ def test_objects_go_back_to_their_starts_in_an_order_of_its_own() -> None:
 
 
 def test_going_back_counts_from_the_step_after_the_last_arrangement_on() -> None:
-    problem = sample_episode(RESTORE, seed=0, num_objects=2).problem
+    problem = episodes(RESTORE, 2)[0].problem
     a, b, *_ = moves(problem)
     a_back, b_back = ({object_id: problem.scene[object_id].pose for object_id in move} for move in (a, b))
     assert judged(problem, a | b) == judged(problem, a, a_back | b) == (Progress((2, 3)), Outcome())
@@ -221,8 +232,8 @@ def test_a_distractor_that_was_in_the_way_is_left_where_it_is_parked() -> None:
 
 
 def test_distractors_start_and_park_away_from_targets_and_starts() -> None:
-    for seed in range(150):
-        problem = sample_episode(RESTORE, seed=seed, num_objects=1).problem
+    for episode in episodes(RESTORE, 1, 150):
+        problem = episode.problem
         (arrange,), (restore,) = goals_of(problem)
         (other,) = (p for p in problem.scene.placements if p.id != arrange.object_id)
         assert other.pose.planar_distance(restore.target) >= 0.1
@@ -261,19 +272,19 @@ def test_a_distractor_that_was_never_in_the_way_has_to_stay_when_asked_back() ->
 
 
 @pytest.mark.parametrize(
-    ("options", "num_steps"),
+    ("num_objects", "options", "num_steps"),
     [
-        ({"num_objects": 1, "conflict_rate": 0}, 2),
-        ({"num_objects": 1, "conflict_rate": 1}, 3),
-        ({"num_objects": 1, "conflict_rate": 1, "restore_distractor": True}, 4),
-        ({"num_objects": 2}, 4),
-        ({"num_objects": 3}, 6),
+        (1, {"conflict": False}, 2),
+        (1, {"conflict": True}, 3),
+        (1, {"conflict": True, "restore_distractor": True}, 4),
+        (2, {}, 4),
+        (3, {}, 6),
     ],
 )
 def test_the_oracle_takes_the_shortest_way(
-    options: dict[str, object], num_steps: int, assets: Assets
+    num_objects: int, options: dict[str, Any], num_steps: int, assets: Assets
 ) -> None:
-    episode = sample_episode(RESTORE, seed=5, **options)
+    (episode,) = episodes(RESTORE, num_objects, **options)
     problem, scene = episode.problem, episode.problem.scene
     progress, outcome, rng = begin(problem), Outcome(), np.random.default_rng(0)
     for _ in range(num_steps):

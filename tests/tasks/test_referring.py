@@ -1,6 +1,8 @@
 """Level L7: sentences of the grammar mean one thing, which a resolver that reads them finds as well."""
 
+import re
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -16,8 +18,29 @@ TEMPLATES = [(kind, number) for kind in PHRASES for number in range(len(template
 SEED = 3
 
 
-def sampled(kind: str, template: int | None = None, seed: int = SEED) -> Problem:
-    return sample_episode(f"refer_by_{kind}", seed=seed, template=template).problem
+def sampled(kind: str, seed: int = SEED) -> Problem:
+    return sample_episode(f"refer_by_{kind}", seed=seed).problem
+
+
+def follows(text: str, template: str) -> bool:
+    """Whether a prompt fills the words of a template; images keep their slots."""
+    pieces = re.split(r"({\w+})", template)
+    is_image = re.compile(r"{(object_\d|base|target)}").fullmatch
+    patterns = (r"[\w -]+" if p[:1] == "{" and not is_image(p) else re.escape(p) for p in pieces)
+    return re.fullmatch("".join(patterns), text) is not None
+
+
+@cache
+def seeds_by_template(kind: str) -> dict[int, list[int]]:
+    """Return seeds by the number of their template: of those that fit, the one with most words of its own."""
+    found: dict[int, list[int]] = {}
+    texts = [sentence(*template) for template in templates(kind)]
+    for seed in range(12 * len(texts)):
+        text = sampled(kind, seed).prompt.text
+        fitting = [number for number, template in enumerate(texts) if follows(text, template)]
+        number = max(fitting, key=lambda n: len(re.sub(r"{\w+}", "", texts[n])))
+        found.setdefault(number, []).append(seed)
+    return found
 
 
 def goals_of(problem: Problem) -> list[AtPose]:
@@ -33,8 +56,8 @@ def test_there_are_many_templates_and_the_tasks_are_held_out() -> None:
 
 @pytest.mark.parametrize(("kind", "number"), TEMPLATES)
 def test_every_template_is_reached_and_its_sentence_read_as_meant(kind: str, number: int) -> None:
-    for seed in range(SEED):
-        episode = sample_episode(f"refer_by_{kind}", seed=seed, prompts="text", template=number)
+    for seed in seeds_by_template(kind)[number][:3]:
+        episode = sample_episode(f"refer_by_{kind}", seed=seed, prompts="text")
         assert disagreement(episode) == "", episode.problem.prompt.text
         assert "{" not in episode.problem.prompt.text
         assert episode.max_steps <= 7
@@ -100,11 +123,11 @@ def test_what_is_meant_solves_an_episode_and_any_other_object_fails(kind: str, s
 
 
 def test_one_more_than_the_number_and_the_wrong_one_of_two_containers_are_failures() -> None:
-    problem = sampled("number", template=0)
+    problem = sampled("number", seeds_by_template("number")[0][0])
     assert problem.num_required == 1
     both = {goal.object_id: goal.target for goal in goals_of(problem)[:2]}
     assert judged(problem, both)[-1].failure
-    problem = sampled("relation", template=2)
+    problem = sampled("relation", seeds_by_template("relation")[2][0])
     (goal,) = goals_of(problem)
     (other,) = [p for p in problem.scene.placements if p.fixed and p.id != goal.relative_to]
     assert problem.scene[goal.relative_to or 0].object == other.object
@@ -122,9 +145,10 @@ def test_no_two_objects_look_alike_and_no_texture_is_part_of_another(kind: str) 
 @pytest.mark.parametrize("template", [0, 1])
 def test_both_alternatives_occur(template: int) -> None:
     first = []
-    for seed in range(20):
-        problem = sampled("alternative", template=template, seed=seed)
+    seeds = seeds_by_template("alternative")[template]
+    for seed in seeds:
+        problem = sampled("alternative", seed)
         shown = dict(problem.prompt.images)["object_1"].placement  # type: ignore[union-attr]
         moved = problem.scene[goals_of(problem)[0].object_id]
         first.append((shown.object, shown.texture) == (moved.object, moved.texture))
-    assert 4 < sum(first) < 16
+    assert 0.2 < sum(first) / len(seeds) < 0.8

@@ -1,16 +1,13 @@
 """`same_shape` and `same_texture`: what belongs together, and gathering it."""
 
 import functools
-from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets, pool
+from openvima.catalog import OBJECT_SETS, TEXTURE_SETS
 from openvima.catalog.objects import OBJECTS
-from openvima.errors import ConfigError
 from openvima.scene import Outcome, Placement, Pose, Problem
-from openvima.tasks import Progress, TableSampler, sample_episode, task_spec
+from openvima.tasks import Progress, sample_episode
 from openvima.tasks.table import is_in_the_way
 from task_cases import (
     assert_frequencies,
@@ -133,15 +130,6 @@ def test_objects_to_gather_may_share_a_texture_but_not_with_a_distractor() -> No
     assert_frequencies(same, {True: 1 / 19, False: 18 / 19})
     for _, dragged, distractors in episodes:
         assert {p.texture for p in dragged}.isdisjoint(p.texture for p in distractors)
-
-
-@pytest.mark.parametrize("missing", ["ring", "shorter block"])
-def test_a_pool_that_leaves_a_base_without_objects_is_refused(missing: str, assets: Assets) -> None:
-    train = pool("same_shape", "train")
-    poor = replace(train, dragged_objects=tuple(n for n in train.dragged_objects if n != missing))
-    table = TableSampler(np.random.default_rng(0), poor, assets=assets)
-    with pytest.raises(ConfigError, match="some must have the profile of the base"):
-        task_spec("same_shape").sample(table)
 
 
 def test_the_texture_alone_tells_what_belongs_together() -> None:

@@ -179,9 +179,7 @@ def _kinds(images: tuple[tuple[str, object], ...]) -> dict[str, type]:
 
 
 _MAX_SHOWN = 100  # characters of a prompt in an error
-_TEXTURE = re.compile(
-    re.escape(twist.TEMPLATE.partition("{examples} ")[2]).replace(r"\{twist_obj_texture\}", "(.+)")
-)
+_TEXTURE = re.compile(re.escape(twist.REQUEST).replace(r"\{twist_obj_texture\}", "(.+)"))
 
 
 def in_context_prompt(prompt: RenderedPrompt, task: str) -> RenderedPrompt:

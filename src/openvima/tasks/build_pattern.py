@@ -22,7 +22,7 @@ from openvima.scene import (
     SceneImage,
     Tolerance,
 )
-from openvima.tasks.options import check_count
+from openvima.tasks.options import check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -52,7 +52,7 @@ def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
         table: Sampler of the scene.
         num_distractors: Objects in the way, 0 … 2.
     """
-    check_count("num_distractors", num_distractors, high=2)
+    check_num_distractors(num_distractors, high=2)
     target_cells = _shifted(table, table.choose(PATTERNS).split())
     cells = [(row, column) for row in range(NUM_ROWS) for column in range(NUM_COLUMNS)]
     free = [cell for cell in cells if cell not in target_cells]
@@ -60,8 +60,7 @@ def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
     if len(free) < len(target_cells) + num_distractors:
         num_distractors = len(free) - len(target_cells)
 
-    pool = table.pool
-    appearances = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
+    appearances = table.appearances()
     count = len(target_cells) + num_distractors
     drawn = [appearances[index] for index in table.rng.choice(len(appearances), count, replace=False)]
     in_the_way = table.rng.choice(len(target_cells), num_distractors, replace=False).tolist()

@@ -25,9 +25,11 @@ from openvima.scene import (
     SceneImage,
     Tolerance,
 )
+from openvima.tasks.manipulate_old_neighbor import NEIGHBOURS
 from openvima.tasks.novel_words import NOUNS, choose_words, gray_image
-from openvima.tasks.options import check_count
+from openvima.tasks.options import check_num_distractors
 from openvima.tasks.placing import ANGLES_DEG, rotation_goal
+from openvima.tasks.referring_grammar import offset
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler, is_in_the_way
 
@@ -55,7 +57,6 @@ COMPOSITIONS: dict[str, tuple[str, ...]] = {
 
 TOLERANCE = Tolerance(position_m=0.1)
 APART_M = 0.12
-DIRECTIONS = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}  # steps along x and y
 _NEIGHBOR_M = 0.17
 _TRIES = 30
 _SPARE_STEPS = 1
@@ -185,17 +186,14 @@ def _rearrange(made: Composition, n: int) -> Goals:
 
 def _neighbor(made: Composition, n: int) -> Goals:
     assert made.object and made.base
-    pool, table, dragged = made.table.pool, made.table, made.object
-    direction, step = table.choose(list(DIRECTIONS.items()))
+    table, dragged = made.table, made.object
+    direction, step = table.choose(list(NEIGHBOURS.items()))
 
     def is_elsewhere(new: Placement) -> bool:
         along, across = offset(new, dragged, step)
         return not (0 < along < _NEIGHBOR_M + 0.06 and across < 0.05)
 
-    appearances = [
-        (s, t) for s in pool.dragged_objects for t in pool.dragged_textures if (s, t) not in made.appearances
-    ]
-    appearance = table.choose(appearances)
+    appearance = table.choose([each for each in table.appearances() if each not in made.appearances])
     neighbor = table.place_one(
         "neighbor", lambda: appearance, tries=200, apart_m=APART_M, reject=is_elsewhere
     )
@@ -203,12 +201,6 @@ def _neighbor(made: Composition, n: int) -> Goals:
     made.directions.append((dragged, step, neighbor))
     made.fills[f"direction_{n}"] = direction
     return _into(neighbor, made.base)
-
-
-def offset(new: Placement, dragged: Placement, step: tuple[int, int]) -> tuple[float, float]:
-    """Return how far an object is from another along a direction, and across it, in metres."""
-    dx, dy = new.pose.x - dragged.pose.x, new.pose.y - dragged.pose.y
-    return dx * step[0] + dy * step[1], abs(dx * step[1] - dy * step[0])
 
 
 INSTRUCTIONS: dict[str, tuple[str, Callable[[Composition, int], Goals]]] = {
@@ -238,7 +230,7 @@ def template(kinds: tuple[str, ...]) -> str:
 
 def compose_problem(table: TableSampler, kinds: tuple[str, ...], num_distractors: int) -> Problem:
     """Place what all instructions need, and distractors; build the problem."""
-    check_count("num_distractors", num_distractors, high=3)
+    check_num_distractors(num_distractors, high=3)
     made, stages = Composition(table), []
     for n, kind in enumerate(kinds, 1):
         if goals := INSTRUCTIONS[kind][1](made, n):

@@ -51,9 +51,7 @@ def sample(
     check_num_distractors(num_distractors)
     check_difficulty(difficulty)
     num_frames = NUM_FRAMES[difficulty]
-    appearances = [
-        (name, texture) for name in table.pool.dragged_objects for texture in table.pool.dragged_textures
-    ]
+    appearances = table.appearances()
     appearance = table.choose(appearances)
     other_appearances = [other for other in appearances if other != appearance]
 

@@ -10,7 +10,7 @@ Source:   level L8 of openvima; not in the VIMA paper.
 """
 
 from openvima.scene import AtPose, DistractorsApart, Placement, Problem, Prompt
-from openvima.tasks.options import check_count
+from openvima.tasks.options import check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import frame_images, goals_between, with_frame_slots
 from openvima.tasks.table import TableSampler
@@ -28,29 +28,25 @@ _SPARE_STEPS = 2
     template=with_frame_slots(TEMPLATE, NUM_FRAMES),
     oracle_max_steps=2 * (NUM_FRAMES - 1) + _SPARE_STEPS,
 )
-def sample(table: TableSampler, *, num_frames: int = NUM_FRAMES, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
-        num_frames: Frames, 4 … 7: six to twelve moves.
         num_distractors: Further objects, 0 … 3.
     """
-    check_count("num_frames", num_frames, low=4, high=7)
-    check_count("num_distractors", num_distractors, high=3)
-    pool = table.pool
+    check_num_distractors(num_distractors, high=3)
     taken: set[tuple[str, str]] = set()
 
     def put(what: str) -> Placement:
-        options = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
-        appearance = table.choose([appearance for appearance in options if appearance not in taken])
+        appearance = table.choose([each for each in table.appearances() if each not in taken])
         taken.add(appearance)
         return table.place_one(what, lambda: appearance, tries=_TRIES, apart_m=APART_M)
 
     objects = [put("object") for _ in range(NUM_OBJECTS)]
     distractors = [put("distractor") for _ in range(num_distractors)]
     scene, frames, last = table.scene(), [tuple(objects)], -1
-    for _ in range(num_frames - 1):
+    for _ in range(NUM_FRAMES - 1):
         last = table.choose([n for n in range(NUM_OBJECTS) if n != last])
         frame = list(frames[-1])
         before = frame[last]
@@ -66,7 +62,7 @@ def sample(table: TableSampler, *, num_frames: int = NUM_FRAMES, num_distractors
     goals: tuple[AtPose, ...] = (*goals_between(frames), *goals_between(frames[::-1]))
     return Problem(
         scene=scene,
-        prompt=Prompt.parse(with_frame_slots(TEMPLATE, num_frames), **frame_images(frames)),
+        prompt=Prompt.parse(with_frame_slots(TEMPLATE, NUM_FRAMES), **frame_images(frames)),
         goals=goals,
         constraints=(DistractorsApart(tuple(p.id for p in distractors), at_end=True),),
         stages=(1,) * len(goals),

@@ -30,7 +30,12 @@ TEMPLATE = (
     "into the same {base_obj}."
 )
 TOLERANCE = Tolerance(position_m=0.1)
-NEIGHBOURS = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}  # steps in (row, column)
+NEIGHBOURS = {
+    "north": (-1, 0),
+    "south": (1, 0),
+    "west": (0, -1),
+    "east": (0, 1),
+}  # steps along x, y
 NUM_ROWS = 3
 NUM_MOVED = 2
 NUM_COLUMNS = {"easy": 2, "medium": 3, "hard": 4}
@@ -60,7 +65,7 @@ def sample(table: TableSampler, *, num_distractors: int | None = None, difficult
     chosen = table.rng.choice(len(others), size=len(others) - num_distractors, replace=False)
     empty_cells = {others[index] for index in chosen}
 
-    appearances = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
+    appearances = table.appearances()
     drawn = table.rng.choice(len(appearances), size=len(cells), replace=False)
     placed: dict[tuple[int, int], Placement] = {}
     for cell, index in zip(cells, drawn, strict=True):

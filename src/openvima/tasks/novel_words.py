@@ -6,7 +6,6 @@ from typing import Literal
 
 from openvima.catalog import Vector3
 from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
-from openvima.errors import ConfigError
 from openvima.scene import ObjectImage, Placement, Pose
 from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.placing import APART_M, of_a_third_shape, place_distractors
@@ -114,8 +113,6 @@ def place_base_and_pair(
     check_difficulty(difficulty)
     check_num_distractors(num_distractors)
     pool = table.pool
-    if len(pool.dragged_objects) < 2:
-        raise ConfigError(f"dragged objects are {pool.dragged_objects}; give at least two shapes.")
     base_texture, texture = table.choose(pool.base_textures), table.choose(pool.dragged_textures)
     base = table.place_one("base", lambda: (table.choose(pool.base_objects), base_texture))
     first, second = table.rng.permutation(len(pool.dragged_objects))[:2]

@@ -3,8 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 
-from openvima.catalog import Pool
-from openvima.catalog.objects import NO_SYMMETRY, object_spec
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
 from openvima.tasks.options import check_difficulty, check_num_distractors
@@ -183,42 +181,14 @@ def rotation_goal(placement: Placement, angle_deg: float, *, position_m: float) 
     )
 
 
-def check_angles(angles_deg: object) -> None:
-    """Check that all angles are numbers beyond the tolerance.
+def check_angles(angles_deg: Sequence[float]) -> None:
+    """Check that there are angles, all beyond the tolerance.
 
     Raises:
-        ConfigError: An angle is within 15 degrees of 0, or this is not a list of numbers.
+        ConfigError: There are none, or one is within 15 degrees of 0.
     """
-    if not isinstance(angles_deg, Sequence) or isinstance(angles_deg, str):
+    if not angles_deg or not all(abs(math.remainder(angle, 360)) > TOLERANCE_DEG for angle in angles_deg):
         raise ConfigError(
-            f"angles_deg is {angles_deg!r}; give a list of degrees, such as {list(ANGLES_DEG)}."
-        )
-    wrong = [str(angle) for angle in angles_deg if not _is_large(angle)]
-    if wrong or not angles_deg:
-        given = ", ".join(wrong) or "nothing"
-        raise ConfigError(
-            f"angles_deg holds {given}; each angle must be larger than {TOLERANCE_DEG} degrees."
-        )
-
-
-def _is_large(angle: object) -> bool:
-    if not isinstance(angle, int | float) or not math.isfinite(angle):
-        return False
-    return abs(math.remainder(angle, 360)) > TOLERANCE_DEG
-
-
-def check_asymmetric(pool: Pool) -> None:
-    """Check that the objects of a pool have no rotational symmetry and at least two textures.
-
-    Raises:
-        ConfigError: An object has a rotational symmetry, or there are fewer than two textures.
-    """
-    symmetric = [name for name in pool.dragged_objects if object_spec(name).symmetry_rad != NO_SYMMETRY]
-    if symmetric:
-        raise ConfigError(
-            f"{', '.join(symmetric)} have a rotational symmetry; give objects without one, such as letters."
-        )
-    if len(set(pool.dragged_textures)) < 2:
-        raise ConfigError(
-            f"the pool's dragged textures are {pool.dragged_textures}; distractors need a second one."
+            f"angles_deg is {angles_deg!r}; give angles of more than {TOLERANCE_DEG} degrees, such as "
+            f"{list(ANGLES_DEG)}."
         )

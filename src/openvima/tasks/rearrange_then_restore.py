@@ -7,9 +7,11 @@ Success:  each object was within 0.1 m of its target and, in a later step than t
 Source:   VIMA paper, task list of the appendix, "Rearrange then restore".
 """
 
+from dataclasses import replace
+
 from openvima.scene import AtPose, DistractorsApart, Problem, Prompt
+from openvima.tasks import rearrange
 from openvima.tasks.registry import register_task
-from openvima.tasks.scene_prompts import CONFLICT_RATE, TOLERANCE, sample_arrangement
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Rearrange objects to this setup {scene} and then restore."
@@ -24,9 +26,7 @@ TEMPLATE = "Rearrange objects to this setup {scene} and then restore."
 def sample(
     table: TableSampler,
     *,
-    num_objects: int | None = None,
     num_distractors: int | None = None,
-    conflict_rate: float = CONFLICT_RATE,
     distractor_textures: str = "all",
     restore_distractor: bool = False,
     difficulty: str = "easy",
@@ -35,9 +35,7 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        num_objects: Objects to move, 1 … 3; by default 1, 2 or 3 with probabilities 0.4, 0.4 and 0.2.
         num_distractors: Distractors, 0 … 6; by default one for a single object, else none.
-        conflict_rate: Probability that the distractor is on the target of a single object.
         distractor_textures: "all" 49 light textures, as in the benchmark at every level, or "pool": only
             those of the level.
         restore_distractor: Ask for the distractor at its original place as well, after the objects were at
@@ -45,26 +43,24 @@ def sample(
             way must not come back.
         difficulty: "easy", "medium" or "hard"; without effect, as in the benchmark.
     """
-    arrangement = sample_arrangement(
+    problem = rearrange.sample(
         table,
-        num_objects=num_objects,
         num_distractors=num_distractors,
-        conflict_rate=conflict_rate,
         distractor_textures=distractor_textures,
         difficulty=difficulty,
     )
-    arrange, starts = arrangement.goals, arrangement.starts
+    arrange, (apart,) = problem.goals, problem.constraints
+    assert isinstance(apart, DistractorsApart)
+    starts = [problem.scene[goal.object_id] for goal in arrange if isinstance(goal, AtPose)]
     to_restore = [starts[index] for index in table.rng.permutation(len(starts))]
-    apart = DistractorsApart(arrangement.distractor_ids, at_end=True)
-    if restore_distractor and arrangement.distractor is not None:
-        to_restore.append(arrangement.distractor)
-        apart = DistractorsApart(arrangement.distractor_ids, at_end=True, goals=tuple(range(len(arrange))))
-    restore = tuple(AtPose(start.id, start.pose, TOLERANCE) for start in to_restore)
-    return Problem(
-        scene=table.scene(),
-        prompt=Prompt.parse(TEMPLATE, scene=arrangement.goal_image),
+    if restore_distractor and len(starts) == 1 and apart.object_ids:
+        to_restore.append(problem.scene[apart.object_ids[0]])
+        apart = replace(apart, goals=tuple(range(len(arrange))))
+    restore = tuple(AtPose(start.id, start.pose, rearrange.TOLERANCE) for start in to_restore)
+    return replace(
+        problem,
+        prompt=Prompt(TEMPLATE, problem.prompt.images),
         goals=(*arrange, *restore),
         constraints=(apart,),
         stages=(len(arrange), len(restore)),
-        prerequisites=arrangement.prerequisites,
     )

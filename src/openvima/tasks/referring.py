@@ -15,7 +15,6 @@ from dataclasses import replace
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
 from openvima.errors import SamplingError
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_count
 from openvima.tasks.placing import ANGLES_DEG, TOLERANCE, rotation_goal
 from openvima.tasks.referring_grammar import (
     MOST_MOVED,
@@ -43,21 +42,14 @@ _TRIES = 30
 _SPARE_STEPS = 2
 
 
-def referring_problem(
-    table: TableSampler, kind: str, *, template: int | None, num_objects: int | None
-) -> Problem:
+def referring_problem(table: TableSampler, kind: str) -> Problem:
     """Set a table, and draw a sentence of a kind whose meaning is clear there.
 
     Raises:
-        ConfigError: An option is out of range.
         SamplingError: An object found no place, or no sentence is clear.
     """
-    options = templates(kind)
-    if template is not None:
-        check_count("template", template, high=len(options) - 1)
-    command, phrase = table.choose(options) if template is None else options[template]
-    least, most = phrase.num_objects if num_objects is None else (num_objects, num_objects)
-    check_count("num_objects", least, low=4, high=7)
+    command, phrase = table.choose(templates(kind))
+    least, most = phrase.num_objects
 
     bases = _place_bases(table, {"put": 1, "rotate": 0, "into": 2}[command])
     loose, absent = _place_objects(table, bases, int(table.rng.integers(least, most + 1)), command)
@@ -139,17 +131,9 @@ def _register(kind: str) -> None:
         oracle_max_steps=MOST_MOVED + _SPARE_STEPS,
         summary=SUMMARIES[kind],
     )
-    def sample(
-        table: TableSampler, *, template: int | None = None, num_objects: int | None = None
-    ) -> Problem:
-        """Sample one problem.
-
-        Args:
-            table: Sampler of the scene.
-            template: Number of the template, in the order of the grammar; by default drawn.
-            num_objects: Loose objects, 4 … 7; by default as the template asks.
-        """
-        return referring_problem(table, kind, template=template, num_objects=num_objects)
+    def sample(table: TableSampler) -> Problem:
+        """Sample one problem."""
+        return referring_problem(table, kind)
 
 
 for _kind in PHRASES:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, ObjectImage, Problem, Prompt
 from openvima.tasks.options import check_difficulty, check_num_distractors
-from openvima.tasks.placing import ANGLES_DEG, check_angles, check_asymmetric, rotation_goal
+from openvima.tasks.placing import ANGLES_DEG, check_angles, rotation_goal
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -45,7 +45,6 @@ def sample(
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
     check_num_distractors(num_distractors)
     check_angles(angles_deg)
-    check_asymmetric(table.pool)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     angle_deg = table.choose(angles_deg)

@@ -9,7 +9,6 @@ Source:   VIMA paper, task list of the appendix, "Visual reasoning".
 """
 
 from openvima.catalog import Pool, object_spec
-from openvima.errors import ConfigError
 from openvima.scene import Problem
 from openvima.tasks.placing import gathering_problem, object_counts
 from openvima.tasks.registry import register_task
@@ -56,9 +55,4 @@ def _by_profile(pool: Pool, base_object: str) -> tuple[list[str], list[str]]:
     profile = object_spec(base_object).profile
     alike = [name for name in pool.dragged_objects if object_spec(name).profile == profile]
     different = [name for name in pool.dragged_objects if object_spec(name).profile != profile]
-    if not alike or not different:
-        raise ConfigError(
-            f"the pool's dragged objects are {', '.join(pool.dragged_objects)}; some must have the profile "
-            f"of the base {base_object!r} ({profile}) and some another one."
-        )
     return alike, different

@@ -18,12 +18,11 @@ TEMPLATE = "Put each {shape_1} into {base_1}, each {shape_2} into {base_2} and e
 
 
 @register_task("sort_by_shape", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=11)
-def sample(table: TableSampler, *, num_objects: int | None = None, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
-        num_objects: Objects to sort, 6 … 8; by default drawn.
         num_distractors: Objects of other shapes, 0 … 3.
     """
     pool = table.pool
@@ -36,6 +35,5 @@ def sample(table: TableSampler, *, num_objects: int | None = None, num_distracto
         draw_distractor=lambda: (table.choose(others), table.choose(pool.dragged_textures)),
         base_textures=pool.base_textures,
         describe=lambda number, group: {f"shape_{number + 1}": gray_image(group[0])},
-        num_objects=num_objects,
         num_distractors=num_distractors,
     )

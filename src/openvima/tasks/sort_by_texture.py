@@ -20,12 +20,11 @@ TEMPLATE = (
 
 
 @register_task("sort_by_texture", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=11)
-def sample(table: TableSampler, *, num_objects: int | None = None, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
-        num_objects: Objects to sort, 6 … 8; by default drawn.
         num_distractors: Objects of other textures, 0 … 3.
     """
     pool = table.pool
@@ -38,6 +37,5 @@ def sample(table: TableSampler, *, num_objects: int | None = None, num_distracto
         draw_distractor=lambda: (table.choose(pool.dragged_objects), table.choose(others)),
         base_textures=others,
         describe=lambda number, _: {f"texture_{number + 1}": textures[number]},
-        num_objects=num_objects,
         num_distractors=num_distractors,
     )

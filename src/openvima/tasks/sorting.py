@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_count
+from openvima.tasks.options import check_num_distractors
 from openvima.tasks.table import TableSampler
 
 NUM_GROUPS = 3
@@ -27,7 +27,6 @@ def sorting_problem(
     draw_distractor: Callable[[], Appearance],
     base_textures: Sequence[str],
     describe: Callable[[int, Sequence[Placement]], Mapping[str, Fill]],
-    num_objects: int | None,
     num_distractors: int,
 ) -> Problem:
     """Place three containers, the objects of three groups and distractors, and build the problem.
@@ -39,16 +38,13 @@ def sorting_problem(
         draw_distractor: Draws that of an object of no group.
         base_textures: Textures of containers, which all differ.
         describe: Returns the fills of the prompt that name a group, from its number and its objects.
-        num_objects: Objects of all groups, 6 … 8; None draws the number.
         num_distractors: Objects of no group, 0 … 3.
 
     Raises:
-        ConfigError: A number is out of range.
+        ConfigError: The number is out of range.
     """
-    if num_objects is None:
-        num_objects = int(table.rng.integers(LEAST, MOST + 1))
-    check_count("num_objects", num_objects, low=LEAST, high=MOST)
-    check_count("num_distractors", num_distractors, high=MAX_DISTRACTORS)
+    num_objects = int(table.rng.integers(LEAST, MOST + 1))
+    check_num_distractors(num_distractors, high=MAX_DISTRACTORS)
     textures = table.rng.choice(base_textures, size=NUM_GROUPS, replace=False).tolist()
     side = table.choose((-1, 1))  # of the table where the containers are
     bases = [

@@ -1,7 +1,7 @@
-"""Shared parts of the sweeping tasks: roles, area, line, groups of small blocks, and the problem."""
+"""Shared parts of the sweeping tasks: area, line, groups of small blocks, and the problem."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 
 from openvima.catalog import Vector3, object_spec
 from openvima.errors import SamplingError
@@ -92,51 +92,6 @@ NUMBER_WORDS = ("one", "two", "three")
 _FACING = -math.pi / 2  # rotates the area's open side, +y, to +x
 
 
-@dataclass(frozen=True, slots=True)
-class Roles:
-    """Objects of a sweeping task.
-
-    Args:
-        num_swept: Number of blocks to sweep.
-        num_distractors: Number of distractors.
-        swept_texture, bounds_texture, line_texture, distractor_texture: Their textures.
-        swept_corner, distractor_corner: Lower corners of the blocks' squares, x and y in metres.
-    """
-
-    num_swept: int
-    num_distractors: int
-    swept_texture: str
-    bounds_texture: str
-    line_texture: str
-    distractor_texture: str
-    swept_corner: Corner
-    distractor_corner: Corner
-
-
-def sample_roles(table: TableSampler, difficulty: str, num_distractors: int | None = None) -> Roles:
-    """Draw the number of blocks, the textures and the sides.
-
-    Args:
-        table: Sampler of the scene.
-        difficulty: "easy", "medium" or "hard": increasing probability of two or three blocks.
-        num_distractors: Distractors, 0 … 6; None: as many as blocks to sweep.
-
-    Raises:
-        ConfigError: There is no such difficulty, or the number is out of range.
-    """
-    check_difficulty(difficulty)
-    check_num_distractors(0 if num_distractors is None else num_distractors)
-    rng, pool = table.rng, table.pool
-    num_swept = 1 + int(rng.choice(3, p=NUM_SWEPT_WEIGHTS[difficulty]))
-    swept = table.choose(pool.dragged_textures)
-    bounds = table.choose(pool.base_textures)
-    line = table.choose([texture for texture in pool.base_textures if texture != bounds])
-    corners = CORNERS if rng.random() < 0.5 else CORNERS[::-1]
-    distractor = table.choose([texture for texture in pool.dragged_textures if texture != swept])
-    num_distractors = num_swept if num_distractors is None else num_distractors
-    return Roles(num_swept, num_distractors, swept, bounds, line, distractor, *corners)
-
-
 def place_flat(
     table: TableSampler, object_name: str, texture: str, *, x: float, scale: tuple[float, float]
 ) -> Placement:
@@ -155,43 +110,53 @@ def place_flat(
     return table.add(object_name, texture, size=size, pose=Pose.planar(x, 0.0, _FACING), fixed=True)
 
 
+Layout = tuple[Placement, Placement, Zone, Placement]
+"""Area and line, the goal of the blocks, and which of the two it is relative to."""
+
+
 def sweep_problem(
     table: TableSampler,
-    roles: Roles,
-    *,
     template: str,
-    bounds: Placement,
-    line: Placement,
-    zone: Zone,
-    zone_marker: Placement,
+    *,
+    difficulty: str,
+    num_distractors: int | None,
+    lay_out: Callable[[str, str], Layout],
     distractor_spread_m: float,
 ) -> Problem:
-    """Scatter the blocks, draw the quantifier and build the problem.
+    """Draw roles and textures, place area, line and blocks, and build the problem.
 
     Args:
-        table: Sampler of the scene, with area and line placed.
-        roles: Objects of the task.
+        table: Sampler of the scene.
         template: The prompt with its slots.
-        bounds: The area.
-        line: The line that no block to sweep may touch.
-        zone: Goal of the blocks.
-        zone_marker: `bounds` or `line`: the object that the zone is relative to.
+        difficulty: "easy", "medium" or "hard": increasing probability of two or three blocks.
+        num_distractors: Distractors, 0 … 6; None: as many as blocks to sweep.
+        lay_out: Places area and line in two textures; no block to sweep may touch the line.
         distractor_spread_m: Side of the distractors' square.
 
     Raises:
+        ConfigError: There is no such difficulty, or the number is out of range.
         SamplingError: No valid group of blocks was found.
     """
+    check_difficulty(difficulty)
+    check_num_distractors(0 if num_distractors is None else num_distractors)
+    rng, pool = table.rng, table.pool
+    num_swept = 1 + int(rng.choice(3, p=NUM_SWEPT_WEIGHTS[difficulty]))
+    swept_texture = table.choose(pool.dragged_textures)
+    bounds_texture = table.choose(pool.base_textures)
+    line_texture = table.choose([texture for texture in pool.base_textures if texture != bounds_texture])
+    swept_corner, distractor_corner = CORNERS if rng.random() < 0.5 else CORNERS[::-1]
+    distractor_texture = table.choose([each for each in pool.dragged_textures if each != swept_texture])
+    num_distractors = num_swept if num_distractors is None else num_distractors
+    bounds, line, zone, zone_marker = lay_out(bounds_texture, line_texture)
 
     def scatter(texture: str, corner: Corner, spread_m: float, count: int) -> list[Placement]:
         return scattered_blocks(table, texture, corner=corner, spread_m=spread_m, count=count, outside=zone)
 
-    if roles.num_distractors > len(NUMBER_WORDS):  # more than published find no place in a small square
+    if num_distractors > len(NUMBER_WORDS):  # more than published find no place in a small square
         distractor_spread_m = SWEPT_SPREAD_M
-    swept = scatter(roles.swept_texture, roles.swept_corner, SWEPT_SPREAD_M, roles.num_swept)
-    distractors = scatter(
-        roles.distractor_texture, roles.distractor_corner, distractor_spread_m, roles.num_distractors
-    )
-    words = ("any", *NUMBER_WORDS[: roles.num_swept], "all")
+    swept = scatter(swept_texture, swept_corner, SWEPT_SPREAD_M, num_swept)
+    distractors = scatter(distractor_texture, distractor_corner, distractor_spread_m, num_distractors)
+    words = ("any", *NUMBER_WORDS[:num_swept], "all")
     word = table.choose(words)
     ids = tuple(block.id for block in swept)
     forbidden = Zone(line.pose.x, line.pose.y, line.size[1], line.size[0])
@@ -209,5 +174,5 @@ def sweep_problem(
             NeverTouches(ids, forbidden, "line"),
             ZoneKeptClear(tuple(block.id for block in distractors), zone),
         ),
-        num_required={"any": 1, "all": roles.num_swept}.get(word) or words.index(word),
+        num_required={"any": 1, "all": num_swept}.get(word) or words.index(word),
     )

@@ -9,7 +9,7 @@ Source:   VIMA paper, task list of the appendix, "Visual constraint satisfaction
 
 from openvima.scene import Placement, Problem, Zone
 from openvima.tasks.registry import register_task
-from openvima.tasks.sweep_table import place_flat, sample_roles, sweep_problem
+from openvima.tasks.sweep_table import Layout, place_flat, sweep_problem
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Sweep {det} {swept_obj} into {bounds} without exceeding {constraint}."
@@ -35,18 +35,19 @@ def sample(table: TableSampler, *, num_distractors: int | None = None, difficult
         num_distractors: Blocks of another texture, 0 … 6; by default as many as blocks to sweep.
         difficulty: "easy", "medium" or "hard": more and more often two or three blocks.
     """
-    roles = sample_roles(table, difficulty, num_distractors)
-    bounds = place_flat(table, table.pool.base_objects[0], roles.bounds_texture, x=AREA_X, scale=AREA_SCALE)
-    low, high = (AREA_X + (fraction - 0.5) * bounds.size[0] for fraction in LINE_RANGE)
-    line = place_flat(table, "line", roles.line_texture, x=table.rng.uniform(low, high), scale=LINE_SCALE)
+
+    def lay_out(bounds_texture: str, line_texture: str) -> Layout:
+        bounds = place_flat(table, table.pool.base_objects[0], bounds_texture, x=AREA_X, scale=AREA_SCALE)
+        low, high = (AREA_X + (fraction - 0.5) * bounds.size[0] for fraction in LINE_RANGE)
+        line = place_flat(table, "line", line_texture, x=table.rng.uniform(low, high), scale=LINE_SCALE)
+        return bounds, line, _zone_in_front(line, bounds), line
+
     return sweep_problem(
         table,
-        roles,
-        template=TEMPLATE,
-        bounds=bounds,
-        line=line,
-        zone=_zone_in_front(line, bounds),
-        zone_marker=line,
+        TEMPLATE,
+        difficulty=difficulty,
+        num_distractors=num_distractors,
+        lay_out=lay_out,
         distractor_spread_m=DISTRACTOR_SPREAD_M,
     )
 

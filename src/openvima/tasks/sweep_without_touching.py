@@ -10,7 +10,7 @@ Source:   VIMA paper, task list of the appendix, "Visual constraint satisfaction
 
 from openvima.scene import Problem, Zone
 from openvima.tasks.registry import register_task
-from openvima.tasks.sweep_table import place_flat, sample_roles, sweep_problem
+from openvima.tasks.sweep_table import Layout, place_flat, sweep_problem
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Sweep {det} {swept_obj} into {bounds} without touching {constraint}."
@@ -37,16 +37,17 @@ def sample(table: TableSampler, *, num_distractors: int | None = None, difficult
         difficulty: "easy": the line leaves gaps on both sides of the mouth; "medium" and "hard": it is
             wider than the mouth, and two or three blocks are more frequent.
     """
-    roles = sample_roles(table, difficulty, num_distractors)
-    bounds = place_flat(table, table.pool.base_objects[0], roles.bounds_texture, x=AREA_X, scale=AREA_SCALE)
-    line = place_flat(table, "line", roles.line_texture, x=LINE_X, scale=LINE_SCALE[difficulty])
+
+    def lay_out(bounds_texture: str, line_texture: str) -> Layout:
+        bounds = place_flat(table, table.pool.base_objects[0], bounds_texture, x=AREA_X, scale=AREA_SCALE)
+        line = place_flat(table, "line", line_texture, x=LINE_X, scale=LINE_SCALE[difficulty])
+        return bounds, line, Zone(AREA_X, 0.0, *bounds.size[:2]), bounds
+
     return sweep_problem(
         table,
-        roles,
-        template=TEMPLATE,
-        bounds=bounds,
-        line=line,
-        zone=Zone(AREA_X, 0.0, *bounds.size[:2]),
-        zone_marker=bounds,
+        TEMPLATE,
+        difficulty=difficulty,
+        num_distractors=num_distractors,
+        lay_out=lay_out,
         distractor_spread_m=DISTRACTOR_SPREAD_M,
     )

@@ -4,12 +4,12 @@ import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from openvima.catalog import Assets, Pool, Vector3, object_spec
-from openvima.catalog.geometry import CollisionBox, CollisionShape
+from openvima.catalog.geometry import CollisionShape
 from openvima.errors import SamplingError
 from openvima.scene import FIRST_OBJECT_ID, WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Placement, Pose, Scene
 
@@ -85,6 +85,10 @@ class TableSampler:
         self._end_effector: EndEffector = end_effector
         self._labels, self._heights = empty_labels()
 
+    def appearances(self) -> list[tuple[str, str]]:
+        """All shapes and textures of dragged objects of the pool."""
+        return list(itertools.product(self.pool.dragged_objects, self.pool.dragged_textures))
+
     def choose(self, options: Sequence[T]) -> T:
         """Draw one option uniformly."""
         return options[int(self.rng.integers(len(options)))]
@@ -145,20 +149,9 @@ class TableSampler:
             raise SamplingError(f"only {len(placed)} of {count} × {what} found a place in {tries} tries.")
         return placed
 
-    def place_one(
-        self,
-        what: str,
-        draw: Callable[[], tuple[str, str]],
-        *,
-        tries: int = 10,
-        size: Vector3 | None = None,
-        scale: Vector3 = NO_SCALE,
-        apart_m: float = 0.0,
-        reject: Reject = never,
-    ) -> Placement:
-        """Place one object; see `place`."""
-        placed = self.place(what, draw, tries=tries, size=size, scale=scale, apart_m=apart_m, reject=reject)
-        return placed[0]
+    def place_one(self, what: str, draw: Callable[[], tuple[str, str]], **settings: Any) -> Placement:
+        """Place one object, with the settings of `place`."""
+        return self.place(what, draw, **settings)[0]
 
     def find_place(
         self,
@@ -409,12 +402,7 @@ def is_wedged(placement: Placement, base: Placement, assets: Assets) -> bool:
 
 def _shadow(part: CollisionShape, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest coordinates of a convex part on the table along all directions, shape (64,), m."""
-    if isinstance(part, CollisionBox):
-        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-        points = signs * part.half_size + part.centre
-    else:
-        points = part.points
-    along = pose.transform(points)[:, :2] @ _DIRECTIONS
+    along = pose.transform(part.points)[:, :2] @ _DIRECTIONS
     return along.min(axis=0), along.max(axis=0)
 
 

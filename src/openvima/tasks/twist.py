@@ -9,49 +9,35 @@ Source:   VIMA paper, task list of the appendix, "Twist".
 """
 
 import math
-from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, Placement, Pose, Problem, Prompt, SceneImage
-from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.placing import (
     ANGLES_DEG,
-    check_angles,
-    check_asymmetric,
     rotated_clockwise,
     rotation_goal,
 )
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
-TEMPLATE = (
-    '"Twist" is defined as rotating object a specific angle. For examples: {examples} '
-    "Now twist all {twist_obj_texture} objects."
-)
-EXAMPLE = "From {{before_twist_{n}}} to {{after_twist_{n}}}."
 NUM_EXAMPLES = 3
+EXAMPLES = " ".join(f"From {{before_twist_{n}}} to {{after_twist_{n}}}." for n in range(1, NUM_EXAMPLES + 1))
+REQUEST = "Now twist all {twist_obj_texture} objects."
+TEMPLATE = f'"Twist" is defined as rotating object a specific angle. For examples: {EXAMPLES} {REQUEST}'
 NUM_OBJECTS = {"easy": 3, "medium": 4, "hard": 5}
 TOLERANCE_M = 0.05
 EXAMPLE_LOW, EXAMPLE_HIGH = (0.4375, -0.375), (0.5625, 0.375)  # m, x and y, of objects in examples
 
 
-def template(num_examples: int) -> str:
-    """Write the slots of the examples into the prompt."""
-    examples = " ".join(EXAMPLE.format(n=n) for n in range(1, num_examples + 1))
-    return TEMPLATE.replace("{examples}", examples)
-
-
 @register_task(
     "twist",
     family="novel_concept_grounding",
-    template=template(NUM_EXAMPLES),
+    template=TEMPLATE,
     oracle_max_steps=NUM_OBJECTS["easy"] + 2,
 )
 def sample(
     table: TableSampler,
     *,
-    angles_deg: Sequence[float] = ANGLES_DEG,
-    num_examples: int = NUM_EXAMPLES,
-    num_objects: int | None = None,
     num_distractors: int | None = None,
     difficulty: str = "easy",
 ) -> Problem:
@@ -59,26 +45,19 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        angles_deg: Possible angles; positive is clockwise seen from above.
-        num_examples: Image pairs in the prompt, 1 … 6.
-        num_objects: Objects on the table, 2 … 6; by default that of the difficulty. At least one is a
-            target and at least one a distractor.
         num_distractors: Distractors, 0 … 6; by default the objects that are no targets.
-        difficulty: "easy", "medium" or "hard": 3, 4 or 5 objects.
+        difficulty: "easy", "medium" or "hard": 3, 4 or 5 objects, at least one of them a target and at least
+            one a distractor.
     """
     check_difficulty(difficulty)
-    num_objects = NUM_OBJECTS[difficulty] if num_objects is None else num_objects
-    check_count("num_objects", num_objects, low=2, high=6)
-    check_count("num_examples", num_examples, low=1, high=6)
-    check_angles(angles_deg)
-    check_asymmetric(table.pool)
+    num_objects = NUM_OBJECTS[difficulty]
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     num_targets = int(table.rng.integers(1, num_objects))
     if num_distractors is None:
         num_distractors = num_objects - num_targets
     check_num_distractors(num_distractors)
-    angle_deg, texture = table.choose(angles_deg), table.choose(textures)
+    angle_deg, texture = table.choose(ANGLES_DEG), table.choose(textures)
     others = [other for other in textures if other != texture]
     targets = table.place(
         "object to rotate",
@@ -93,13 +72,13 @@ def sample(
         tries=num_distractors + 10,
     )
     examples: dict[str, SceneImage] = {}
-    for n in range(1, num_examples + 1):
+    for n in range(1, NUM_EXAMPLES + 1):
         before = _example(table.blank(), table.choose(targets).object, table.choose(others))
         examples[f"before_twist_{n}"] = SceneImage.of([before])
         examples[f"after_twist_{n}"] = SceneImage.of([before.at(rotated_clockwise(before.pose, angle_deg))])
     return Problem(
         scene=table.scene(),
-        prompt=Prompt.parse(template(num_examples), twist_obj_texture=texture, **examples),
+        prompt=Prompt.parse(TEMPLATE, twist_obj_texture=texture, **examples),
         goals=tuple(rotation_goal(target, angle_deg, position_m=TOLERANCE_M) for target in targets),
         constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
         oracle_max_steps=num_objects + 2,
