@@ -22,7 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import openvima
 from openvima.env import stack_actions
 from openvima.scene import Action
-from openvima.sim.model import _model_cache
+from openvima.sim.model import build_model
 from sim import circumstances
 
 
@@ -46,7 +46,7 @@ def record(task: str, index: int, num_envs: int, steps: int) -> list[Action | No
 
 def time_single(tasks: Sequence[str], plans: Sequence[Sequence[Action | None]]) -> float:
     """Return the seconds that single environments take for the second half of the steps."""
-    _model_cache.cache_clear()
+    build_model.cache_clear()
     envs = [openvima.make(tasks[index % len(tasks)]) for index in range(len(plans))]
     for index, env in enumerate(envs):
         env.reset(seed=index)
@@ -65,7 +65,7 @@ def time_single(tasks: Sequence[str], plans: Sequence[Sequence[Action | None]]) 
 
 def time_batch(tasks: Sequence[str], plans: Sequence[Sequence[Action | None]], num_workers: int) -> float:
     """Return the seconds that a vector environment takes for the second half of the steps."""
-    _model_cache.cache_clear()
+    build_model.cache_clear()
     num_seeds = len(plans) * (len(plans[0]) + 1)
     envs = openvima.make_vec(list(tasks), len(plans), num_workers=num_workers, seeds=range(num_seeds))
     try:

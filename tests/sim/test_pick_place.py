@@ -193,7 +193,7 @@ def test_recording_and_watching_change_nothing(scene, action) -> None:
 def test_from_frame_to_frame_nothing_jumps(scene, action) -> None:
     frames = []
     world = World(scene, ASSETS)
-    world.execute(action, record=lambda *frame: frames.append(frame), frames_per_second=30)
+    world.execute(action, record=lambda *frame: frames.append(frame))
     assert 50 < len(frames) < 200
     joints = np.array([ur5.HOME, *(frame[1] for frame in frames), world.joints])
     assert np.linalg.norm(np.diff(joints, axis=0), axis=1).max() < 1.5 * FREE_SPEED / 30

@@ -50,9 +50,6 @@ class ObjectNames(Mapping[int, dict[str, str]]):
         return repr(self._names)
 
 
-FRAMES_PER_SECOND = 30
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoFrame:
     """One frame of a video, not yet rendered.
@@ -142,7 +139,6 @@ class PrimitiveRun:
             action,
             monitor=self.monitor if goals.needs_monitoring(self.episode.problem) else None,
             record=self.record if realtime else None,
-            frames_per_second=FRAMES_PER_SECOND,
         )
         self.grasped, self.joint_path = execution.grasped, execution.joint_path
         self.num_steps += 1

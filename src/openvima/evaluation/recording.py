@@ -9,7 +9,6 @@ from PIL import Image, ImageDraw
 
 from openvima.atomic_io import atomic_write_file
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.env.running_episode import FRAMES_PER_SECOND
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import PolicyError
 from openvima.evaluation.results import EpisodeOutcome
@@ -19,6 +18,7 @@ from openvima.input_files import as_path
 from openvima.policies.loading import load_policy
 from openvima.scene import Episode
 from openvima.scene.explanation import Explanation
+from openvima.sim.primitive_state import FRAMES_PER_SECOND
 from openvima.video.encoder import Animation, png
 from openvima.video.prompt_strip import MUTED, PAPER, draw_prompt_strip, font
 from openvima.video.recorder import ENLARGE, EpisodeRecorder, SceneRenderer

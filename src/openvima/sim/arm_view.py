@@ -29,9 +29,6 @@ def arm_drawables(joints: np.ndarray, end_effector: EndEffector) -> tuple[Drawab
     Returns:
         One body per segmentation value and colour, in world coordinates: the arm has id 2, the gripper's base
         3 and its head 4; the spatula has id 3.
-
-    Raises:
-        ShapeError: `joints` does not have shape (6,).
     """
     frames = link_frames(joints)
     return tuple(

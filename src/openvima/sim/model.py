@@ -15,8 +15,7 @@ VIMA-Bench multiplies the friction coefficients of a pair; MuJoCo takes the larg
 
 import hashlib
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import mujoco
@@ -30,8 +29,7 @@ from openvima.sim.ur5 import PROBE_RADIUS_M, SPATULA_HALF_SIZE_M
 mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)
 # By default MuJoCo caches up to 500 MB of hulls; containers come in any size, so few recur, and
 # compiling is as fast with 8 MB.
-if hasattr(mujoco, "mj_setCacheCapacity"):
-    mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 8 << 20)
+mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 8 << 20)
 
 TICK_S = 1 / 240
 GRAVITY_M_S2 = 9.8
@@ -46,13 +44,12 @@ _INERTIA_GROWTH_M = 0.003  # by which hull bounds are grown for that, on every s
 _TURNING_DAMPING_PER_S = 3.0  # else discs keep wobbling; its linear effect is 100 times smaller
 _SPATULA_MASS_KG = 17.0  # stopping it within a tick takes about the 500 N of VIMA-Bench's tool mount
 PARKED_M = 1000.0  # height of bodies out of contact
-_MODEL_CACHE_SIZE = 256
 _MEMORY_BYTES = 64 << 20  # reserved; crowded scenes use 0.3 MB, a heap of overlapping bodies 5 MB
 PROBE_HALF_LENGTH_M = 0.2
 _COLLIDES, _COLLIDES_WITH_SPATULA = 1, 2  # bits of contype and conaffinity
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class BodyShape:
     """One body without its pose; bodies with equal `key` are equal.
 
@@ -67,12 +64,12 @@ class BodyShape:
     """
 
     key: bytes
-    shapes: tuple[CollisionShape, ...]
-    points: np.ndarray
-    radius_m: float
-    spec: ObjectSpec
-    fixed: bool
-    inertia: Vector3
+    shapes: tuple[CollisionShape, ...] = field(compare=False)
+    points: np.ndarray = field(compare=False)
+    radius_m: float = field(compare=False)
+    spec: ObjectSpec = field(compare=False)
+    fixed: bool = field(compare=False)
+    inertia: Vector3 = field(compare=False)
 
 
 @lru_cache(maxsize=256)
@@ -82,7 +79,9 @@ def body_shape(object_name: str, geometry: Geometry, fixed: bool) -> BodyShape:
     digest = hashlib.sha1(repr((spec.mass_kg, spec.friction, spec.com_offset, fixed)).encode())
     for shape in geometry.collision:
         digest.update(repr(shape).encode() if isinstance(shape, CollisionBox) else shape.points.tobytes())
-    corners = [_corners(shape) for shape in geometry.collision]
+    corners = [
+        np.c_[shape.points, np.full(len(shape.points), _margin(shape))] for shape in geometry.collision
+    ]
     points = np.concatenate(corners) if corners else np.zeros((0, 4))
     reach = np.linalg.norm(points[:, :3], axis=1) + points[:, 3]
     return BodyShape(
@@ -96,11 +95,8 @@ def body_shape(object_name: str, geometry: Geometry, fixed: bool) -> BodyShape:
     )
 
 
-def _corners(shape: CollisionShape) -> np.ndarray:
-    if isinstance(shape, CollisionBox):
-        signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
-        return np.c_[np.asarray(shape.centre) + signs * np.asarray(shape.half_size), np.full(8, BOX_MARGIN_M)]
-    return np.c_[shape.points, np.full(len(shape.points), HULL_MARGIN_M)]
+def _margin(shape: CollisionShape) -> float:
+    return BOX_MARGIN_M if isinstance(shape, CollisionBox) else HULL_MARGIN_M
 
 
 def _inertia(points: np.ndarray, mass_kg: float) -> Vector3:
@@ -112,25 +108,13 @@ def _inertia(points: np.ndarray, mass_kg: float) -> Vector3:
     return (float(y + z), float(x + z), float(x + y))
 
 
-@lru_cache(maxsize=_MODEL_CACHE_SIZE)
-def _model_cache(key: tuple[bytes, ...], with_spatula: bool) -> list[mujoco.MjModel]:
-    """A cached list for the model of these bodies; empty at first."""
-    return []
-
-
-def build_model(bodies: Sequence[BodyShape], *, with_spatula: bool) -> mujoco.MjModel:
-    """Compile the model of some bodies, cached.
+@lru_cache(maxsize=256)
+def build_model(bodies: tuple[BodyShape, ...], *, with_spatula: bool) -> mujoco.MjModel:
+    """Compile the model of some bodies.
 
     Body 0 is the world, the next ones are `bodies` in order, then probe and spatula. Free joints are in
     the same order, the spatula's last.
     """
-    cached = _model_cache(tuple(body.key for body in bodies), with_spatula)
-    if not cached:
-        cached.append(_compile(bodies, with_spatula))
-    return cached[0]
-
-
-def _compile(bodies: Sequence[BodyShape], with_spatula: bool) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.memory = _MEMORY_BYTES
     spec.compiler.usethread = False  # a scene has a few small hulls: threads take longer to start
@@ -185,11 +169,8 @@ def _add_body(
     names = []
     for part, shape in enumerate(body.shapes):
         name = f"body{index}/{part}"
-        box = isinstance(shape, CollisionBox)
-        contact = _contact(
-            friction, slippery=friction < 1, affinity=affinity, margin=BOX_MARGIN_M if box else HULL_MARGIN_M
-        )
-        if box:
+        contact = _contact(friction, slippery=friction < 1, affinity=affinity, margin=_margin(shape))
+        if isinstance(shape, CollisionBox):
             place = {
                 "type": mujoco.mjtGeom.mjGEOM_BOX,
                 "size": list(shape.half_size),

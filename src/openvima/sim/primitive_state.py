@@ -68,6 +68,8 @@ class Settling:
             self._bodies.refresh()
 
 
+FRAMES_PER_SECOND = 30  # of simulated time, in a video
+FRAME_S = 1 / FRAMES_PER_SECOND
 FREE_SPEED = 2.4  # rad/s, Euclidean norm over the joints, as in VIMA-Bench
 SWEEP_SPEED = 0.48
 
@@ -93,13 +95,11 @@ class ArmPath:
     Args:
         joints: Joint angles at the start, shape (6,), radians.
         record: Called with scene and joints for every video frame, or None.
-        frames_per_second: Frame rate of the video.
     """
 
-    def __init__(self, joints: np.ndarray, record: RecordFrame | None, frames_per_second: float) -> None:
+    def __init__(self, joints: np.ndarray, record: RecordFrame | None) -> None:
         self.waypoints = [np.array(joints, dtype=np.float64)]
         self._record = record
-        self._frame_s = 1 / frames_per_second
         self._since_frame_s = 0.0
         self._stored: list[Scene] = []
 
@@ -155,11 +155,11 @@ class ArmPath:
         """Times within the coming `duration_s` seconds at which a frame is due."""
         if self._record is None:
             return
-        due_s = self._frame_s - self._since_frame_s
-        count = max(0, math.floor((duration_s - due_s) / self._frame_s + 1e-9) + 1)
-        self._since_frame_s += duration_s - count * self._frame_s
+        due_s = FRAME_S - self._since_frame_s
+        count = max(0, math.floor((duration_s - due_s) / FRAME_S + 1e-9) + 1)
+        self._since_frame_s += duration_s - count * FRAME_S
         for index in range(count):
-            yield due_s + index * self._frame_s
+            yield due_s + index * FRAME_S
 
 
 RESTING_GAP_M = 5e-4  # bodies nearer than this may support each other

@@ -147,7 +147,7 @@ class ToolWorld:
         return True
 
     def _new_state(self, monitor: Callable[[Scene], None] | None) -> PrimitiveState:
-        return PrimitiveState(self._scene, self._bodies, ArmPath(self._joints, None, CONTROL_HZ), monitor)
+        return PrimitiveState(self._scene, self._bodies, ArmPath(self._joints, None), monitor)
 
     def _take_hold(self, monitor: Callable[[Scene], None] | None) -> None:
         """Grasp the body below the cup, or press the spatula to the table, if it is near enough."""

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from openvima.catalog.geometry import Vector3
-from openvima.errors import ActionError, ShapeError
+from openvima.errors import ActionError
 from openvima.scene.scene import Pose, Quaternion, multiply, yaw_quaternion
 
 HOME = np.array([-1.0, -0.5, 0.5, -0.5, -0.5, 0.0]) * math.pi
@@ -57,13 +57,7 @@ def link_frames(joints: np.ndarray) -> tuple[Pose, ...]:
     Returns:
         Eight poses in the world: base, shoulder, upper arm, forearm, wrist 1, wrist 2, wrist 3, flange (z
         along the tool).
-
-    Raises:
-        ShapeError: `joints` does not have shape (6,).
     """
-    joints = np.asarray(joints, dtype=np.float64)
-    if joints.shape != (6,):
-        raise ShapeError(f"joints have shape {joints.shape}; the arm has 6, so give shape (6,).")
     frames = [_WORLD_FROM_BASE]
     for (parent_from_joint, axis), angle in zip(_CHAIN, joints.tolist(), strict=True):
         rotation = [0.0, 0.0, 0.0, math.cos(angle / 2)]
@@ -75,11 +69,7 @@ def link_frames(joints: np.ndarray) -> tuple[Pose, ...]:
 
 
 def forward(joints: np.ndarray) -> Pose:
-    """Pose of the tip for given joint angles, shape (6,), radians; its z axis points along the tool.
-
-    Raises:
-        ShapeError: `joints` does not have shape (6,).
-    """
+    """Pose of the tip for given joint angles, shape (6,), radians; its z axis points along the tool."""
     return link_frames(joints)[-1] @ _FLANGE_FROM_TIP
 
 
@@ -145,14 +135,8 @@ def highest_tip_z(x: float, y: float) -> float:
 
 
 def farthest_tip_distance(z: float) -> float:
-    """Greatest distance from the base axis at which the vertical tool reaches height `z`; both in metres.
-
-    Raises:
-        ActionError: The height is beyond the arm altogether.
-    """
+    """Greatest distance from the base axis at which the vertical tool reaches height `z`; both in metres."""
     height = z + _HEIGHT_OFFSET_M
-    if abs(height) > LONGEST_REACH_M:
-        raise ActionError(f"height {z:.4f} m is out of reach; the arm is {LONGEST_REACH_M:.4f} m long.")
     return math.hypot(math.sqrt(LONGEST_REACH_M**2 - height**2) + WRIST_M, SIDE_OFFSET_M)
 
 

@@ -337,7 +337,6 @@ class World:
         *,
         monitor: Callable[[Scene], None] | None = None,
         record: RecordFrame | None = None,
-        frames_per_second: float = 30,
     ) -> Execution:
         """Execute one action: pick and place, or sweep, depending on the end effector.
 
@@ -346,13 +345,12 @@ class World:
         Args:
             action: The action; positions lie in the workspace.
             monitor: Called with the scene at least every 25 ticks while bodies may move, and at the end.
-            record: Called with scene and joints, shape (6,), for every video frame.
-            frames_per_second: Frame rate in simulated time.
+            record: Called with scene and joints, shape (6,), for every video frame, 30 a second.
 
         Returns:
             The result; `scene` and `joints` are updated.
         """
-        path = ArmPath(self._joints, record, frames_per_second)
+        path = ArmPath(self._joints, record)
         state = PrimitiveState(self._scene, self._bodies, path, monitor)
         if not self._is_settled:
             state.settle(max_speed=SEPARATION_SPEED)

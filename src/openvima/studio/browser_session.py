@@ -16,7 +16,7 @@ import viser
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.env.running_episode import FRAMES_PER_SECOND, VideoFrame
+from openvima.env.running_episode import VideoFrame
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.config import DEFAULT_DEVICE
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_own_rollout_policy
@@ -26,6 +26,7 @@ from openvima.render.rasteriser import SHEET_RGB, SHEET_SIZE
 from openvima.render.raycast import TABLE, Hit, first_hit
 from openvima.scene import Action, EndEffector, Episode, Placement, Pose, RenderedPrompt, Scene
 from openvima.sim.arm_view import arm_parts
+from openvima.sim.primitive_state import FRAMES_PER_SECOND
 from openvima.sim.ur5 import link_frames
 from openvima.tasks.pushes import Push
 from openvima.video.explanation import PLACE

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from openvima.env.running_episode import FRAMES_PER_SECOND
 from openvima.env.tabletop import TabletopEnv, VideoFrame
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene
 from openvima.scene.explanation import Explanation
 from openvima.sim.arm_view import arm_drawables
+from openvima.sim.primitive_state import FRAMES_PER_SECOND
 from openvima.sim.ur5 import HOME
 from openvima.video.encoder import VideoWriter
 from openvima.video.explanation import attention_rows, draw_panel
