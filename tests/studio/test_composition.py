@@ -1,11 +1,15 @@
 """Episodes as arguments of `compose`."""
 
+from dataclasses import replace
+
 import pytest
 
 import openvima
+from openvima.catalog import load_assets
+from openvima.env.composing import scene_objects
 from openvima.errors import SceneError
 from openvima.scene import Episode
-from openvima.studio.composition import compose_values
+from openvima.studio.composition import Composition
 from openvima.tasks import sample_episode
 
 OBJECTS = {
@@ -23,15 +27,16 @@ def composed() -> Episode:
 
 
 def test_a_composed_episode_gives_its_arguments_back() -> None:
-    values = compose_values(composed())
-    assert values["objects"] == OBJECTS and values["prompt"] == PROMPT and values["goals"][:2] == GOALS[:2]
-    assert openvima.compose(**values) == composed()
+    again = Composition.of(composed())
+    assert [replace(each, fixed=None) for each in again.objects] == scene_objects(OBJECTS)
+    assert again.prompt == PROMPT and list(again.goals[:2]) == GOALS[:2]
+    assert again.episode(load_assets()) == composed()
 
 
 @pytest.mark.parametrize("task", ["visual_manipulation", "rotate", "scene_understanding", "rearrange"])
 def test_a_sampled_episode_can_be_changed(task: str) -> None:
     episode = sample_episode(task, seed=2)
-    again = openvima.compose(**compose_values(episode))
+    again = Composition.of(episode).episode(load_assets())
     pairs = list(zip(episode.problem.scene.placements, again.problem.scene.placements, strict=True))
     assert all(old.pose.planar_distance(new.pose) < 1e-5 and old.object == new.object for old, new in pairs)
     assert len(again.problem.goals) == len(episode.problem.goals)
@@ -44,4 +49,4 @@ def test_goals_without_a_composed_form_are_named() -> None:
             return False
 
     with pytest.raises(SceneError, match="goal 0 is a Own"):
-        compose_values(openvima.compose(OBJECTS, "Look.", goals=[Own()]))
+        Composition.of(openvima.compose(OBJECTS, "Look.", goals=[Own()]))

@@ -12,18 +12,13 @@ import yaml
 from openvima.catalog import OBJECTS, object_spec
 from openvima.catalog.geometry import Assets
 from openvima.env.composing import (
-    FIELDS,
     SCALES,
     SceneObject,
     compose,
     default_names,
-    is_fixed_by_default,
-    scene_objects,
 )
-from openvima.errors import SceneError, brief_repr
+from openvima.errors import SceneError
 from openvima.scene import (
-    WORKSPACE_HIGH,
-    WORKSPACE_LOW,
     AtPose,
     EndEffector,
     Episode,
@@ -35,42 +30,6 @@ from openvima.scene import (
 )
 
 _DECIMALS = 6  # of positions and angles that `compose` was given, which come back exactly
-
-
-def compose_values(episode: Episode) -> dict[str, Any]:
-    """Return the arguments of `compose` for an episode, to change one thing and play it again.
-
-    Composed episodes come back exactly, but for handles that the prompt does not show, and photos, which stay
-    `PhotoImage`. Of sampled ones the objects come back at their positions with the proportions of the
-    catalogue, and the goals; constraints and stages have no composed form and are left out.
-
-    Args:
-        episode: A composed or sampled episode.
-
-    Returns:
-        `objects` by handle, `prompt`, `images`, `goals`, `max_steps` and `end_effector`.
-
-    Raises:
-        SceneError: A goal has no composed form.
-    """
-    problem = episode.problem
-    placements, fills = problem.scene.placements, problem.prompt.images
-    handles = _handles(placements, fills)
-    images = {}
-    for slot, fill in fills:
-        shown = _shown(fill, placements)
-        if shown is None:
-            images[slot] = _image(fill)
-        elif handles[shown] != slot:
-            images[slot] = handles[shown]
-    return {
-        "objects": {handles[p.id]: _object(p) for p in placements},
-        "prompt": problem.prompt.text,
-        "images": images,
-        "goals": [_goal(goal, episode, handles, number) for number, goal in enumerate(problem.goals)],
-        "max_steps": episode.max_steps,
-        "end_effector": problem.scene.end_effector,
-    }
 
 
 def _handles(placements: Sequence[Placement], fills: Sequence[tuple[str, PromptFill]]) -> dict[int, str]:
@@ -99,22 +58,15 @@ def _image(fill: PromptFill) -> Any:
     return fill if isinstance(fill, PhotoImage) else [_object(p) for p in fill.scene.placements]
 
 
-def _object(placement: Placement) -> Any:
-    """An object as `compose` takes it, in its short form if that says all."""
+def _object(placement: Placement, name: str = "") -> SceneObject:
+    """An object as `compose` takes it."""
     pose = placement.pose
     position = round(pose.x, _DECIMALS), round(pose.y, _DECIMALS)
     yaw_deg = round(math.degrees(pose.yaw_rad), _DECIMALS)
     sizes = zip(placement.size, placement.scale, object_spec(placement.object).size_max, strict=True)
     factors = [size * scale / largest for size, scale, largest in sizes if largest]  # some are flat
     scale = round(min(max(sum(factors) / len(factors), SCALES[0]), SCALES[1]), 3)
-    extra: dict[str, Any] = {} if scale == 1 else {"scale": scale}
-    if placement.fixed != is_fixed_by_default(placement.object):
-        extra["fixed"] = placement.fixed
-    if extra:
-        named = {"object": placement.object, "texture": placement.texture, "position": position}
-        return {**named, "yaw_deg": yaw_deg, **extra}
-    heading = (yaw_deg,) if yaw_deg else ()
-    return placement.object, placement.texture, position, *heading
+    return SceneObject(placement.object, placement.texture, position, yaw_deg, name, scale, placement.fixed)
 
 
 def _goal(goal: object, episode: Episode, handles: Mapping[int, str], number: int) -> tuple[Any, ...]:
@@ -138,7 +90,9 @@ def _goal(goal: object, episode: Episode, handles: Mapping[int, str], number: in
     return "at", handles[object_id], position, *heading
 
 
-_STEP_M, _EDGE_M = 0.05, 0.1  # of the positions that are tried for a new object
+# Positions that are tried for a new object, nearest to the middle of the table first.
+_GRID = itertools.product((0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65), (y / 20 for y in range(-8, 9)))
+_POSITIONS = sorted(_GRID, key=lambda place: math.dist(place, (0.5, 0.0)))
 _SHELF_X_M, _SHELF_STEP_M, _SHELF_OBJECT_M, _SHELF_COLUMNS = 0.82, 0.066, 0.055, 16
 _ROUND_M, _ROUND_DEG = 3, 1  # decimals of positions and headings
 
@@ -172,19 +126,37 @@ class Composition:
     level: str = "train"
     domain: str = "user"
 
-    __repr__ = brief_repr
-
     @staticmethod
     def of(episode: Episode) -> "Composition":
-        """Return the composition of a composed or sampled episode, as `compose_values` says.
+        """Return the composition of a composed or sampled episode.
+
+        Composed episodes come back exactly, but for handles that the prompt does not show, and photos, which
+        stay `PhotoImage`. Of sampled ones the objects come back at their positions with the proportions of
+        the catalogue, and the goals; constraints and stages have no composed form and are left out.
 
         Raises:
             SceneError: A goal has no composed form.
         """
-        values = compose_values(episode)
-        objects = tuple(scene_objects(values.pop("objects")))
-        values |= {"goals": tuple(values["goals"]), "level": episode.level, "domain": episode.domain}
-        return Composition(objects, **values)
+        problem = episode.problem
+        placements, fills = problem.scene.placements, problem.prompt.images
+        handles = _handles(placements, fills)
+        images = {}
+        for slot, fill in fills:
+            shown = _shown(fill, placements)
+            if shown is None:
+                images[slot] = _image(fill)
+            elif handles[shown] != slot:
+                images[slot] = handles[shown]
+        return Composition(
+            tuple(_object(p, handles[p.id]) for p in placements),
+            problem.prompt.text,
+            images,
+            tuple(_goal(goal, episode, handles, number) for number, goal in enumerate(problem.goals)),
+            episode.max_steps,
+            problem.scene.end_effector,
+            episode.level,
+            episode.domain,
+        )
 
     def episode(self, assets: Assets) -> Episode:
         """Compose the episode.
@@ -233,7 +205,7 @@ class Composition:
         taken = {each.name for each in self.objects} | {*self.images}
         name = next(each for each in default_names() if each not in taken)
         reason = SceneError("there is no room on the table.")
-        for place in _positions() if position is None else [_rounded(position)]:
+        for place in _POSITIONS if position is None else [_rounded(position)]:
             new = replace(self, objects=(*self.objects, SceneObject(object_name, texture, place, name=name)))
             try:
                 replace(new, prompt="-", images={}, goals=()).episode(assets)
@@ -251,10 +223,8 @@ class Composition:
         """Change fields of an object.
 
         Raises:
-            SceneError: There is no such object or field.
+            SceneError: There is no such object.
         """
-        if unknown := fields.keys() - {*FIELDS}:
-            raise SceneError(f"objects have no field {', '.join(unknown)}; they have {', '.join(FIELDS)}.")
         new = replace(self[handle], **fields)
         return replace(self, objects=tuple(new if each.name == handle else each for each in self.objects))
 
@@ -333,15 +303,3 @@ def shelf(texture: str, assets: Assets) -> list[Placement]:
 def _rounded(position: tuple[float, float]) -> tuple[float, float]:
     x, y = (round(float(value), _ROUND_M) for value in position)
     return x, y
-
-
-def _positions() -> list[tuple[float, float]]:
-    """Positions on the table, nearest to its middle first."""
-    (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
-    middle_x, middle_y = (low_x + high_x) / 2, (low_y + high_y) / 2
-    count_x, count_y = (
-        int((high - low - 2 * _EDGE_M) / _STEP_M / 2) for low, high in ((low_x, high_x), (low_y, high_y))
-    )
-    offsets = itertools.product(range(-count_x, count_x + 1), range(-count_y, count_y + 1))
-    ordered = sorted(offsets, key=lambda offset: (offset[0] ** 2 + offset[1] ** 2, offset))
-    return [(round(middle_x + _STEP_M * x, 3), round(middle_y + _STEP_M * y, 3)) for x, y in ordered]
