@@ -69,7 +69,7 @@ def test_help_of_evaluation_is_grouped(capsys) -> None:
         ("report evaluation --out report.pdf", r"\.md or \.tex"),
         ("serve randm", r"there is no policy 'randm'\. Did you mean 'random'"),
         ("serve random --host 0.0.0.0", "give a token"),
-        ("serve random --port 70000", "port is at most 65535"),
+        ("serve random --port 70000", "port must be 0-65535"),
         ("train --loader.batch-size 0", "--loader.batch-size is 0; it must be at least 1."),
         ("train --seed -1", "--seed is -1; it must be between"),
         ("train --preset vima-2m", "set --t5 to the folder .* or set --model.text-encoder to 'small'"),
