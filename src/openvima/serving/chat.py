@@ -9,6 +9,7 @@ import os
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -331,7 +332,7 @@ class VlmPolicy(Policy):
         self._chats = [_Chat(prompt, []) for prompt in prompts]
 
     def act(self, observations: Sequence[Mapping | None]) -> list[Any]:
-        """Ask for the next action of every episode.
+        """Ask for the next action of every episode, of several at a time.
 
         Raises:
             PolicyError: `reset` was not called, or with another number of prompts.
@@ -339,7 +340,8 @@ class VlmPolicy(Policy):
         """
         if len(observations) != len(self._chats):
             raise PolicyError(f"got {len(observations)} observations for {len(self._chats)} prompts.")
-        return [self._act(*both) for both in zip(self._chats, observations, strict=True)]
+        with ThreadPoolExecutor(self.client.config.options.concurrency) as pool:
+            return list(pool.map(self._act, self._chats, observations))
 
     def explain(self) -> list[Explanation | None]:
         """Return the last action and words of each episode."""
