@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch.nn import functional as F
 
 import naive
 from openvima.detector.boxes import (
@@ -17,16 +16,13 @@ from openvima.detector.boxes import (
     nms,
     subsample,
 )
-from openvima.detector.config import small
-from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, MaskHead, RegionProposalNetwork
+from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, RegionProposalNetwork
 from openvima.detector.roi_align import (
     align_levels,
     box_levels,
     crop_masks,
-    normalise,
     paste_masks,
     pyramid_align,
-    rectify_and_pool,
     roi_align,
 )
 
@@ -192,20 +188,6 @@ def test_cropping_and_pasting_keeps_a_mask():
 LEVELS = {"canonical_size": 48, "canonical_level": 1}
 
 
-def test_pixels_are_normalised_and_padded():
-    pixels = torch.arange(2 * 3 * 5 * 7).view(2, 3, 5, 7).to(torch.uint8)
-    mean, std = torch.tensor([10.0, 20, 30]), torch.tensor([2.0, 3, 7])
-    expected = F.pad((pixels - mean.view(3, 1, 1)) / std.view(3, 1, 1), (0, 1, 0, 3))
-    assert torch.equal(normalise(pixels, mean, std, height=8, width=8), expected)
-
-
-@pytest.mark.parametrize(("height", "width"), [(6, 10), (5, 7), (1, 1), (2, 3)])
-def test_pooling_equals_relu_and_max_pooling(height, width):
-    x = torch.randn(2, 3, height, width, generator=torch.Generator().manual_seed(0))
-    for given in (x, x.to(memory_format=torch.channels_last)):
-        assert torch.equal(rectify_and_pool(given), F.max_pool2d(F.relu(x), 3, stride=2, padding=1))
-
-
 @pytest.mark.parametrize("sampling_ratio", [0, 1, 2, 3])
 def test_aligned_features_agree_with_the_naive_twin(sampling_ratio):
     rng = np.random.default_rng(sampling_ratio)
@@ -245,13 +227,3 @@ def test_aligned_features_are_those_of_training():
             pyramid_align(levels, boxes, torch.arange(9) % 2, **sizes, **LEVELS), trained, atol=1e-5
         )
         assert pyramid_align(levels, boxes[:0], torch.arange(0), **sizes, **LEVELS).shape == (0, 4, 7, 7)
-
-
-def test_mask_logits_are_those_of_training():
-    torch.manual_seed(0)
-    head = MaskHead(small())
-    torch.nn.init.normal_(head.deconv.bias)
-    features = torch.randn(3, 32, 14, 14)
-    with torch.no_grad():
-        inference = head(features)
-    assert torch.allclose(inference, head(features), atol=1e-6)

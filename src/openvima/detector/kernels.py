@@ -1,37 +1,8 @@
-"""Numba kernels of the detector: normalisation, pooling, box decoding, suppression, RoIAlign, pasting."""
+"""Numba kernels of the detector: box decoding, suppression, RoIAlign, pasting."""
 
 import numpy as np
 
 from openvima.compilation import njit
-
-
-@njit
-def look_up(images, table, out):
-    """Write `table` (3, 256) at images (B, 3, H, W), uint8, to the beginning of `out` (B, ≥ H, ≥ W, 3)."""
-    for image in range(images.shape[0]):
-        for row in range(images.shape[2]):
-            for column in range(images.shape[3]):
-                for channel in range(3):
-                    out[image, row, column, channel] = table[channel, images[image, channel, row, column]]
-
-
-@njit
-def relu_and_pool(x, out):
-    """Write maxima of 0 and 3 × 3 pixels of `x` (B, H, W, C), with stride 2, to `out`, half as large."""
-    _, height, width, channels = x.shape
-    highest = np.empty(width * channels, x.dtype)  # of three rows, where one at the border counts twice
-    for image in range(len(out)):
-        for i in range(out.shape[1]):
-            upper, middle = x[image, max(2 * i - 1, 0)].reshape(-1), x[image, 2 * i].reshape(-1)
-            lower = x[image, min(2 * i + 1, height - 1)].reshape(-1)
-            for k in range(len(highest)):
-                highest[k] = max(max(upper[k], middle[k]), max(lower[k], 0))
-            for j in range(out.shape[2]):
-                left, centre = max(2 * j - 1, 0) * channels, 2 * j * channels
-                right = min(2 * j + 1, width - 1) * channels
-                cell = out[image, i, j]
-                for k in range(channels):
-                    cell[k] = max(max(highest[left + k], highest[centre + k]), highest[right + k])
 
 
 @njit

@@ -21,7 +21,7 @@ from openvima.detector.boxes import (
     subsample,
 )
 from openvima.detector.config import FIRST_STRIDE, BackboneConfig, DetectorConfig
-from openvima.detector.roi_align import crop_masks, is_cpu_inference, rectify_and_pool
+from openvima.detector.roi_align import crop_masks
 
 
 class ConvNorm(nn.Module):
@@ -125,11 +125,7 @@ class Backbone(nn.Module):
 
     def forward(self, images: torch.Tensor) -> list[torch.Tensor]:
         """Map images (B, 3, H, W) to the pyramid levels, finest first, each (B, C, h, w)."""
-        x = self.stem(images)
-        if is_cpu_inference(x):
-            x = rectify_and_pool(x)
-        else:
-            x = F.max_pool2d(F.relu_(x), kernel_size=3, stride=2, padding=1)
+        x = F.max_pool2d(F.relu_(self.stem(images)), kernel_size=3, stride=2, padding=1)
         laterals = []
         for stage, lateral in zip(self.stages, self.lateral, strict=True):
             x = stage(x)
@@ -323,19 +319,7 @@ class MaskHead(nn.Module):
         """Map features (R, C, size, size) to logits (R, classes, 2 · size, 2 · size)."""
         for layer in self.convs:
             features = F.relu_(layer(features))
-        if is_cpu_inference(features):
-            return self._upsample(features)
         return self.mask_logits(F.relu_(self.deconv(features)))
-
-    def _upsample(self, features: torch.Tensor) -> torch.Tensor:
-        """Apply the last two layers as matrix products, which take a third of the time on a CPU."""
-        count, width, size, _ = features.shape
-        kernel = self.deconv.weight.permute(0, 2, 3, 1).reshape(width, -1)  # (C, 2 · 2 · C)
-        assert self.deconv.bias is not None  # it has one
-        cells = F.relu_((features.permute(0, 2, 3, 1) @ kernel).view(-1, width).add_(self.deconv.bias))
-        logits = F.linear(cells, self.mask_logits.weight.flatten(1), self.mask_logits.bias)
-        logits = logits.view(count, size, size, 2, 2, logits.shape[1]).permute(0, 5, 1, 3, 2, 4)
-        return logits.reshape(count, logits.shape[1], 2 * size, 2 * size)
 
 
 def box_losses(

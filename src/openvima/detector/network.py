@@ -25,7 +25,7 @@ from openvima.detector.layers import (
     box_losses,
     mask_loss,
 )
-from openvima.detector.roi_align import is_cpu_inference, normalise, paste_masks, pyramid_align
+from openvima.detector.roi_align import paste_masks, pyramid_align
 from openvima.errors import ShapeError
 from openvima.policies.base import usable_device
 from openvima.policies.nn.layers import TensorRecord
@@ -144,15 +144,9 @@ class MaskRCNN(nn.Module):
             pixels = F.interpolate(pixels, (height, width), mode="bilinear", antialias=True).round()
         scale = self.pixel_mean.new_tensor([width / before[1], height / before[0]]).repeat(2)
         divisor = self.backbone.size_divisor
-        padded = height + -height % divisor, width + -width % divisor
-        return self._normalise(pixels, *padded), scale, (height, width)
-
-    def _normalise(self, pixels: torch.Tensor, height: int, width: int) -> torch.Tensor:
-        """Normalise pixels, and pad them with zeros."""
-        if pixels.dtype == torch.uint8 and is_cpu_inference(pixels):
-            return normalise(pixels, self.pixel_mean, self.pixel_std, height=height, width=width)
-        padding = (0, width - pixels.shape[3], 0, height - pixels.shape[2])
-        return F.pad((pixels - self.pixel_mean) / self.pixel_std, padding)
+        padding = (0, -width % divisor, 0, -height % divisor)
+        inputs = F.pad((pixels - self.pixel_mean) / self.pixel_std, padding)
+        return inputs, scale, (height, width)
 
     def _detect_boxes(
         self, levels: Sequence[torch.Tensor], proposals: Sequence[torch.Tensor], size: tuple[int, int]

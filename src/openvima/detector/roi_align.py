@@ -12,31 +12,12 @@ import torch
 from torch.nn import functional as F
 
 from openvima.detector.boxes import box_area
-from openvima.detector.kernels import align, look_up, paste, relu_and_pool
+from openvima.detector.kernels import align, paste
 
 
 def is_cpu_inference(tensor: torch.Tensor) -> bool:
     """Return whether these layers compute with a tensor: it is in main memory, and needs no gradients."""
     return tensor.device.type == "cpu" and not torch.is_grad_enabled()
-
-
-def normalise(
-    pixels: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, *, height: int, width: int
-) -> torch.Tensor:
-    """Normalise images (B, 3, H, W), uint8, and pad them with zeros to (B, 3, height, width)."""
-    table = (torch.arange(256) - mean.view(3, 1)) / std.view(3, 1)
-    normalised = torch.zeros(len(pixels), height, width, 3)
-    look_up(pixels.numpy(), table.numpy(), normalised.numpy())
-    return normalised.permute(0, 3, 1, 2)
-
-
-def rectify_and_pool(x: torch.Tensor) -> torch.Tensor:
-    """Apply ReLU and max pooling over 3 × 3 pixels with stride 2: (B, C, H, W) to (B, C, H / 2, W / 2)."""
-    rows = _channels_last(x)
-    count, height, width, channels = rows.shape
-    pooled = torch.empty(count, (height + 1) // 2, (width + 1) // 2, channels, dtype=x.dtype)
-    relu_and_pool(rows, pooled.numpy())
-    return pooled.permute(0, 3, 1, 2)
 
 
 def align_levels(
