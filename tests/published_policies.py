@@ -9,7 +9,7 @@ from openvima.policies.architectures import VimaConfig, vima
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
-from openvima.policies.published import T5, to_published
+from openvima.policies.published import FLAMINGO, GATO, T5, VIMA, _pattern
 from openvima.policies.sizes import Size
 
 VOCABULARY_SIZE = 160
@@ -24,6 +24,22 @@ class Touch:
 
     def __reduce__(self) -> tuple:
         return os.mkdir, (str(self.folder),)
+
+
+def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
+    """Give the weights of a network their published names, without `policy.` before them."""
+    adapters = {"vima": VIMA, "gato": GATO, "gpt": GATO, "flamingo": FLAMINGO}
+    rules, result = adapters[network.config.architecture].rules, {}
+    for name, tensor in network.state_dict().items():
+        rule, match = next((rule, match) for rule in rules if (match := _pattern(rule.ours).fullmatch(name)))
+        *numbers, ending = match.groups(default="")
+        published = rule.published
+        for number in numbers:
+            published = published.replace("*", number, 1)
+        tensor = tensor.detach().float() if tensor.is_floating_point() else tensor
+        is_turned = rule.transposed and tensor.ndim == 2
+        result[published + ending] = (tensor.T if is_turned else tensor).contiguous()
+    return result
 
 
 def small_vima() -> VimaConfig:

@@ -2,12 +2,10 @@
 
 import pytest
 import torch
-from torch.nn import functional as F
 
 from openvima.errors import PolicyError
 from openvima.policies import preset
 from openvima.policies.build import build_network
-from openvima.policies.nn import layers as linear
 from openvima.policies.nn.actions import from_unit_range, to_unit_range
 from openvima.policies.nn.decoder import (
     CausalDecoder,
@@ -127,47 +125,6 @@ def test_fresh_attention_finds_the_object_that_the_prompt_shows(name):
         query_ND = decoder.self_blocks[0].query_key_value(scene_ND)[:, :128]
         key_ND = decoder.self_blocks[0].query_key_value(in_prompt_ND)[:, 128:256]
     assert (query_ND @ key_ND.T).argmax(dim=1).tolist() == [0, 1, 2, 3, 4, 5]
-
-
-@pytest.fixture
-def layer() -> Linear:
-    torch.manual_seed(0)
-    return Linear(1024, 512).eval()
-
-
-def assert_right(layer: Linear, rows: int = 5) -> None:
-    """The layer agrees with the plain product in inference mode, but for rounding."""
-    x = torch.randn(1, rows, layer.in_features, dtype=layer.weight.dtype)
-    expected = F.linear(x, layer.weight, layer.bias).detach()
-    with torch.inference_mode():
-        torch.testing.assert_close(layer(x), expected, rtol=0, atol=5e-6 * float(expected.abs().max()))
-
-
-@pytest.mark.parametrize("rows", [1, 2, 15, 128, 129])
-@pytest.mark.parametrize("bias", [True, False])
-def test_any_number_of_rows_gives_the_product(rows: int, bias: bool) -> None:
-    torch.manual_seed(1)
-    assert_right(Linear(1024, 512, bias=bias), rows)
-
-
-def test_weights_changed_in_place_count_at_once(layer) -> None:
-    assert_right(layer)
-    with torch.no_grad():
-        layer.weight.mul_(-2)
-    assert_right(layer)
-    layer.load_state_dict({name: 3 * tensor for name, tensor in layer.state_dict().items()})
-    assert_right(layer)
-
-
-@pytest.mark.skipif(not linear._HAS_ONEDNN, reason="this torch has no oneDNN")
-def test_only_acting_makes_a_packed_copy_and_training_drops_it(layer) -> None:
-    layer(torch.randn(5, 1024))
-    assert layer._packed is None
-    assert_right(layer)
-    assert layer._packed is not None
-    assert "_packed" not in layer.state_dict()
-    layer.train()
-    assert layer._packed is None
 
 
 @pytest.mark.parametrize("bias", [True, False])

@@ -26,8 +26,8 @@ from tests.policies.golden import (
 from tests.policies.golden_stages import closed_loop, stages
 
 from openvima.policies.build import PolicyConfig, outline_network
-from openvima.policies.published import config_from_published, to_published
-from published_policies import with_unused_entries
+from openvima.policies.published import config_from_published
+from published_policies import to_published, with_unused_entries
 
 pytestmark = [pytest.mark.slow, needs("fulldims")]
 

@@ -10,8 +10,8 @@ from tests.policies.golden import FOLDER, tiny_weights
 from openvima.policies import preset
 from openvima.policies.build import outline_network
 from openvima.policies.nn.decoder import PrefixDecoderConfig
-from openvima.policies.published import config_from_published, from_published, load_published, to_published
-from published_policies import with_unused_entries
+from openvima.policies.published import config_from_published, from_published, load_published
+from published_policies import to_published, with_unused_entries
 
 SHAPES = FOLDER / "state_dict_shapes.json"
 pytestmark = pytest.mark.skipif(not SHAPES.is_file(), reason=f"no golden data in {FOLDER}")

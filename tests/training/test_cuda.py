@@ -53,10 +53,8 @@ def test_losses_are_those_of_a_cpu(name, precision, without_dropout, tmp_path) -
         assert ours == pytest.approx(theirs, rel=TOLERANCE[precision])
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the compiler itself
-@pytest.mark.parametrize("compiled", [False, True])
-def test_an_interrupted_run_resumes_and_its_policy_acts_on_both_devices(compiled, settings, tmp_path) -> None:
-    changes = {"runtime.device": "cuda", "runtime.compile": compiled, "runtime.precision": "bfloat16"}
+def test_an_interrupted_run_resumes_and_its_policy_acts_on_both_devices(settings, tmp_path) -> None:
+    changes = {"runtime.device": "cuda", "runtime.precision": "bfloat16"}
     config = TrainingConfig.of({**settings, **changes, "schedule.checkpoint_every": 1})
     train_until(config, 7)
     run = train(config)

@@ -181,14 +181,12 @@ class PublishedAdapter:
     """How to load published files of one architecture.
 
     Args:
-        architecture: Its name.
         rules: Names of all weights.
         cfg_names: What `cfg` calls the width, the number of layers and the numbers of heads.
         decoder: Prefix of the decoder's weights.
         build: Its config in a size.
     """
 
-    architecture: str
     rules: tuple[Rule, ...]
     cfg_names: tuple[str, ...]
     decoder: str
@@ -197,22 +195,12 @@ class PublishedAdapter:
 
 def to_ours(rules: Iterable[Rule], name: str) -> tuple[str, bool] | None:
     """Return our name of a published weight and whether to transpose it; None if there is no such weight."""
-    return _rename(name, [(rule.published, rule.ours, rule.transposed) for rule in rules])
-
-
-def to_theirs(rules: Iterable[Rule], name: str) -> tuple[str, bool] | None:
-    """Return the published name of one of our weights and whether to transpose it; None if it has none."""
-    return _rename(name, [(rule.ours, rule.published, rule.transposed) for rule in rules])
-
-
-def _rename(name: str, rows: list[tuple[str, str, bool]]) -> tuple[str, bool] | None:
-    for before, after, transposed in rows:
-        match = _pattern(before).fullmatch(name)
-        if match:
-            *numbers, ending = match.groups(default="")
+    for rule in rules:
+        if match := _pattern(rule.published).fullmatch(name):
+            ours, (*numbers, ending) = rule.ours, match.groups(default="")
             for number in numbers:
-                after = after.replace("*", number, 1)
-            return after + ending, transposed
+                ours = ours.replace("*", number, 1)
+            return ours + ending, rule.transposed
     return None
 
 
@@ -222,31 +210,27 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 VIMA = PublishedAdapter(
-    "vima",
     (*_SHARED_RULES, *_vit_rules("images.crop_encoder"), *_OBJECT_RULES, *_CROSS_ATTENTION_RULES),
     cfg_names=("embed_dim", "xf_n_layers", "sattn_n_heads", "xattn_n_heads"),
     decoder="xattn_gpt",
     build=vima,
 )
 GATO = PublishedAdapter(
-    "gato",
     (*_SHARED_RULES, *_vit_rules("images"), *_PREFIX_RULES),
     cfg_names=("embed_dim", "n_layer", "n_head"),
     decoder="transformer.lm",
     build=gato,
 )
 FLAMINGO = PublishedAdapter(
-    "flamingo",
     (*_SHARED_RULES, *_vit_rules("images"), *_RESAMPLER_RULES, *_CROSS_ATTENTION_RULES),
     cfg_names=("embed_dim", "dt_n_layers", "dt_n_heads", "xattn_n_heads"),
     decoder="xattn_gpt",
     build=flamingo,
 )
-GPT = replace(GATO, architecture="gpt", build=gpt)  # with a class token
+GPT = replace(GATO, build=gpt)  # with a class token
 
 
 PREFIX = "policy."  # before every name in a file
-ADAPTERS = {adapter.architecture: adapter for adapter in (VIMA, GATO, FLAMINGO, GPT)}
 # Unused position counters, masks and embeddings of the files.
 _UNUSED = re.compile(
     r"(xattn_gpt|transformer\.lm)\.(position_ids|xattn_position_ids|h\.\d+\.attn\.bias)"
@@ -306,38 +290,6 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     return result
 
 
-def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
-    """Give the weights of a network their published names, without `policy.` before them.
-
-    Numbers of heads are not in the weights; a file gives those of the decoder in its `cfg`, and all image
-    encoders have 24.
-
-    Args:
-        network: Of the published architecture, in any size, with or without weights.
-
-    Returns:
-        Weights in float32, matrices as they are published. They may share memory with the network.
-
-    Raises:
-        InputFileError: The network has parts that no published policy has.
-    """
-    adapter = ADAPTERS.get(network.config.architecture, VIMA)
-    result, without_name = {}, []
-    for ours, tensor in network.state_dict().items():
-        renamed = to_theirs(adapter.rules, ours)
-        if renamed is None:
-            without_name.append(ours)
-        else:
-            name, transposed = renamed
-            result[name] = _convert(tensor, transposed)
-    if without_name:
-        raise InputFileError(
-            f"this network has parts that no published policy has: {', '.join(without_name)}. "
-            "Only presets of the form vima-…, gato-…, flamingo-… and gpt-… have published names."
-        )
-    return result
-
-
 def _convert(tensor: torch.Tensor, transposed: bool) -> torch.Tensor:
     tensor = tensor.detach()
     tensor = tensor.float() if tensor.is_floating_point() else tensor
@@ -364,9 +316,10 @@ def load_published(file: str | Path) -> PolicyNetwork:
         raise InputFileError(f"{file} is no file. A published checkpoint is a single file such as 2M.ckpt.")
     weights, cfg = _contents(file, read_archive(file))
     try:
-        network = outline_network(config_from_published(weights, cfg))
-        _check_fit(network, weights)
-        network.load_state_dict(from_published(weights), assign=True)
+        network, tensors = outline_network(config_from_published(weights, cfg)), from_published(weights)
+        if problems := mismatches(tensors, network.state_dict(), limit=_MAX_LISTED):
+            raise InputFileError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
+        network.load_state_dict(tensors, assign=True)
     except (InputFileError, ConfigError) as error:
         raise InputFileError(f"{file}: {error}") from error
     except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
@@ -398,15 +351,6 @@ def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapp
             f"{file}: state_dict holds more than weights: {', '.join(others[:_MAX_LISTED])}."
         )
     return weights, values["cfg"]
-
-
-def _check_fit(network: PolicyNetwork, weights: Mapping[str, torch.Tensor]) -> None:
-    """Compare published names and shapes with what the network expects."""
-    expected = to_published(network)
-    given = {name: tensor for name, tensor in without_prefix(weights).items() if not is_unused(name)}
-    problems = mismatches(given, expected, limit=_MAX_LISTED)
-    if problems:
-        raise InputFileError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -481,7 +425,7 @@ def _decoder(
     if wrong:
         raise InputFileError(f"cfg says {'; '.join(wrong)}. They do not match.")
     try:
-        kind = PrefixDecoderConfig if adapter.architecture in ("gato", "gpt") else DecoderConfig
+        kind = PrefixDecoderConfig if name == "transformer.lm" else DecoderConfig
         return kind(width, num_layers, *heads)
     except ConfigError as error:
         raise InputFileError(f"cfg is {given}: {error}") from error

@@ -5,13 +5,10 @@ Nothing is downloaded unless an id is given.
 """
 
 import re
-from collections.abc import Iterable
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from openvima.errors import (
     InputFileError,
@@ -24,9 +21,9 @@ from openvima.imports import import_extra
 from openvima.input_files import as_path, open_regular
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.published import T5, T5_RULES, to_theirs
-from openvima.policies.sizes import T5_SIZES, t5_name
-from openvima.policies.tensor_files import check_finite, mismatches, read_archive, read_safetensors
+from openvima.policies.published import T5, T5_RULES, to_ours
+from openvima.policies.sizes import t5_name
+from openvima.policies.tensor_files import mismatches, read_safetensors
 from openvima.policies.tokenizer import END_ID, PADDING_ID, UNKNOWN, Tokenizer, Vocabulary, WordTokenizer
 
 if TYPE_CHECKING:
@@ -37,9 +34,8 @@ _WORD_START = "▁"  # T5 marks the beginning of a word with it
 _OWNERLESS = re.compile(
     r"([A-Za-z0-9][\w.-]*)(?:@([A-Za-z0-9][\w.-]*))?"
 )  # T5 may be named without its owner
-_FAST_FILE, _SENTENCEPIECE_FILE = "tokenizer.json", "spiece.model"
-_TOKENIZER_FILES = (_FAST_FILE, _SENTENCEPIECE_FILE, "tokenizer_config.json", "special_tokens_map.json")
-_SAFE_FILE, _PICKLE_FILE = "model.safetensors", "pytorch_model.bin"
+_TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json")
+_WEIGHTS_FILE = "model.safetensors"
 _MAX_TOKENIZER_BYTES = 16 * 2**20  # of each file; those of t5-base have up to 1.4 MB
 _MAX_WORDS = 2**16  # words whose pieces are kept
 _MAX_LISTED = 6  # differences that a message lists
@@ -54,8 +50,7 @@ class T5Tokenizer:
     transformers differ in how they split whole texts, but not single words.
 
     Args:
-        path_or_hub_id: A folder with `tokenizer.json` (or `spiece.model`, for which transformers needs the
-            packages sentencepiece and protobuf), or a name on the Hugging Face Hub such as "t5-base".
+        path_or_hub_id: A folder with `tokenizer.json`, or a name on the Hugging Face Hub such as "t5-base".
 
     Raises:
         InputFileError: There is no such tokenizer, or it is not a T5 tokenizer.
@@ -151,26 +146,29 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
 
     Args:
         network: Its text encoder must match the file in size; that of the published presets is t5-base.
-        path_or_hub_id: A folder with `model.safetensors` or `pytorch_model.bin` (loaded with
-            `weights_only`), or a name on the Hugging Face Hub such as "t5-base".
+        path_or_hub_id: A folder with `model.safetensors`, or a name on the Hugging Face Hub such as
+            "t5-base".
 
     Raises:
         InputFileError: There are no such weights, they are damaged, or their names or sizes differ.
         MissingExtraError: An id is given and huggingface_hub is not installed.
     """
-    text = network.config.prompt.text
-    named = str(path_or_hub_id).partition("@")[0].rpartition("/")[2]
-    if named in T5_SIZES and T5_SIZES[named] != text and not as_path(path_or_hub_id).exists():
-        raise InputFileError(
-            f"t5 is {path_or_hub_id}, but the network has {t5_name(text)}; give a T5 1.0 of that size."
-        )
-    file = _weights_file(path_or_hub_id)
-    tensors = _read_encoder(file)
-    expected = _expected(network)
+    file = _folder(path_or_hub_id, (_WEIGHTS_FILE,)) / _WEIGHTS_FILE
+    if not file.is_file():
+        raise InputFileError(f"{path_or_hub_id} holds no {_WEIGHTS_FILE}.")
+    tensors = {}  # without decoder and language model head
+    for name, tensor in read_safetensors(file).items():
+        if name in ("shared.weight", "encoder.embed_tokens.weight"):  # two names of one table
+            tensors["prompt.words.weight"] = tensor
+        elif name.startswith("encoder."):
+            ours = to_ours(T5_RULES, T5 + name.removeprefix("encoder"))
+            tensors[ours[0] if ours else name] = tensor
+    kept = ("prompt.words.", "prompt.text.")
+    expected = {name: own for name, own in network.state_dict().items() if name.startswith(kept)}
     if problems := mismatches(tensors, expected, limit=_MAX_LISTED):
         raise InputFileError(
             f"{file} does not fit the text encoder: {'; '.join(problems)}. "
-            f"It needs a T5 1.0: {t5_name(text)}."
+            f"It needs a T5 1.0: {t5_name(network.config.prompt.text)}."
         )
     for name, tensor in expected.items():
         tensor.copy_(tensors[name])
@@ -178,14 +176,12 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
 
 def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
     folder = _folder(path_or_hub_id, _TOKENIZER_FILES)
-    if not any((folder / name).is_file() for name in (_FAST_FILE, _SENTENCEPIECE_FILE)):
+    if not (folder / _TOKENIZER_FILES[0]).is_file():
         # Without this check transformers would return a vocabulary of special tokens only.
-        raise InputFileError(f"{path_or_hub_id} holds neither {_FAST_FILE} nor {_SENTENCEPIECE_FILE}.")
-    if not (folder / _FAST_FILE).is_file():
-        _require("sentencepiece", f"{folder / _SENTENCEPIECE_FILE}", "sentencepiece protobuf")
+        raise InputFileError(f"{path_or_hub_id} holds no {_TOKENIZER_FILES[0]}.")
     for name in _TOKENIZER_FILES:
         _check_size(folder / name)
-    transformers = _require("transformers", "the tokenizer of T5", "'openvima[t5]'")
+    transformers = import_extra("transformers", "T5 needs transformers: pip install 'openvima[t5]'")
     try:
         tokenizer = transformers.T5TokenizerFast.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # tokenizers raises no narrower one for a damaged file
@@ -214,39 +210,6 @@ def _check_is_t5(tokenizer: "PreTrainedTokenizerFast", source: str) -> None:
         )
 
 
-def _expected(network: PolicyNetwork) -> dict[str, torch.Tensor]:
-    """The network's weights by their names in T5 files, which the published policies share."""
-    expected = {"shared.weight": network.prompt.words.weight.detach()}
-    for ours, tensor in network.state_dict().items():
-        if named := to_theirs(T5_RULES, ours):
-            expected["encoder" + named[0].removeprefix(T5)] = tensor
-    return expected
-
-
-def _read_encoder(file: Path) -> dict[str, torch.Tensor]:
-    """Load word embedding and encoder, without decoder and language model head."""
-    try:
-        weights = read_safetensors(file) if file.name == _SAFE_FILE else read_archive(file)
-        tensors = {name: weights[name] for name in _of_encoder(weights)}
-        check_finite(tensors, file)
-    except (OSError, TypeError, AttributeError) as error:  # a pickle may hold anything
-        raise InputFileError(f"{file} holds no weights that can be read ({error}).") from error
-    copy = tensors.pop("encoder.embed_tokens.weight", None)  # the same table under its other name
-    return tensors if copy is None else {"shared.weight": copy, **tensors}
-
-
-def _of_encoder(names: Iterable[str]) -> list[str]:
-    return [name for name in names if name.startswith(("shared.", "encoder."))]
-
-
-def _weights_file(path_or_hub_id: str | Path) -> Path:
-    for name in (_SAFE_FILE, _PICKLE_FILE):
-        file = _folder(path_or_hub_id, (name,)) / name
-        if file.is_file():
-            return file
-    raise InputFileError(f"{path_or_hub_id} holds neither {_SAFE_FILE} nor {_PICKLE_FILE}.")
-
-
 def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
     """The folder itself; for a Hub id, the folder of the downloaded files."""
     folder, name = as_path(path_or_hub_id), str(path_or_hub_id)
@@ -258,7 +221,3 @@ def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
     if folder.exists() or repository is None:
         raise InputFileError(f"{name} is no folder, and no name on the Hugging Face Hub such as 't5-base'.")
     return fetch(repository, files)
-
-
-def _require(module: str, what: str, packages: str) -> ModuleType:
-    return import_extra(module, f"{what} needs {module}; install it with: pip install {packages}")

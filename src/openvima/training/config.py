@@ -24,7 +24,7 @@ _NOT_IDENTITY = {
     "": ("data", "out", "force", "object_cache", "t5", "rollout"),
     "loader": ("num_workers",),
     "schedule": ("checkpoint_every", "keep_every"),
-    "runtime": ("device", "compile", "threads", "workers", "tensorboard", "wandb"),
+    "runtime": ("device", "threads", "workers", "tensorboard", "wandb"),
 }
 
 
@@ -302,7 +302,6 @@ class RuntimeConfig:
     Args:
         device: "auto" takes a GPU where there is one; or "cpu", "cuda", "cuda:1".
         precision: "float32", or "bfloat16" for matrix products, with weights in float32.
-        compile: Compile the layers of the network with torch.compile.
         processes: Processes that share each batch, on this machine; for several, see `torchrun`. On GPUs at
             most one on each.
         threads: CPU threads; equal numbers give equal weights.
@@ -314,7 +313,6 @@ class RuntimeConfig:
 
     device: str = "auto"
     precision: Literal["float32", "bfloat16"] = "float32"
-    compile: bool = False
     processes: Annotated[int, Range(1, 64)] = 1
     threads: Annotated[int, Range(1, 1024)] = 1
     workers: Annotated[int, Range(1, 1024)] = 1

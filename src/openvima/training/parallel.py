@@ -247,21 +247,6 @@ def join_processes(device: str) -> Iterator[Parallel]:
         dist.destroy_process_group()
 
 
-def compile_layers(module: nn.Module) -> None:
-    """Compile the layers of all stacks with torch.compile; equal layers are compiled once.
-
-    The rest of the network is called once per step, and would take many times as long to compile.
-    """
-    for layer in _layers(module):
-        layer.compile(dynamic=True)
-
-
-def _layers(module: nn.Module) -> list[nn.Module]:
-    """Return the layers of all stacks, without plain linear and sequential ones."""
-    stacks = [part for part in module.modules() if isinstance(part, nn.ModuleList)]
-    return [layer for stack in stacks for layer in stack if not isinstance(layer, nn.Linear | nn.Sequential)]
-
-
 def named_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     """Return the state of each parameter of a module, by its name."""
     names = {id(parameter): name for name, parameter in module.named_parameters()}

@@ -34,7 +34,7 @@ from openvima.training.loop import (
     num_steps,
     open_run,
 )
-from openvima.training.parallel import Parallel, compile_layers
+from openvima.training.parallel import Parallel
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
 from openvima.training.recipes import command_going_on
@@ -197,8 +197,6 @@ class _Stages:
                 learner.network.fit_prior(read_actions(self._examples[0]))
             if freezes_crops(learner.network, config):
                 freeze_crops(learner, caches, self.parallel)
-        if config.runtime.compile:
-            compile_layers(learner)
         module = self.parallel.wrap(learner)
         training, validation = self._examples
         alternatives = self._alternatives(training)

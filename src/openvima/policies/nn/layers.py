@@ -17,13 +17,6 @@ from torch import nn
 from torch.nn import functional as F
 from torch.overrides import TorchFunctionMode
 
-# Measured in float32 on one core with AVX-512 at width 768: weights prepacked for oneDNN take 0.65× the time
-# of the default kernel for 6 rows, 0.7× for 17, 0.8× for 34 and 0.9× for 90, since that kernel repacks the
-# matrix at every call. More rows gain little, and a single row is fast anyway.
-_MAX_ROWS = 128
-_MIN_WEIGHTS = 500_000  # smaller matrices stay in the cache of a core
-_PACKED_FOR_ROWS = 16
-
 _MIN_TRAINING_ROWS = 256  # of fewer rows there are too many numbers to compile for
 # Kernels that oneDNN keeps; its default of 1,024 are fewer than training uses again. Read at its first use.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
@@ -32,70 +25,21 @@ os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
 _HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
-class TrainingLinear(nn.Linear):
+class Linear(nn.Linear):
     """`nn.Linear` that computes outputs and gradients of many rows with oneDNN, on a CPU."""
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Map (..., in) to (..., out)."""
         if (
-            torch.is_grad_enabled()
+            _HAS_ONEDNN
+            and torch.is_grad_enabled()
             and input.numel() >= _MIN_TRAINING_ROWS * self.in_features
-            and self._can_use_onednn(input)
+            and input.dtype == self.weight.dtype == torch.float32
+            and input.device.type == "cpu"
             and not torch.is_autocast_enabled("cpu")
         ):
             return _OneDnnLinear.apply(input, self.weight, self.bias)  # type: ignore[no-any-return]
         return F.linear(input, self.weight, self.bias)
-
-    def _can_use_onednn(self, x: torch.Tensor) -> bool:
-        return (
-            _HAS_ONEDNN
-            and not torch.compiler.is_compiling()  # it chooses by itself
-            and x.dtype == self.weight.dtype == torch.float32
-            and x.device.type == "cpu"
-        )
-
-
-class Linear(TrainingLinear):
-    """With prepacked weights for the few rows of a step in inference, as well.
-
-    They are packed at the first such call in inference mode, repacked when they change, and dropped for
-    training. Results are equal up to rounding.
-    """
-
-    _packed: torch.Tensor | None = None
-    _packed_version: tuple[int, int] | None = None  # address and version of the weights that were packed
-
-    def __init__(self, in_features: int, out_features: int, bias: bool = True) -> None:
-        super().__init__(in_features, out_features, bias)
-        self._is_large = in_features * out_features >= _MIN_WEIGHTS
-
-    def forward(self, input: torch.Tensor) -> torch.Tensor:
-        """Map (..., in) to (..., out)."""
-        if not (self._is_large and self._has_few_rows(input)):
-            return super().forward(input)
-        version = (self.weight.data_ptr(), self.weight._version)
-        if version != self._packed_version:
-            self._packed = torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), _PACKED_FOR_ROWS)
-            self._packed_version = version
-        return torch.ops.mkldnn._linear_pointwise(input, self._packed, self.bias, "none", [], "")
-
-    def train(self, mode: bool = True) -> "Linear":
-        """Set the mode, and drop the packed copy for training."""
-        if mode:
-            self._packed = self._packed_version = None
-        return super().train(mode)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Exclude the packed copy from copies and pickles."""
-        return {**self.__dict__, "_packed": None, "_packed_version": None}
-
-    def _has_few_rows(self, x: torch.Tensor) -> bool:
-        return (
-            torch.is_inference_mode_enabled()
-            and self.in_features < x.numel() <= _MAX_ROWS * self.in_features
-            and self._can_use_onednn(x)
-            and not self.weight.is_inference()  # such tensors have no version
-        )
 
 
 class _OneDnnLinear(torch.autograd.Function):

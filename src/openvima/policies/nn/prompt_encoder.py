@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from openvima.policies.batch import PromptBatch
-from openvima.policies.nn.layers import TrainingLinear, Unpadder, mlp
+from openvima.policies.nn.layers import Linear, Unpadder, mlp
 
 NUM_BUCKETS = 32  # half for keys before the query, half for keys after it
 _EXACT = 8  # distances below have a bucket each
@@ -82,13 +82,13 @@ class TextBlock(nn.Module):
         inner = config.num_heads * config.head_width
         self.num_heads = config.num_heads
         self.norm_attention = RmsNorm(config.width)
-        self.query = TrainingLinear(config.width, inner, bias=False)
-        self.key = TrainingLinear(config.width, inner, bias=False)
-        self.value = TrainingLinear(config.width, inner, bias=False)
-        self.attention_out = TrainingLinear(inner, config.width, bias=False)
+        self.query = Linear(config.width, inner, bias=False)
+        self.key = Linear(config.width, inner, bias=False)
+        self.value = Linear(config.width, inner, bias=False)
+        self.attention_out = Linear(inner, config.width, bias=False)
         self.norm_feed_forward = RmsNorm(config.width)
-        self.widen = TrainingLinear(config.width, config.hidden_width, bias=False)
-        self.narrow = TrainingLinear(config.hidden_width, config.width, bias=False)
+        self.widen = Linear(config.width, config.hidden_width, bias=False)
+        self.narrow = Linear(config.hidden_width, config.width, bias=False)
         # Scores are not divided by √K; the smaller start of the queries stands in for it, as in T5.
         nn.init.normal_(self.query.weight, std=(config.width * config.head_width) ** -0.5)
         for linear in (self.key, self.value):

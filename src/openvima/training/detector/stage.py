@@ -28,7 +28,7 @@ from openvima.training.loop import (
     step_generator,
     step_seed,
 )
-from openvima.training.parallel import Parallel, compile_layers
+from openvima.training.parallel import Parallel
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import check_scenes, open_demonstrations
 
@@ -156,8 +156,6 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
         origin = {"held_out": found} if found else None
         trainer = Trainer(config, dataset, learner, parallel, report=report, demonstrations=origin)
         learner.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
-        if config.runtime.compile:
-            compile_layers(learner)
 
         def make() -> DetectorStage:
             probs = {"prompt_prob": loader.prompt_prob, "rerendered_prob": loader.rerendered_prob}
