@@ -13,13 +13,14 @@ from typing import Literal
 import numpy as np
 import torch
 
-from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import (
     GROUND_TRUTH,
-    PUBLISHED_ORDER,
+    GroundTruth,
     ObjectExtractor,
     ObjectViews,
     end_effector_of,
+    make_hidden_objects,
+    observe,
     whole_frames,
 )
 from openvima.policies.batch import WORD, HistoryBatch, InputLayout, PromptBatch
@@ -72,20 +73,42 @@ class StepInput:
     end_effector: int
 
 
+class PublishedOrder(GroundTruth):
+    """Finds objects in the order of their ids, as the published evaluation does."""
+
+    def in_observation(self, observation: Mapping) -> ObjectViews:
+        objects = observe(observation)
+        return objects.select(np.argsort(objects.ids))
+
+
+PUBLISHED_ORDER = PublishedOrder()
+
+
+def compacted(objects: ObjectViews) -> ObjectViews:
+    """Move the visible objects of each view to the front; a slot is then no object in both views."""
+    order = np.argsort(~objects.masks, axis=1, kind="stable")
+    rows = np.arange(len(VIEWS))[:, None]
+    views = (objects.crops, objects.boxes, objects.masks, objects.grasps)
+    return ObjectViews(np.full_like(objects.ids, -1), *(array[rows, order] for array in views))
+
+
+def padded(objects: ObjectViews, count: int) -> ObjectViews:
+    """Append hidden objects up to a number of them."""
+    return ObjectViews.concatenate([objects, make_hidden_objects(max(0, count - len(objects)))])
+
+
 @dataclass(frozen=True, slots=True)
 class NaiveProcessor:
     """Turns prompts and observations into what a network takes; the same for training and acting.
 
     Args:
         layout: What a token shows: an object in both views, an object in one view, or part of a whole frame.
-        image_size: Height and width of a crop or frame.
         tokens_per_image: How many tokens both views of an image become; 0 if that depends on its objects.
         tokenizer: Splits text into word ids.
         extractor: Finds the objects in images.
     """
 
     layout: Literal["objects", "views", "frames"]
-    image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
     tokens_per_image: int = 0
     tokenizer: Tokenizer = field(default_factory=WordTokenizer)
     extractor: ObjectExtractor = GROUND_TRUTH
@@ -99,9 +122,7 @@ class NaiveProcessor:
         """Make the processor for a network that takes such inputs."""
         tokenizer = tokenizer or WordTokenizer()
         order = PUBLISHED_ORDER if inputs.tokens == "views" else GROUND_TRUTH
-        return NaiveProcessor(
-            inputs.tokens, inputs.image_size, inputs.tokens_per_image, tokenizer, extractor or order
-        )
+        return NaiveProcessor(inputs.tokens, inputs.tokens_per_image, tokenizer, extractor or order)
 
     def encode_prompt(self, prompt: RenderedPrompt) -> PromptInput:
         """Turn a prompt into words and images."""
@@ -140,7 +161,7 @@ class NaiveProcessor:
         if self.layout == "frames":
             return whole_frames(image.rgb)
         objects = self.extractor.in_prompt_image(image)
-        return objects if self.layout == "objects" else objects.compact()
+        return objects if self.layout == "objects" else compacted(objects)
 
     def _places(self, objects: ObjectViews, slots: Sequence[int]) -> list[tuple[int, int, bool]]:
         """Entry, part and validity of the tokens of one image, in the order of the prompt.
@@ -181,7 +202,7 @@ class NaiveEpisode:
         objects = self._processor.extractor.in_observation(observation)
         if layout == "views":
             self._num_slots = max(self._num_slots, len(objects))
-            objects = objects.compact().pad(self._num_slots)
+            objects = padded(compacted(objects), self._num_slots)
         return StepInput(objects, objects.positions(), objects.grasp_points(), end_effector)
 
 

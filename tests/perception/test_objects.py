@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from naive import crop_and_box, most_interior
+from naive_inputs import compacted
 from openvima.errors import PolicyError, ShapeError
 from openvima.perception.objects import (
     FRONT,
@@ -113,10 +114,10 @@ def test_slots_are_the_same_object_in_both_views_until_compacted() -> None:
     segm["top"][10:20, 10:20] = 8
     objects = extract_objects(noise(), segm, [7, 8])
     assert objects.masks.tolist() == [[True, False], [False, True]]
-    compacted = objects.compact()
-    assert compacted.masks.tolist() == [[True, False], [True, False]]
-    np.testing.assert_array_equal(compacted.boxes[TOP, 0], objects.boxes[TOP, 1])
-    np.testing.assert_array_equal(compacted.crops[TOP, 0], objects.crops[TOP, 1])
+    moved = compacted(objects)
+    assert moved.masks.tolist() == [[True, False], [True, False]]
+    np.testing.assert_array_equal(moved.boxes[TOP, 0], objects.boxes[TOP, 1])
+    np.testing.assert_array_equal(moved.crops[TOP, 0], objects.crops[TOP, 1])
 
 
 @pytest.mark.parametrize(("effector", "first"), [(0, 5), (1, 4)])
@@ -207,7 +208,7 @@ def test_objects_of_observations_and_prompt_images_equal_the_golden_ones(view: i
     )
     for kind, prefix, ids, place in images:
         rgb, segm = ({v: golden[f"{prefix}.{part}.{v}"] for v in VIEWS} for part in ("rgb", "segm"))
-        objects = extract_objects(rgb, segm, ids).compact()
+        objects = compacted(extract_objects(rgb, segm, ids))
         expected = golden[f"out.{kind}.mask.{name}"][place]
         count = int(objects.masks[view].sum())
         assert count == expected.sum()

@@ -30,11 +30,12 @@ from naive_inputs import (
     batch_prompts,
 )
 from openvima.perception.objects import ObjectViews, make_hidden_objects
-from openvima.perception.preprocessing import ImageStack
+from openvima.perception.preprocessing import IMAGE_SIZES, ImageStack
 from openvima.policies.build import outline_network
 from openvima.policies.nn.action_head import BinsHead, decode_bins, shift_actions
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
 from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork
+from openvima.policies.processor import Processor
 from openvima.policies.published import config_from_published, from_published
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import VIEWS
@@ -282,7 +283,7 @@ def _file(name: str) -> Path:
 
 
 def _stack(network: PolicyNetwork) -> ImageStack:
-    return ImageStack(NaiveProcessor.of(network.config.inputs).image_size)
+    return ImageStack(IMAGE_SIZES[Processor.of(network.config.inputs).input_kind])
 
 
 def _features(network: PolicyNetwork, stack: ImageStack) -> torch.Tensor:

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from naive_inputs import PUBLISHED_ORDER, compacted
 from openvima.detector.detection import DetectedObjects, Detections
 from openvima.errors import PolicyError, PromptError, ShapeError
-from openvima.perception.objects import GROUND_TRUTH, GroundTruth
+from openvima.perception.objects import GROUND_TRUTH
 from openvima.policies import preset
 from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
@@ -16,7 +17,7 @@ from openvima.scene import RenderedPrompt
 from task_cases import noise
 
 VIEWS = ("front", "top")
-FRAMES = {"layout": "frames", "image_size": (64, 128), "tokens_per_image": 16}
+FRAMES = {"layout": "frames", "tokens_per_image": 16}
 
 
 class Scripted:
@@ -88,9 +89,9 @@ def test_prompts_that_do_not_fit_together_are_refused(layout: str, demonstration
 
 def test_objects_come_in_the_order_of_their_ids_where_published_policies_know_it(starts) -> None:
     for _, seen in starts:
-        in_order = GroundTruth(left_to_right=False).in_observation(seen)
+        in_order = PUBLISHED_ORDER.in_observation(seen)
         assert (np.diff(in_order.ids) > 0).all()
-        for name, expected in (("vima-nano", in_order.compact()), ("nano", in_order.left_to_right())):
+        for name, expected in (("vima-nano", compacted(in_order)), ("nano", in_order.left_to_right())):
             batch, stack = Processor.of(preset(name).inputs).encode_observations([[seen]])
             crops = stack.images()[batch.crop_index_BTVN[0, 0]]
             np.testing.assert_array_equal(crops, expected.crops)

@@ -83,7 +83,7 @@ def test_words_begin_with_the_marker_and_no_piece_ends_with_special_ids(tokenize
 def test_a_prompt_is_read_with_placeholders_between_words_and_the_end_mark(tokenizer) -> None:
     image = PromptImage("a", "object", dict.fromkeys(VIEWS, np.zeros((3, 128, 256), np.uint8)), {}, ())
     prompt = RenderedPrompt("Put the {a} into the {a}.", {"a": image})
-    processor = Processor("frames", image_size=(64, 128), tokens_per_image=1, tokenizer=tokenizer)
+    processor = Processor("frames", tokens_per_image=1, tokenizer=tokenizer)
     batch, _ = processor.encode_prompts([prompt])
     words, shows_image = batch.word_ids_BL[0], batch.object_index_BL[0] >= 0
     assert shows_image.tolist() == [False, False, True, False, False, True, False, False, False]

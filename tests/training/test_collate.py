@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from naive_inputs import NaiveProcessor, batch_histories, batch_prompts
+from naive_inputs import PUBLISHED_ORDER, NaiveProcessor, batch_histories, batch_prompts
 from openvima.data.preprocessed import number_images, preprocess
 from openvima.detector.detection import DetectedObjects, Detections
 from openvima.detector.plugins import PluggedExtractor
 from openvima.errors import DatasetError
-from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box
-from openvima.perception.preprocessing import ImageStack
+from openvima.perception.objects import GROUND_TRUTH, ObjectViews, crop_box
+from openvima.perception.preprocessing import IMAGE_SIZES, ImageStack
 from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.processor import Processor
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
@@ -23,7 +23,7 @@ from plugged_extractors import NoisyExtractor
 from small_networks import collate_examples, examples_of
 
 OBJECTS = Processor("objects")
-FRAMES = {"image_size": (64, 128), "tokens_per_image": 3}
+FRAMES = {"tokens_per_image": 3}
 
 
 class Guesses:
@@ -46,7 +46,7 @@ EXTRACTORS = {
 
 def assert_as_when_acting(batch, demos, naive: NaiveProcessor, processor: Processor, prompts) -> None:
     """Compare a batch with what a policy encodes, and with what the naive twin reads step by step."""
-    stack = ImageStack(naive.image_size)
+    stack = ImageStack(IMAGE_SIZES[processor.input_kind])
 
     def add(objects: ObjectViews) -> np.ndarray:
         numbers = np.zeros(objects.masks.shape, np.int64)

@@ -60,36 +60,6 @@ class ObjectViews:
             self.grasps[:, slots],
         )
 
-    def compact(self) -> "ObjectViews":
-        """Return visible objects first in each view, padding at its end, as published policies expect.
-
-        Slots of the two views then need not show the same object, and `ids` name nothing any more.
-        """
-        order = np.argsort(~self.masks, axis=1, kind="stable")
-        rows = np.arange(len(VIEWS))[:, None]
-        return ObjectViews(
-            np.full_like(self.ids, -1),
-            self.crops[rows, order],
-            self.boxes[rows, order],
-            self.masks[rows, order],
-            self.grasps[rows, order],
-        )
-
-    def pad(self, count: int) -> "ObjectViews":
-        """Return at least so many slots; the new ones are black, hidden and at the end."""
-        extra = max(0, count - len(self))
-
-        def longer(array: np.ndarray) -> np.ndarray:
-            return np.pad(array, [(0, 0), (0, extra)] + [(0, 0)] * (array.ndim - 2))
-
-        return ObjectViews(
-            np.pad(self.ids, (0, extra), constant_values=-1),
-            longer(self.crops),
-            longer(self.boxes),
-            longer(self.masks),
-            longer(self.grasps),
-        )
-
     @staticmethod
     def concatenate(images: Sequence["ObjectViews"]) -> "ObjectViews":
         """Put the objects of several images into one record, image after image."""
@@ -156,18 +126,11 @@ class AheadExtractor(ObjectExtractor, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """Finds the objects by the simulator's segmentation, as the published policies do.
-
-    Args:
-        left_to_right: Order the objects of an observation by where they lie. False keeps the order of their
-            ids, as the published evaluation does.
-    """
-
-    left_to_right: bool = True
+    """Finds the objects by the simulator's segmentation, as the published policies do."""
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
         """Find the objects of an observation; see `observe`."""
-        return observe(observation, left_to_right=self.left_to_right)
+        return observe(observation)
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Find the objects that a prompt's image shows; see `observe_prompt_image`."""
@@ -175,7 +138,6 @@ class GroundTruth:
 
 
 GROUND_TRUTH = GroundTruth()
-PUBLISHED_ORDER = GroundTruth(left_to_right=False)
 
 
 def make_hidden_objects(count: int = 0) -> ObjectViews:
@@ -246,16 +208,15 @@ def extract_objects(
     return _cut_out(_measure(rgb, segm), ids)
 
 
-def observe(observation: Mapping, *, left_to_right: bool = True) -> ObjectViews:
+def observe(observation: Mapping) -> ObjectViews:
     """Find the objects of an observation by its segmentation.
 
-    Objects are all segmentation values from the end effector's first object id up to 254. By default their
-    order is that of the images, not of the ids, which could give away how the task laid the table.
+    Objects are all segmentation values from the end effector's first object id up to 254. Their order
+    is that of the images, not of the ids, which could give away how the task laid the table.
 
     Args:
         observation: `rgb` and `segm`, each view name to array of 128 × 256 pixels, and `ee`, the index of the
             end effector.
-        left_to_right: Order them by where they lie; False keeps the order of their ids.
 
     Returns:
         The objects that show at least two pixels in some view.
@@ -269,8 +230,7 @@ def observe(observation: Mapping, *, left_to_right: bool = True) -> ObjectViews:
     frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
     views = _measure(frames, part_of(observation, "segm"))
     shown = np.max([view.num_pixels for view in views], axis=0) >= MIN_PIXELS
-    objects = _cut_out(views, first + np.flatnonzero(shown[first:BACKGROUND_ID]))
-    return objects.left_to_right() if left_to_right else objects
+    return _cut_out(views, first + np.flatnonzero(shown[first:BACKGROUND_ID])).left_to_right()
 
 
 def observe_prompt_image(image: PromptImage) -> ObjectViews:

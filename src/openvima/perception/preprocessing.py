@@ -33,7 +33,6 @@ class ImageStack:
     """
 
     def __init__(self, image_size: tuple[int, int]) -> None:
-        self.image_size = image_size
         self._shape = (3, *image_size)
         self._images = [np.zeros(self._shape, np.uint8)]
         self._index: dict[bytes, int] = {b"": 0}  # by digest, which is shorter than the image
@@ -180,7 +179,7 @@ def preprocess_prompt(
         ShapeError: An image has another shape or dtype.
     """
     images = [prompt.images[name] for name in image_names(prompt.text)]
-    found = [_extract_prompt_image(image, kind, extractor, stack.image_size) for image in images]
+    found = [_extract_prompt_image(image, kind, extractor) for image in images]
     return PreprocessedPrompt(
         prompt.text,
         ObjectTable.from_views(ObjectViews.concatenate(found), stack),
@@ -193,7 +192,6 @@ def extract_observation(
     observation: Mapping,
     kind: InputKind,
     extractor: ObjectExtractor | None = None,
-    image_size: tuple[int, int] | None = None,
 ) -> ObjectViews:
     """Extract the objects of an observation, or take both frames whole as one object.
 
@@ -202,14 +200,13 @@ def extract_observation(
             found beforehand.
         kind: "objects" or "frames".
         extractor: Finds the objects; None takes the segmentation, in left-to-right order.
-        image_size: Height and width that halved frames must have; None means those of `IMAGE_SIZES`.
 
     Raises:
         PolicyError: A part or a view is missing, or there is no such end effector.
         ShapeError: An image has another shape or dtype.
     """
     if kind == "frames":
-        return _whole_frames(part_of(observation, "rgb"), image_size or IMAGE_SIZES[kind])
+        return _whole_frames(part_of(observation, "rgb"))
     if FOUND in observation:
         return observation[FOUND]
     if extractor is None:
@@ -265,10 +262,10 @@ def split_prompt(text: str) -> tuple[str | int, ...]:
 
 
 def _extract_prompt_image(
-    image: PromptImage, kind: InputKind, extractor: ObjectExtractor | None, image_size: tuple[int, int]
+    image: PromptImage, kind: InputKind, extractor: ObjectExtractor | None
 ) -> ObjectViews:
     if kind == "frames":
-        return _whole_frames(image.rgb, image_size)
+        return _whole_frames(image.rgb)
     if isinstance(image, FoundImage):
         return image.found
     if extractor is None:
@@ -276,10 +273,10 @@ def _extract_prompt_image(
     return _number(extractor.in_prompt_image(image))
 
 
-def _whole_frames(rgb: Mapping[str, np.ndarray], image_size: tuple[int, int]) -> ObjectViews:
+def _whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
     frames = whole_frames(rgb)
-    if frames.crops.shape[-2:] != image_size:
-        height, width = (2 * length for length in image_size)
+    if frames.crops.shape[-2:] != IMAGE_SIZES["frames"]:
+        height, width = (2 * length for length in IMAGE_SIZES["frames"])
         raise ShapeError(
             f"the frames are {rgb[VIEWS[0]].shape}; this policy takes those of (3, {height}, {width})."
         )

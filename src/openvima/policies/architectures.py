@@ -98,7 +98,7 @@ class TokenPolicyConfig:
         if isinstance(images, ObjectEncoderConfig):
             return InputLayout("objects" if images.fuse_views else "views", tokens_per_image=tokens)
         tokens = tokens or (1 if images.class_token else NUM_VIEWS * images.num_patches)
-        return InputLayout("frames", (images.image_height, images.image_width), tokens)
+        return InputLayout("frames", tokens)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 import torch
 
-from openvima.perception.kernels import CROP_SIZE
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.layers import TensorRecord
 
@@ -154,11 +153,9 @@ class InputLayout:
 
     Args:
         tokens: What a token encodes: an object in both views, an object in one view, or part of a frame.
-        image_size: Height and width of a crop or frame.
         tokens_per_image: Number of tokens of both views of a prompt image or observation; 0 if it depends on
             their objects.
     """
 
     tokens: Literal["objects", "views", "frames"]
-    image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
     tokens_per_image: int = 0

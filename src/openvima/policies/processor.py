@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from openvima.errors import DatasetError, PolicyError, PromptError
-from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import FRONT, TOP, ObjectExtractor, ObjectViews, end_effector_of
 from openvima.perception.preprocessing import (
+    IMAGE_SIZES,
     ImageStack,
     InputKind,
     ObjectTable,
@@ -52,14 +52,12 @@ class Processor:
     Args:
         layout: What a token encodes: "objects", an object in both views; "views", an object in one view (the
             published VIMA); "frames", part of a whole frame.
-        image_size: Height and width of a crop or frame.
         tokens_per_image: Number of tokens of both views of an image; 0 if it depends on its objects.
         tokenizer: Tokenizer of prompt text; by default that of the benchmark's vocabulary.
         extractor: Object extractor for inference; None uses the segmentation.
     """
 
     layout: Literal["objects", "views", "frames"]
-    image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
     tokens_per_image: int = 0
     tokenizer: Tokenizer = field(default_factory=WordTokenizer)
     extractor: ObjectExtractor | None = None
@@ -72,13 +70,7 @@ class Processor:
         extractor: ObjectExtractor | None = None,
     ) -> "Processor":
         """Return a `Processor` for a network with this input layout."""
-        return Processor(
-            inputs.tokens,
-            inputs.image_size,
-            inputs.tokens_per_image,
-            tokenizer or WordTokenizer(),
-            extractor,
-        )
+        return Processor(inputs.tokens, inputs.tokens_per_image, tokenizer or WordTokenizer(), extractor)
 
     @property
     def input_kind(self) -> InputKind:
@@ -104,7 +96,7 @@ class Processor:
             PROMPT_LIMITS.check(prompt)
         if not all(prompt.sequence() for prompt in prompts):
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
-        stack = ImageStack(self.image_size)
+        stack = ImageStack(IMAGE_SIZES[self.input_kind])
         extract_ahead(self.input_kind, self.extractor, prompts=prompts)
         preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
         return self.batch_prompts(preprocessed), stack
@@ -134,7 +126,7 @@ class Processor:
                 objects or none. With layout "views" there may be none after the first step.
             ShapeError: An image has another shape or dtype.
         """
-        stack = stack or ImageStack(self.image_size)
+        stack = stack or ImageStack(IMAGE_SIZES[self.input_kind])
         if num_slots is None or self.layout != "views":
             num_slots = [0] * len(histories)
         extract_ahead(
@@ -145,7 +137,7 @@ class Processor:
         for history, slots in zip(histories, num_slots, strict=True):
             for observation in history:
                 end_effectors.append(end_effector_of(observation))
-                objects = extract_observation(observation, self.input_kind, self.extractor, self.image_size)
+                objects = extract_observation(observation, self.input_kind, self.extractor)
                 self._check_count(len(objects), slots)
                 slots = max(slots, len(objects)) if self.layout == "views" else 0
                 found.append(objects)

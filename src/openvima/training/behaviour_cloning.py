@@ -11,6 +11,7 @@ from torch import nn
 from openvima.data.object_cache import ObjectCache
 from openvima.errors import ConfigError
 from openvima.multiprocess import num_cpus
+from openvima.perception.preprocessing import IMAGE_SIZES
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.training.batches import BatchMaker, ExampleSource, read_batches
 from openvima.training.config import TrainingConfig
@@ -160,7 +161,7 @@ def freeze_crops(
     if count > MAX_FEATURES:
         return
     device = next(learner.parameters()).device
-    height, width = learner.processor.image_size
+    height, width = IMAGE_SIZES[learner.input_kind]
     chunks = [(cache, start) for cache in caches for start in range(0, len(cache), CHUNK)]
     with torch.no_grad():
         black = learner.network.encode_images(
