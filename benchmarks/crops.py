@@ -25,10 +25,10 @@ from openvima.policies.checkpoint import load_network
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
 from openvima.training.augmentation.scenes import rearrange
+from openvima.training.config import PretrainingConfig
 from openvima.training.pretraining.losses import retrieval_accuracy, rotation_accuracy
 from openvima.training.pretraining.pairs import (
     Pairs,
-    SceneAugmentation,
     pairs_of_scene,
     render_pairs,
     stack_rows,
@@ -39,9 +39,11 @@ SEED = 7_000_000  # no run is likely to have it
 SHAPES = ("letter A", "letter G", "heart", "letter R")  # the last is novel
 POSITIONS_Y = (-0.25, 0.0, 0.25)  # m
 AUGMENTATIONS = {
-    "training partition": SceneAugmentation(second_view=True),
-    "with hard negatives": SceneAugmentation(hard_negative_prob=0.5, second_view=True),
-    "with random appearance as well": SceneAugmentation(0.5, 0.5, second_view=True),
+    "training partition": PretrainingConfig(),
+    "with hard negatives": PretrainingConfig(hard_negative_prob=0.5),
+    "with random appearance as well": PretrainingConfig(
+        appearance_randomization_prob=0.5, hard_negative_prob=0.5
+    ),
 }
 
 
@@ -74,7 +76,12 @@ def all_pairs(num_scenes: int) -> Iterator[tuple[str, Pairs]]:
         yield (
             name,
             render_pairs(
-                tasks, num_scenes=num_scenes, seed=SEED, assets="procedural", augmentation=augmentation
+                tasks,
+                num_scenes=num_scenes,
+                seed=SEED,
+                assets="procedural",
+                augmentation=augmentation,
+                second_view=True,
             ),
         )
     for shape in SHAPES:

@@ -21,6 +21,7 @@ from openvima.tasks import task_spec
 from openvima.tasks.prompts import training_paraphrases
 from openvima.training import TrainingConfig
 from openvima.training.building import resolve
+from openvima.training.config import PretrainingConfig
 from openvima.training.pretraining.losses import (
     _compare_attributes,
     _images,
@@ -31,7 +32,6 @@ from openvima.training.pretraining.pairs import (
     AttributeLabeller,
     AttributeLabels,
     Pairs,
-    SceneAugmentation,
     render_pairs,
 )
 from openvima.training.pretraining.stage import (
@@ -44,7 +44,8 @@ from openvima.training.pretraining.stage import (
 from openvima.training.recipes import recipe_settings
 from small_networks import narrow_small
 
-AUGMENTATION = SceneAugmentation(0.4, 0.5, second_view=True, grayscale_prob=0.3)
+PROBS = {"appearance_randomization_prob": 0.4, "hard_negative_prob": 0.5, "grayscale_prob": 0.3}
+AUGMENTED = {"augmentation": PretrainingConfig(**PROBS), "second_view": True}
 TOKENIZER = WordTokenizer(Vocabulary().extended(caption_texts()))
 
 
@@ -55,7 +56,7 @@ def pairs() -> Pairs:
         num_scenes=12,
         seed=0,
         assets="procedural",
-        augmentation=AUGMENTATION,
+        **AUGMENTED,
         with_attributes=True,
     )
 
@@ -126,9 +127,7 @@ def test_pairs_are_labelled_as_rendered(pairs):
     shown = torch.stack([pairs.prompt_masks, pairs.scene_masks, view.masks], dim=1)
     assert torch.equal(labels.boxes.any(dim=-1), shown)
     np.testing.assert_allclose(labels.colours.sum(dim=-1), 1.0, rtol=1e-5)
-    plain = render_pairs(
-        ("same_shape", "novel_adj"), num_scenes=2, seed=0, assets="procedural", augmentation=AUGMENTATION
-    )
+    plain = render_pairs(("same_shape", "novel_adj"), num_scenes=2, seed=0, assets="procedural", **AUGMENTED)
     assert plain.attributes is None
     assert torch.equal(plain.scene_crops, pairs.scene_crops[: len(plain.scenes)])
 

@@ -20,11 +20,11 @@ from openvima.training.augmentation.crops import (
     with_occlusion,
 )
 from openvima.training.augmentation.scenes import (
-    ShapeKinds,
     rearrange,
     with_hard_negatives,
     with_random_appearance,
 )
+from openvima.training.config import PretrainingConfig
 from openvima.training.loop import step_generator
 from openvima.training.parallel import Parallel
 from openvima.training.pretraining import pairs as pairs_module
@@ -34,14 +34,13 @@ from openvima.training.pretraining.losses import (
 )
 from openvima.training.pretraining.pairs import (
     Pairs,
-    SceneAugmentation,
     pairs_of_scene,
     render_pairs,
     stack_rows,
 )
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
-HARD = SceneAugmentation(0.5, 0.6, second_view=True)
+HARD = PretrainingConfig(appearance_randomization_prob=0.5, hard_negative_prob=0.6)
 
 
 def rendered(num_scenes: int, *, seed: int = 0, tasks: tuple[str, ...] = TASKS, **options) -> Pairs:
@@ -59,8 +58,8 @@ def test_pairs_follow_from_the_seed():
 @pytest.mark.slow
 def test_workers_change_nothing(monkeypatch):
     monkeypatch.setattr(pairs_module, "_CHUNK", 3)
-    augmentation = SceneAugmentation(second_view=True, hard_negative_prob=0.5)
-    one, three = (rendered(7, augmentation=augmentation, workers=workers) for workers in (1, 3))
+    options = {"augmentation": HARD, "second_view": True}
+    one, three = (rendered(7, **options, workers=workers) for workers in (1, 3))
     for name in ("prompt_crops", "scene_crops", "appearances", "scenes", "is_grayscale"):
         assert torch.equal(getattr(one, name), getattr(three, name)), name
     assert torch.equal(one.second_view.crops, three.second_view.crops)
@@ -72,7 +71,7 @@ def test_processes_share_the_scenes(monkeypatch):
     one, *parts = (
         rendered(
             5,
-            augmentation=SceneAugmentation(second_view=True),
+            second_view=True,
             with_attributes=True,
             parallel=Parallel(rank, count, torch.device("cpu")),
         )
@@ -102,7 +101,7 @@ def test_random_containers_are_gratings_as_often_as_asked():
             placement.object.rpartition(" ")[0]
             for seed in range(20)
             for placement in with_random_appearance(
-                scene, 1.0, assets, np.random.default_rng(seed), ShapeKinds(prob)
+                scene, 1.0, assets, np.random.default_rng(seed), PretrainingConfig(grating_prob=prob)
             ).placements
             if placement.object.startswith(("random container", "random grating"))
         }
@@ -168,7 +167,7 @@ def encoder() -> ObjectEncoder:
     return ObjectEncoder(ObjectEncoderConfig(crop, fuse_views=True, **sizes))
 
 
-@pytest.mark.parametrize("augmentation", [SceneAugmentation(), HARD])
+@pytest.mark.parametrize("augmentation", [PretrainingConfig(), HARD])
 def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
     """Pairs show training objects in textures of their role, and random ones where it is asked for."""
     shown = []
@@ -180,7 +179,7 @@ def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
 
     monkeypatch.setattr(pairs_module, "_prompt_image", spy)
     tasks = (*TASKS, "rotate", "sweep_without_exceeding")
-    pairs = rendered(30, seed=3, tasks=tasks, augmentation=augmentation)
+    pairs = rendered(30, seed=3, tasks=tasks, augmentation=augmentation, second_view=augmentation is HARD)
     pools = [pool(task, "train") for task in tasks]
     objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
     objects |= {name for entry in pools for name in getattr(entry, "constraint_objects", ())} | {"line"}
@@ -198,7 +197,7 @@ def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
 
 
 def test_a_second_view_leaves_the_scenes_unchanged():
-    plain, twice = rendered(4), rendered(4, augmentation=SceneAugmentation(second_view=True))
+    plain, twice = rendered(4), rendered(4, second_view=True)
     assert plain.second_view is None
     assert torch.equal(plain.prompt_crops, twice.prompt_crops)
     assert torch.equal(plain.scene_crops, twice.scene_crops)

@@ -1,13 +1,11 @@
 """Recipes and files of settings, their precedence on the command line, and runs that it starts."""
 
-import shlex
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from safetensors.torch import load_file
 
 from openvima.cli.main import main
@@ -228,24 +226,6 @@ def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
 def test_a_run_makes_a_working_policy(architecture, data, tmp_path) -> None:
     assert run_train(data, tmp_path, f"{architecture}-nano") == 0
     assert_it_acts(tmp_path)
-
-
-def test_a_finished_run_that_is_to_be_longer_names_the_command_that_goes_on(data, tmp_path, capsys) -> None:
-    run = tmp_path / "my run"
-    assert run_train(data, run, "vima-nano", "--schedule.warmup-steps", 2) == 0
-    capsys.readouterr()
-    longer = ["--schedule.warmup-steps", 2, "--schedule.steps", STEPS + 3]
-    assert run_train(data, run, "vima-nano", *longer) != 0
-    error = " ".join(capsys.readouterr().err.split())
-    assert "finished run, whose learning-rate schedule has ended. Train 3 more steps" in error
-    _, command, _ = error.split("`")
-    program, *words = shlex.split(command)
-    assert program == "openvima" and main(words) == 0
-    other = tmp_path / "my run-longer"
-    settings = yaml.safe_load((other / "config.yaml").read_text())["training"]
-    assert (settings["schedule"]["steps"], settings["schedule"]["warmup_steps"]) == (3, 2)
-    assert settings["init_from"] == str(run)
-    assert (other / "checkpoints" / "2-cloning-000003").is_dir()
 
 
 @pytest.mark.parametrize("finetune", ["False", "True"])

@@ -50,25 +50,6 @@ def test_tensorboard_has_numbers_prompts_and_rollouts(animation: Animation, tmp_
     assert events.Images("2-cloning/rotate/prompt")[0].width == 32
 
 
-def test_training_goes_on_without_a_tensorboard_that_cannot_be_written(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    pytest.importorskip("tensorboard")
-    (tmp_path / "tensorboard_log").touch()  # where a folder should be
-    tracker = TensorBoardTracker(tmp_path, 1)
-    for step in (1, 2):
-        tracker.add("train", {"loss": 1.0}, step)
-    tracker.close()
-    assert [record.message for record in caplog.records] == [
-        f"{tmp_path / 'tensorboard_log'} gets no more events: File exists"
-    ]
-
-
-def test_a_tracker_that_logs_nothing_leaves_no_file(tmp_path: Path) -> None:
-    TensorBoardTracker(tmp_path, 1).close()
-    assert not list(tmp_path.iterdir())
-
-
 def test_wandb_is_asked_for_by_project_and_continued_by_run_folder(
     animation: Animation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

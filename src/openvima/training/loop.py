@@ -199,7 +199,6 @@ class Trainer:
         rollout_every: Steps between rollouts.
         animate: Called with the same checkpoints, for experiment trackers.
         demonstrations: Further values that identify the data.
-        going_on: As in `RunFolder`.
 
     Raises:
         InputFileError: The last checkpoint is damaged.
@@ -218,7 +217,6 @@ class Trainer:
         rollout_every: int | None = None,
         animate: Animate | None = None,
         demonstrations: dict[str, Any] | None = None,
-        going_on: str = "",
     ) -> None:
         self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel
         self._on_report, self._rollout, self._rollout_every = report, rollout, rollout_every
@@ -230,7 +228,6 @@ class Trainer:
             force=config.force,
             keep_every=config.schedule.keep_every,
             is_first=parallel.is_first,
-            going_on=going_on,
         )
         parallel.wait()
         self._started, self._cpu_started = time.monotonic(), time.process_time()

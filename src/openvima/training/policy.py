@@ -35,9 +35,8 @@ from openvima.training.loop import (
     open_run,
 )
 from openvima.training.parallel import Parallel
-from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
+from openvima.training.pretraining.pairs import render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
-from openvima.training.recipes import command_going_on
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
     alternative_source,
@@ -117,7 +116,6 @@ def train(
             rollout_every=config.rollout.every,
             animate=animate,
             demonstrations=_origin(config, dataset, boxes),
-            going_on=command_going_on(config),
         )
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
 
@@ -174,10 +172,8 @@ class _Stages:
             num_scenes=config.num_scenes,
             seed=self.config.seed,
             assets=self.config.assets,
-            augmentation=SceneAugmentation.of(
-                config,
-                second_view=compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes,
-            ),
+            augmentation=config,
+            second_view=compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes,
             with_attributes=with_attributes,
             report=self._say,
             parallel=self.parallel,

@@ -1,6 +1,5 @@
 """Recipes (named settings), and settings from files."""
 
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from reprlib import repr as short
@@ -9,7 +8,6 @@ from typing import Any
 
 from openvima.errors import ConfigError, InputFileError, unknown_name
 from openvima.input_files import read_yaml
-from openvima.policies.naming import CONFIG_FILE
 from openvima.policies.presets import PRESETS
 from openvima.training.config import TrainingConfig
 from openvima.training.validation import convert, flatten, setting_types
@@ -219,15 +217,6 @@ def read_settings(file: Path, *, trust_code: bool = False) -> dict[str, Any]:
             "--trust-code."
         )
     return {name: convert(value, known[name]) for name, value in values.items()}
-
-
-def command_going_on(config: TrainingConfig) -> str:
-    """Return the command that trains on from the weights of a run in another folder, but for its steps."""
-    settings = flatten(config.identity())
-    trust = " --trust-code" if any(_is_code(settings[name]) for name in _CODE) else ""
-    paths = (config.out / CONFIG_FILE, config.data, config.out, f"{config.out}-longer")
-    file, data, run, out = (shlex.quote(str(path)) for path in paths)
-    return f"openvima train --config {file}{trust} --data {data} --init-from {run} --out {out}"
 
 
 def _is_code(value: object) -> bool:

@@ -56,7 +56,6 @@ SESSIONS_FILE = "sessions_log.jsonl"
 OPTIMIZER_FILE = "optimizer.safetensors"
 STATE_FILE = "state.json"
 _PARTIAL = ".partial"
-_STEPS = "training.schedule.steps"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +84,6 @@ class RunFolder:
         force: Delete a run with other settings.
         keep_every: Steps between permanent checkpoints; None keeps the latest and the best only.
         is_first: Whether this process writes the folder; others only read.
-        going_on: Command that trains on from the weights in another folder, but for the number of steps.
 
     Raises:
         ConfigError: The folder belongs to a run with other settings.
@@ -99,7 +97,6 @@ class RunFolder:
         force: bool = False,
         keep_every: int | None = None,
         is_first: bool = True,
-        going_on: str = "",
     ) -> None:
         self.path, self._keep_every = path, keep_every
         self.checkpoints = path / CHECKPOINTS_FOLDER
@@ -107,14 +104,9 @@ class RunFolder:
             return
         differing = self._differences(settings)
         if differing and not force:
-            if going_on and (steps := self._further_steps(settings)):
-                raise ConfigError(
-                    f"{path} holds a finished run, whose learning-rate schedule has ended. Train {steps} "
-                    f"more steps from its weights in another folder: `{going_on} --schedule.steps {steps}`."
-                )
             raise ConfigError(
                 f"{path} holds a run with other settings: {'; '.join(differing)}. Give the same settings to "
-                "continue it, another --out, or --force to delete it."
+                "continue it, another --out (where --init-from takes its weights), or --force to delete it."
             )
         if differing:
             self._clear()
@@ -243,19 +235,6 @@ class RunFolder:
         except InputFileError as error:
             return [str(error).rstrip(".")]
         return differences(flatten(old), flatten(settings))
-
-    def _further_steps(self, settings: dict[str, Any]) -> int:
-        """Return how many steps are asked for beyond those of a finished run; 0 if more differs."""
-        try:
-            old, new = flatten(read_yaml(self.path / CONFIG_FILE)), flatten(settings)
-            last = self.latest()
-        except (OSError, InputFileError):
-            return 0
-        progress, before, asked = Progress(), old.pop(_STEPS, 0), new.pop(_STEPS, 0)
-        if last is not None:
-            progress = _read_progress(last)
-        is_finished = progress.best_checkpoint and progress.step == before  # the last stage names one
-        return max(0, asked - before) if is_finished and old == new else 0
 
     def _clear(self) -> None:
         if not (self.path / CONFIG_FILE).is_file():

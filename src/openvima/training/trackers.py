@@ -1,10 +1,8 @@
 """Experiment trackers, in addition to `metrics.jsonl`: TensorBoard, and Weights & Biases."""
 
-import contextlib
 import io
-import logging
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +16,6 @@ from openvima.video.encoder import Animation
 BOARD_FOLDER = "tensorboard_log"  # events hold times, so they differ between machines
 WANDB_FOLDER = "wandb_log"
 _ID_FILE = "id.txt"
-_LOGGER = logging.getLogger(__name__)
 
 
 class Tracker(Protocol):
@@ -59,61 +56,38 @@ def open_trackers(config: RunConfig, run: Path, first: int) -> list[Tracker]:
 class TensorBoardTracker(Tracker):
     """Writes TensorBoard events to `RUN/tensorboard_log`.
 
-    Training goes on without it if they cannot be written; `metrics.jsonl` has the numbers.
-
     Args:
         run: The run folder.
         first: First step of this session.
     """
 
     def __init__(self, run: Path, first: int) -> None:
-        self._run, self._first = run, first
-        self._events: Any = None
-        self._has_failed = False
+        from torch.utils.tensorboard import SummaryWriter
 
-    @property
-    def _writer(self) -> Any:
-        if self._events is None:  # restarting a finished run writes no empty file
-            from torch.utils.tensorboard import SummaryWriter
-
-            self._events = SummaryWriter(str(self._run / BOARD_FOLDER), purge_step=self._first)
-        return self._events
+        self._writer = SummaryWriter(str(run / BOARD_FOLDER), purge_step=first)
 
     def add(self, prefix: str, values: Mapping[str, float], step: int) -> None:
         """Log named numbers."""
-        with self._noting_failure():
-            for name, value in values.items() if not self._has_failed else ():
-                self._writer.add_scalar(f"{prefix}/{name}", value, step)
+        for name, value in values.items():
+            self._writer.add_scalar(f"{prefix}/{name}", value, step)
 
     def add_animations(self, prefix: str, animations: Sequence[Animation], step: int) -> None:
         """Log rollouts as animated images."""
-        with self._noting_failure():
-            for animation in animations if not self._has_failed else ():
-                self._add_animation(f"{prefix}/{animation.name}", animation, step)
-
-    def _add_animation(self, tag: str, animation: Animation, step: int) -> None:
         from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore  # generated at run time
 
-        self._writer.add_image(f"{tag}/prompt", animation.prompt, step, dataformats="HWC")
-        _, height, width, _ = animation.frames.shape
-        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=animation.gif())
-        summary = Summary(value=[Summary.Value(tag=f"{tag}/rollout", image=image)])
-        self._writer.file_writer.add_summary(summary, step)
+        for animation in animations:
+            tag = f"{prefix}/{animation.name}"
+            self._writer.add_image(f"{tag}/prompt", animation.prompt, step, dataformats="HWC")
+            _, height, width, _ = animation.frames.shape
+            image = Summary.Image(
+                height=height, width=width, colorspace=3, encoded_image_string=animation.gif()
+            )
+            summary = Summary(value=[Summary.Value(tag=f"{tag}/rollout", image=image)])
+            self._writer.file_writer.add_summary(summary, step)
 
     def close(self) -> None:
         """Write what is left."""
-        if self._events is not None:
-            with self._noting_failure():
-                self._events.close()
-
-    @contextlib.contextmanager
-    def _noting_failure(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            if not self._has_failed:
-                _LOGGER.warning("%s gets no more events: %s", self._run / BOARD_FOLDER, error.strerror)
-            self._has_failed = True
+        self._writer.close()
 
 
 class WandbTracker(Tracker):

@@ -8,7 +8,7 @@ its shape alone.
 import math
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,34 +18,14 @@ from openvima.catalog.random_pack import is_random, random_name
 from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Placement, Pose, Scene
 from openvima.tasks.table import NO_SCALE
+from openvima.training.config import PretrainingConfig
 
 _MOVABLE, _CONTAINERS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
 _PALETTE_SIZE = 3  # random textures of a scene, so that some of its objects share one
 
 
-@dataclass(frozen=True, slots=True)
-class ShapeKinds:
-    """How often random shapes are of special kinds; see `PretrainingConfig`."""
-
-    grating_prob: float = 0.0
-    eared_prob: float = 0.0
-    ring_and_block_prob: float = 0.0
-
-    def of_movable(self, rng: np.random.Generator) -> str:
-        """Draw the kind of a movable shape."""
-        if not _draw(self.ring_and_block_prob, rng):
-            return "shape"
-        return "ring" if rng.random() < 0.5 else "block"
-
-    def of_container(self, rng: np.random.Generator) -> str:
-        """Draw the kind of a container."""
-        if _draw(self.grating_prob, rng):
-            return "grating"
-        return "eared container" if _draw(self.eared_prob, rng) else "container"
-
-
 def with_random_appearance(
-    scene: Scene, prob: float, assets: Assets, rng: np.random.Generator, kinds: ShapeKinds | None = None
+    scene: Scene, prob: float, assets: Assets, rng: np.random.Generator, settings: PretrainingConfig
 ) -> Scene:
     """Give some of the objects a random texture, and some a random shape.
 
@@ -54,7 +34,7 @@ def with_random_appearance(
         prob: Probability of either for each object.
         assets: A pack with random textures and shapes.
         rng: Source of all draws.
-        kinds: How often which kinds of shapes; none of the special ones by default.
+        settings: How often which kinds of shapes.
     """
     palette = [random_name("texture", rng) for _ in range(_PALETTE_SIZE)]
     # In half of the scenes equal containers stay equal, so that only texture distinguishes them.
@@ -65,7 +45,7 @@ def with_random_appearance(
             dark = "dark " if rng.random() < 0.25 else ""
             placement = replace(placement, texture=dark + palette[int(rng.integers(_PALETTE_SIZE))])
         if rng.random() < prob:
-            placement = _with_random_shape(placement, assets, rng, common, kinds or ShapeKinds())
+            placement = _with_random_shape(placement, assets, rng, common, settings)
         placements.append(placement)
     return replace(scene, placements=tuple(placements))
 
@@ -81,15 +61,27 @@ def _with_random_shape(
     assets: Assets,
     rng: np.random.Generator,
     common: dict[str, str] | None,
-    kinds: ShapeKinds,
+    settings: PretrainingConfig,
 ) -> Placement:
     is_container = placement.object in _CONTAINERS
     if not is_container and placement.object not in _MOVABLE:
         return placement
-    name = random_name(kinds.of_container(rng) if is_container else kinds.of_movable(rng), rng)
+    name = random_name(_container_kind(settings, rng) if is_container else _movable_kind(settings, rng), rng)
     if common is not None and is_container:
         name = common.setdefault(placement.object, name)
     return at_rest(replace(placement, object=name), assets)
+
+
+def _movable_kind(settings: PretrainingConfig, rng: np.random.Generator) -> str:
+    if not _draw(settings.ring_and_block_prob, rng):
+        return "shape"
+    return "ring" if rng.random() < 0.5 else "block"
+
+
+def _container_kind(settings: PretrainingConfig, rng: np.random.Generator) -> str:
+    if _draw(settings.grating_prob, rng):
+        return "grating"
+    return "eared container" if _draw(settings.eared_prob, rng) else "container"
 
 
 def _draw(prob: float, rng: np.random.Generator) -> bool:

@@ -8,7 +8,6 @@ Labels say what the objects are like, in the attributes in which they are compar
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -27,7 +26,6 @@ from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
 from openvima.training.augmentation.scenes import (
-    ShapeKinds,
     draw_grayscale,
     rearrange,
     to_grayscale,
@@ -207,47 +205,7 @@ class Pairs(TensorRecord):
         return pairs.select(is_visible)
 
 
-@dataclass(frozen=True, slots=True)
-class SceneAugmentation:
-    """Augmentation of the scenes of contrastive pretraining; see `PretrainingConfig`.
-
-    Args:
-        appearance_randomization_prob: Probability for each object of a random texture, and of a random shape.
-        hard_negative_prob: Probability for each movable object of a hard negative.
-        second_view: Add a rearranged view of each scene.
-        grayscale_prob: Probability for each object of a grayscale prompt image.
-        kinds: How often which kinds of random shapes.
-    """
-
-    appearance_randomization_prob: float = 0.0
-    hard_negative_prob: float = 0.0
-    second_view: bool = False
-    grayscale_prob: float = 0.0
-    kinds: ShapeKinds | None = None
-
-    @staticmethod
-    def of(config: PretrainingConfig, *, second_view: bool) -> "SceneAugmentation":
-        """Return the augmentation that the settings of a stage ask for."""
-        return SceneAugmentation(
-            config.appearance_randomization_prob,
-            config.hard_negative_prob,
-            second_view=second_view,
-            grayscale_prob=config.grayscale_prob,
-            kinds=ShapeKinds(config.grating_prob, config.eared_prob, config.ring_and_block_prob),
-        )
-
-    def __call__(
-        self, scene: Scene, shades: AbstractSet[str], assets: Assets, rng: np.random.Generator
-    ) -> Scene:
-        """Augment a scene; `shades` are the textures that movable objects may have."""
-        if prob := self.appearance_randomization_prob:
-            scene = with_random_appearance(scene, prob, assets, rng, self.kinds)
-        if self.hard_negative_prob:
-            scene = with_hard_negatives(scene, self.hard_negative_prob, shades, assets, rng)
-        return scene
-
-
-NO_AUGMENTATION = SceneAugmentation()
+NO_AUGMENTATION = PretrainingConfig()
 
 
 def render_pairs(
@@ -256,7 +214,8 @@ def render_pairs(
     num_scenes: int,
     seed: int,
     assets: str,
-    augmentation: SceneAugmentation = NO_AUGMENTATION,
+    augmentation: PretrainingConfig = NO_AUGMENTATION,
+    second_view: bool = False,
     with_attributes: bool = False,
     report: Report | None = None,
     parallel: Parallel = ONE_PROCESS,
@@ -271,7 +230,8 @@ def render_pairs(
         num_scenes: Number of scenes.
         seed: Seed of the run.
         assets: Asset pack, as `load_assets` takes it.
-        augmentation: Augmentation of the scenes.
+        augmentation: Settings that say how the scenes are augmented.
+        second_view: Add a rearranged view of each scene.
         with_attributes: Label what objects are like; needs a second view.
         report: Called with scenes done, scenes in all, and a note.
         parallel: Processes of the run that share the scenes; each returns all pairs, on its device.
@@ -280,7 +240,7 @@ def render_pairs(
     numbers = parallel.part_of(num_scenes)
     workers = max(1, workers // parallel.num_ranks)
     chunks = [numbers[start : start + _CHUNK] for start in range(0, len(numbers), _CHUNK)]
-    job = partial(_columns_of_scenes, tuple(tasks), seed, assets, augmentation, with_attributes)
+    job = partial(_columns_of_scenes, tuple(tasks), seed, assets, augmentation, second_view, with_attributes)
     say = report and (lambda done: report(done, len(numbers), "rendering scenes"))
     found = {chunk.start: columns for chunk, columns in imap_unordered(job, chunks, workers, report=say)}
     columns = zip(*(found[chunk.start] for chunk in chunks), strict=True)
@@ -292,7 +252,8 @@ def _columns_of_scenes(
     tasks: Sequence[str],
     seed: int,
     assets: str,
-    augmentation: SceneAugmentation,
+    augmentation: PretrainingConfig,
+    second_view: bool,
     with_attributes: bool,
     numbers: range,
     count: Callable[..., None],
@@ -311,8 +272,11 @@ def _columns_of_scenes(
         scene = _retexture(episode.problem.scene, pools[task], np.random.default_rng(episode_seed))
         # A generator of its own, so that the scenes below are the same with any augmentation.
         rng = np.random.default_rng([episode_seed, 1])
-        scene = augmentation(scene, shades, rasteriser.assets, rng)
-        view = rearrange(scene, rng) if augmentation.second_view else None
+        if prob := augmentation.appearance_randomization_prob:
+            scene = with_random_appearance(scene, prob, rasteriser.assets, rng, augmentation)
+        if prob := augmentation.hard_negative_prob:
+            scene = with_hard_negatives(scene, prob, shades, rasteriser.assets, rng)
+        view = rearrange(scene, rng) if second_view else None
         is_grayscale = draw_grayscale(len(scene.placements), augmentation.grayscale_prob, rng)
         rows += pairs_of_scene(
             scene,
