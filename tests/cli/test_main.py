@@ -180,7 +180,7 @@ WORDS = ["generate", "--tasks", "rotate", "--episodes", "5"]
 
 
 def test_flags_reach_the_shards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = ["--compression", "zstd", "--no-images", "--keep-failed", "--seed", "7", "--shard-size", "3"]
+    flags = ["--compression", "zstd", "--no-images", "--seed", "7", "--shard-size", "3"]
     assert main([*WORDS, *flags, "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'out'}\n"
     shard = Shard(tmp_path / "out" / "rotate-train-00001.arrow")

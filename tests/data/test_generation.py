@@ -120,31 +120,10 @@ def clumsy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("clumsy")
-def test_failed_episodes_are_kept_apart_on_request(tmp_path: Path) -> None:
-    generate(config(tmp_path / "without"))
-    generate(config(tmp_path / "kept", keep_failed=True))
-    kept = contents(tmp_path / "kept")
-    without = contents(tmp_path / "without")
-    assert {name: content for name, content in kept.items() if not name.startswith("failed/")} == without
-    dataset = Dataset(tmp_path / "kept")
+def test_failed_episodes_are_left_out_and_counted(tmp_path: Path) -> None:
+    dataset = Dataset(generate(config(tmp_path / "demos")))
     assert all(demo.outcome.success for demo in dataset)
     assert dataset.manifest["tasks"]["rotate"]["skipped"] == {"failed": 1, "no_action": 1, "unsolved": 2}
-    failed = Dataset(tmp_path / "kept" / "failed", tasks=["rotate"])
-    assert [demo.seed for demo in failed] == [0, 1, 20]
-    assert [demo.outcome.reason for demo in failed] == ["it fell", "", ""]
-    assert failed.manifest["config"]["kept"] == "failed"
-
-
-@pytest.mark.usefixtures("clumsy")
-def test_failed_episodes_can_be_asked_for_later_and_are_extended(tmp_path: Path) -> None:
-    generate(config(tmp_path / "at_once", keep_failed=True))
-    generate(config(tmp_path / "later", episodes=1))
-    generate(config(tmp_path / "later", episodes=1, keep_failed=True))
-    generate(config(tmp_path / "later", keep_failed=True))
-    generate(config(tmp_path / "at_last"))
-    generate(config(tmp_path / "at_last", keep_failed=True))
-    assert contents(tmp_path / "later") == contents(tmp_path / "at_once")
-    assert contents(tmp_path / "at_last") == contents(tmp_path / "at_once")
 
 
 def test_every_episode_is_a_solved_one_as_the_environment_shows_it(whole: Path) -> None:
@@ -352,10 +331,10 @@ def test_the_command_of_a_record_has_its_settings(tmp_path: Path) -> None:
     )
     record = json.loads(json.dumps(asked.record()))
     assert str(tmp_path) not in json.dumps(record)
-    command = generate_command(Path("my demos"), record, keep_failed=True)
+    command = generate_command(Path("my demos"), record)
     for words in ("--out 'my demos'", "--level L1", "--seed 5", "--task-options difficulty=hard", "--compat"):
         assert words in command
-    for words in ("--compression zstd", "--no-images", "--keep-failed"):
+    for words in ("--compression zstd", "--no-images"):
         assert words in command
 
 

@@ -52,21 +52,16 @@ def test_counts_are_those_of_the_episodes(whole: Path) -> None:
     assert titles == ["level", "steps in an episode", "end effector"]
 
 
-def test_failed_episodes_and_object_caches_are_counted(
-    whole: Path, tmp_path: Path, made_up: MadeUp, info: ShardInfo
-) -> None:
+def test_object_caches_are_counted(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
     folder = tmp_path / "demos"
-    (folder / "failed").mkdir(parents=True)
     (folder / "object_cache" / "objects-v1").mkdir(parents=True)
     (folder / "object_cache" / "objects-v1" / "a.arrow").write_bytes(bytes(1000))
-    for path in (folder / "stack-train-00000.arrow", folder / "failed" / "stack-train-00000.arrow"):
-        with ShardWriter(path, info) as writer:
-            writer.write(made_up(num_steps=0, num_images=0))
+    with ShardWriter(folder / "stack-train-00000.arrow", info) as writer:
+        writer.write(made_up(num_steps=0, num_images=0))
     shards = [folder / "stack-train-00000.arrow"]
     finish_folder(folder, shards, command="openvima generate", config={}, versions=info.versions)
     summary = finished(folder)
-    assert (summary.num_failed, summary.object_caches) == (1, {"objects-v1": 1000})
-    assert finished(whole).num_failed is None
+    assert summary.object_caches == {"objects-v1": 1000}
 
 
 def test_the_terminal_shows_the_whole(

@@ -25,10 +25,9 @@ from openvima.data import (
 )
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import MANIFEST_NAME, finish_folder
-from openvima.data.planning import COMMAND
 from openvima.data.verification import Verification
 from openvima.errors import DatasetError
-from openvima.scene import Action, Outcome
+from openvima.scene import Action
 from small_data_sets import TASKS, contents, finish, with_plain_images, write_folder
 
 MadeUp = Callable[..., Demonstration]
@@ -67,18 +66,6 @@ def test_a_generated_data_set_is_clean_and_replays(whole: Path) -> None:
     assert found.notes == ()
     assert (found.num_shards, found.num_episodes, found.num_replayed) == (4, 6, 6)
     assert calls[-1] == (6, 6, "replaying")
-
-
-def test_failed_episodes_can_be_verified_alone(
-    tmp_path: Path, made_up: MadeUp, info: ShardInfo, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_folder(tmp_path, info, [[with_plain_images(made_up(1))]], command=COMMAND)
-    failed = dataclasses.replace(with_plain_images(made_up(2)), outcome=Outcome(failure=True))
-    write_folder(tmp_path / "failed", info, [[failed]], command=COMMAND)
-    config = VerifyConfig(replay=0)
-    by_name = verify(tmp_path / "failed", config)
-    monkeypatch.chdir(tmp_path / "failed")
-    assert causes(verify(".", config)) == causes(by_name)
 
 
 def test_what_killed_writers_left_is_noted_and_what_the_manifest_does_not_list_is_none(folder: Path) -> None:
@@ -227,15 +214,3 @@ def test_the_command_that_is_named_makes_a_damaged_file_again(folder: Path, whol
         command = f"openvima generate --out {folder} --tasks {','.join(TASKS)} --episodes 3 --shard-size 2"
     assert main(shlex.split(command)[1:]) == 0
     assert contents(folder) == contents(whole)
-
-
-def test_shards_of_failed_episodes_are_verified_too(folder: Path, made_up: MadeUp, info: ShardInfo) -> None:
-    failed = dataclasses.replace(
-        with_plain_images(made_up()), outcome=Outcome(failure=True, reason="it fell")
-    )
-    write_folder(folder / "failed", info, [[failed]], command=COMMAND)
-    found = verify(folder, NONE)
-    assert found.num_episodes == 7
-    assert found.is_clean
-    (folder / "failed" / "index.parquet").unlink()
-    assert causes(verify(folder, NONE))["failed/index.parquet"] == ["it is missing"]

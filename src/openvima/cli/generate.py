@@ -23,7 +23,6 @@ def main(
     address: str | None = None,
     compression: Literal["lz4", "zstd"] = "lz4",
     images: bool = True,
-    keep_failed: bool = False,
     assets: str = "procedural",
     compat: bool = False,
     prompts: str = "multimodal",
@@ -54,7 +53,6 @@ def main(
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
         compression: Codec of the files: lz4, or zstd, which is smaller and slower.
         images: Store images; without, they are drawn anew on reading.
-        keep_failed: Keep episodes that the oracle did not solve too, in the folder's "failed".
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
         compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
@@ -84,7 +82,6 @@ def main(
         env_config=EnvConfig(assets, compat, prompts, task_options, control),
         compression=compression,
         images=images,
-        keep_failed=keep_failed,
         workers=workers,
         engine=engine,
         address=address,

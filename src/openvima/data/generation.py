@@ -1,6 +1,5 @@
 """Generating demonstrations: what a folder holds already, the rollouts, the finished data set."""
 
-import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -9,7 +8,6 @@ from pathlib import Path
 from openvima.atomic_io import FINISH_S, folder_lock, parts_in_range
 from openvima.data.encoding import ShardInfo, SkipKind, Skipped
 from openvima.data.manifest import (
-    FAILED_FOLDER,
     MANIFEST_NAME,
     clear,
     finish_folder,
@@ -32,21 +30,14 @@ from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.multiprocess import Report, imap_with_engine
 
-FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
-
 
 def is_done(block: Block) -> bool:
     """Say whether a block's shard needs no work.
 
     A shard is whole if its name exists. It is written again if more episodes are asked for than when it was
-    written, or if its failed episodes are wanted now and were not kept.
+    written.
     """
-    if not block.path.is_file():
-        return False
-    shard = Shard(block.path)
-    if len(shard) != block.episodes:
-        return False
-    return block.failed_path is None or block.failed_path.is_file() or not _has_failed(shard)
+    return block.path.is_file() and len(Shard(block.path)) == block.episodes
 
 
 def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
@@ -71,12 +62,6 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
                 f"{path} belongs to another data set, or to a larger one: {'; '.join(problems)}. "
                 "Give its settings, another --out, or --force to delete it."
             )
-    failed = config.out / FAILED_FOLDER
-    if not config.keep_failed and any(failed.glob("*.arrow")):
-        raise DatasetError(
-            f"{failed} holds the episodes that the oracle did not solve. "
-            "Give --keep-failed to keep it up to date, or delete it."
-        )
 
 
 def _check_origin(folder: Path) -> None:
@@ -84,16 +69,11 @@ def _check_origin(folder: Path) -> None:
     if not (folder / MANIFEST_NAME).is_file():
         return
     manifest = read_manifest(folder)
-    if manifest["command"] != COMMAND or "kept" in manifest["config"]:
+    if manifest["command"] != COMMAND:
         raise DatasetError(
             f"{folder} belongs to another data set: `{manifest['command']}` made it. "
             "Give another --out, or --force to delete it."
         )
-
-
-def _has_failed(shard: Shard) -> bool:
-    rows = shard.table(["skipped"]).column("skipped").to_pylist()
-    return any(skipped["kind"] in FAILED_KINDS for row in rows for skipped in row)
 
 
 def _explain_surplus(found: ShardInfo, config: GenerateConfig) -> str:
@@ -103,9 +83,7 @@ def _explain_surplus(found: ShardInfo, config: GenerateConfig) -> str:
 
 
 def write_block(block: Block, count: Callable[[int], None]) -> None:
-    """Write one shard, and one of its failed episodes if these are kept.
-
-    A smaller shard that is there is continued, unless its failed episodes are wanted now.
+    """Write one shard; a smaller one that is there is continued.
 
     Args:
         block: What to write.
@@ -116,10 +94,8 @@ def write_block(block: Block, count: Callable[[int], None]) -> None:
         DatasetError: A record that is to be copied is damaged.
     """
     num_kept, skipped = 0, []
-    with contextlib.ExitStack() as files:  # closed in reverse: where a shard is, its failed episodes are too
-        kept = files.enter_context(ShardWriter(block.path, block.info))
-        failed: ShardWriter | None = None
-        if block.path.is_file() and block.failed_path is None:
+    with ShardWriter(block.path, block.info) as kept:
+        if block.path.is_file():
             num_kept, next_seed = _copy_records(block.path, kept)
             rest = range(next_seed, block.seeds.stop)
             block = replace(block, episodes=block.episodes - num_kept, seeds=rest)
@@ -131,11 +107,6 @@ def write_block(block: Block, count: Callable[[int], None]) -> None:
                 num_kept, skipped = num_kept + 1, []
             else:
                 skipped.append(explain_skip(rollout))
-                if block.failed_path is not None:
-                    if failed is None:
-                        block.failed_path.parent.mkdir(exist_ok=True)
-                        failed = files.enter_context(ShardWriter(block.failed_path, block.info))
-                    failed.write(rollout)
             count(num_kept)
 
 
@@ -267,8 +238,7 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
     count(0)
     if not missing:
         return
-    for folder in (config.out, config.out / FAILED_FOLDER):
-        (folder / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
+    (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
     try:
         for _ in imap_with_engine(
             config.engine, write_block, missing, config.workers, address=config.address, report=count
@@ -298,7 +268,7 @@ def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None
 
 
 def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
-    """Write index and manifest of a folder whose shards are all there, and those of its failed episodes.
+    """Write index and manifest of a folder whose shards are all there.
 
     Args:
         config: What was generated.
@@ -307,10 +277,5 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
     Raises:
         DatasetError: A shard is damaged.
     """
-    versions, record = blocks[0].info.versions, config.record()
-    failed = [block.failed_path for block in blocks if block.failed_path and block.failed_path.is_file()]
-    if failed:
-        settings = {**record, "kept": FAILED_FOLDER}
-        finish_folder(config.out / FAILED_FOLDER, failed, command=COMMAND, config=settings, versions=versions)
-    paths = [block.path for block in blocks]
-    finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions)
+    paths, versions = [block.path for block in blocks], blocks[0].info.versions
+    finish_folder(config.out, paths, command=COMMAND, config=config.record(), versions=versions)

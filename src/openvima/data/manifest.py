@@ -23,7 +23,6 @@ from openvima.errors import DatasetError, StorageError
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
 BROKEN_NAME = "broken.json"  # episodes that an import left out
-FAILED_FOLDER = "failed"  # episodes that the oracle did not solve; a data set of the same form
 _NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
 CACHE_FOLDER = "object_cache"  # derived from the shards, safe to delete
 LICENCE = "MIT"
@@ -261,21 +260,20 @@ def is_finished(folder: Path) -> bool:
 
 
 def clear(folder: Path) -> None:
-    """Delete a data set, its failed episodes too; other files stay."""
-    for part in (folder, folder / FAILED_FOLDER):
-        for path in [*(part / name for name in _NAMES), *part.glob("*.arrow")]:
-            path.unlink(missing_ok=True)
+    """Delete a data set; other files stay."""
+    for path in [*(folder / name for name in _NAMES), *folder.glob("*.arrow")]:
+        path.unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path, shards: Iterable[Path] | None = None) -> None:
     """Delete what killed writers, perhaps on other machines, left in a folder that is locked.
 
     Args:
-        folder: The data folder; its failed episodes count too.
+        folder: The data folder.
         shards: The locked shards; None means the whole folder.
     """
     names = None if shards is None else {path.name for path in shards}
-    for file in (*folder.glob(".*.tmp"), *(folder / FAILED_FOLDER).glob(".*.tmp")):  # .NAME.PROCESS.tmp
+    for file in folder.glob(".*.tmp"):  # .NAME.PROCESS.tmp
         name = file.name[1:].rsplit(".", 2)[0]
         if name in names if names is not None else name in _NAMES or name.endswith(".arrow"):
             file.unlink(missing_ok=True)

@@ -14,7 +14,6 @@ from typing import Any, Literal
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
 from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
@@ -58,7 +57,6 @@ class GenerateConfig:
         env_config: Settings of the environments.
         compression: Codec of the files: "lz4", or "zstd", which is smaller and slower.
         images: Store images; without, they are drawn anew on reading.
-        keep_failed: Keep the episodes that the oracle did not solve too, in the folder's `failed`.
         workers: Number of processes; None means one, or on a Ray cluster at an address all that it offers.
         engine: "processes" of this machine, or "ray".
         address: Of a Ray cluster; None starts Ray on this machine for as long as it is needed.
@@ -79,7 +77,6 @@ class GenerateConfig:
     env_config: EnvConfig = DEFAULT_ENV_CONFIG
     compression: Compression = "lz4"
     images: bool = True
-    keep_failed: bool = False
     workers: int | None = None
     engine: Engine = "processes"
     address: str | None = None
@@ -153,13 +150,12 @@ class GenerateConfig:
         }
 
 
-def generate_command(out: Path, record: Mapping[str, Any], *, keep_failed: bool = False) -> str:
+def generate_command(out: Path, record: Mapping[str, Any]) -> str:
     """Return the command that writes a data set, or what a folder lacks of it.
 
     Args:
         out: The folder.
         record: `config` of its manifest.
-        keep_failed: Whether it holds failed episodes too.
     """
     tasks = record.get("tasks")
     options = {"--out": out, "--tasks": ",".join(map(str, tasks)) if isinstance(tasks, list) else None}
@@ -168,7 +164,6 @@ def generate_command(out: Path, record: Mapping[str, Any], *, keep_failed: bool 
     options |= {f"--{name.replace('_', '-')}": record.get(name) for name in ENV_SETTINGS if name != "compat"}
     words = [word for name, value in options.items() if value for word in (name, str(value))]
     flags = {"--no-images": not record.get("images", True), "--compat": record.get("compat")}
-    flags["--keep-failed"] = keep_failed
     return shlex.join([*COMMAND.split(), *words, *(name for name, is_set in flags.items() if is_set)])
 
 
@@ -182,7 +177,6 @@ class Block:
         episodes: Number of successful episodes.
         seeds: Seeds to try, in order.
         env_config: As in `GenerateConfig`.
-        failed_path: File for the episodes that the oracle did not solve; None throws them away.
     """
 
     path: Path
@@ -190,7 +184,6 @@ class Block:
     episodes: int
     seeds: range
     env_config: EnvConfig
-    failed_path: Path | None = None
 
 
 def plan(config: GenerateConfig) -> list[Block]:
@@ -218,10 +211,7 @@ def plan(config: GenerateConfig) -> list[Block]:
                 images=config.images,
                 **{**asdict(config.env_config), "assets": assets},
             )
-            failed = config.out / FAILED_FOLDER / info.file_name if config.keep_failed else None
-            blocks.append(
-                Block(config.out / info.file_name, info, episodes, seeds, config.env_config, failed)
-            )
+            blocks.append(Block(config.out / info.file_name, info, episodes, seeds, config.env_config))
     return blocks
 
 

@@ -22,7 +22,6 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
     BROKEN_NAME,
     CACHE_FOLDER,
-    FAILED_FOLDER,
     INDEX_NAME,
     MANIFEST_NAME,
     finish_folder,
@@ -41,7 +40,7 @@ Duplicates = Literal["refuse", "skip"]
 _SPLIT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _ROUNDING = 1e-6  # tolerance of the sum of fractions
 _NUM_NAMED = 3  # duplicates that a message names
-_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, CACHE_FOLDER)
 
 
 def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:

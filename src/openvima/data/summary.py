@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
+from openvima.data.manifest import CACHE_FOLDER, INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset, data_folder
-from openvima.data.shard import Shard
 from openvima.errors import DatasetError, echo
 from openvima.hub import dataset_name
 from openvima.multiprocess import Report
@@ -73,7 +72,6 @@ class Summary:
         manifest: Its manifest.
         tasks: One entry a task, by name.
         histograms: Of levels, steps, tools and, with details, of objects, textures and prompt images.
-        num_failed: Episodes in `failed/`; None if there is no such folder.
         object_caches: Name of each object cache to its size in bytes.
     """
 
@@ -81,12 +79,11 @@ class Summary:
     manifest: dict[str, Any]
     tasks: tuple[TaskSummary, ...]
     histograms: tuple[Histogram, ...]
-    num_failed: int | None
     object_caches: dict[str, int]
 
     @property
     def file_bytes(self) -> int:
-        """Size of shards, index and manifest, without failed episodes and object caches."""
+        """Size of shards, index and manifest, without object caches."""
         shards = sum(entry["bytes"] for entry in self.manifest["shards"].values())
         return shards + sum((self.folder / name).stat().st_size for name in (INDEX_NAME, MANIFEST_NAME))
 
@@ -101,7 +98,6 @@ class Summary:
             "file_bytes": self.file_bytes,
             "tasks": tasks,
             "histograms": {histogram.title: histogram.counts for histogram in self.histograms},
-            "failed_episodes": self.num_failed,
             "object_caches": self.object_caches,
         }
         return {**self.manifest, "summary": summary}
@@ -133,7 +129,6 @@ def summarise_folder(folder: str | Path, *, details: bool = False, report: Repor
         dataset.manifest,
         tuple(_task_summary(dataset, task, task_of == task) for task in dataset.manifest["tasks"]),
         tuple(histograms),
-        _count_failed(folder),
         _measure_caches(folder),
     )
 
@@ -186,13 +181,6 @@ def _most_first(counts: Counter[str]) -> dict[str, int]:
 
 def _value_counts(values: pa.Array | pa.ChunkedArray) -> dict[Any, int]:
     return {entry["values"]: entry["counts"] for entry in values.value_counts().to_pylist()}
-
-
-def _count_failed(folder: Path) -> int | None:
-    failed = folder / FAILED_FOLDER
-    if not failed.is_dir():
-        return None
-    return sum(len(Shard(path)) for path in failed.glob("*.arrow"))
 
 
 def _measure_caches(folder: Path) -> dict[str, int]:

@@ -11,7 +11,7 @@ import hashlib
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,6 @@ import pyarrow as pa
 from openvima.catalog.packs import load_assets, recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
-    FAILED_FOLDER,
     INDEX_NAME,
     MANIFEST_NAME,
     fingerprint,
@@ -137,7 +136,7 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     """Find all problems of a data set; nothing is changed.
 
     Args:
-        folder: Folder of demonstrations. Its `failed` episodes are checked too.
+        folder: Folder of demonstrations.
         config: How thoroughly to verify.
         report: Called with episodes done, episodes in all, and the current stage.
 
@@ -152,16 +151,7 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     folder = as_path(folder)
     if config.assets is not None and is_code(config.assets):
         load_assets(config.assets)
-    found = _Verifier(folder, config, report).run()
-    failed = folder / FAILED_FOLDER
-    if not (failed / MANIFEST_NAME).is_file() and not any(failed.glob("*.arrow")):
-        return found
-    inner = _Verifier(failed, config, report).run()
-    problems = [replace(problem, file=f"{FAILED_FOLDER}/{problem.file}") for problem in inner.problems]
-    inner = replace(inner, problems=tuple(problems))
-    names = [field.name for field in fields(found) if field.name != "folder"]
-    both = replace(found, **{name: getattr(found, name) + getattr(inner, name) for name in names})
-    return replace(both, problems=tuple(sorted(both.problems)))
+    return _Verifier(folder, config, report).run()
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +203,7 @@ class _Checked:
 
 @dataclass(slots=True)
 class _Verifier:
-    """Verifies one folder, without the failed episodes in it."""
+    """Verifies one folder."""
 
     folder: Path
     config: VerifyConfig
@@ -255,11 +245,6 @@ class _Verifier:
         )
 
     @property
-    def _holds_failed(self) -> bool:
-        folder = self.folder.resolve()  # which has a name and a parent, even if "." was given
-        return folder.name == FAILED_FOLDER and (folder.parent / MANIFEST_NAME).is_file()
-
-    @property
     def _is_generated(self) -> bool:
         return self.manifest is not None and self.manifest["command"] == COMMAND
 
@@ -271,9 +256,7 @@ class _Verifier:
         if not self._is_generated:
             command = echo(self.manifest["command"])
             return f"Restore it from a copy, or delete the folder and write it again with `{command}`."
-        out = self.folder.parent if self._holds_failed else self.folder
-        keep_failed = self._holds_failed or (out / FAILED_FOLDER).is_dir()
-        command = generate_command(out, self.manifest["config"], keep_failed=keep_failed)
+        command = generate_command(self.folder, self.manifest["config"])
         return f"Delete it and make it again: `{echo(command, len(command))}`"
 
     def _add(self, file: str, cause: str, remedy: str) -> None:

@@ -270,7 +270,7 @@ def push_demonstrations(
 ) -> HubName:
     """Push a finished data set to the Hugging Face Hub in one commit, with a dataset card.
 
-    Shards, index and manifest are pushed; failed episodes and object caches are not.
+    Shards, index and manifest are pushed; object caches are not.
 
     Args:
         folder: Folder of demonstrations.

@@ -77,8 +77,6 @@ def _summary(summary: "Summary", name: str) -> "Iterator[str | Table]":
     yield f"written by {manifest['command']}{_settings(manifest['config'])}"
     yield ", ".join(f"{name} {versions[name]}" for name in sorted(versions))
     yield f"finished; content {manifest['content_hash']}, licence {manifest['licence']}"
-    if summary.num_failed is not None:
-        yield f"failed/ keeps {summary.num_failed:,} episodes that the oracle did not solve"
     for name, size in summary.object_caches.items():
         yield f"object cache {name}: {size / 1e6:,.1f} MB"
     yield ""
