@@ -132,7 +132,9 @@ class NaiveProcessor:
         slots = _widest(images)
         if self.layout == "views":
             # What comes after the fullest view's objects is hidden in both.
-            images = [image.select(np.arange(len(image)) < max(slots)).pad(max(slots)) for image in images]
+            images = [
+                padded(image.select(np.arange(len(image)) < max(slots)), max(slots)) for image in images
+            ]
         count, unread = 0, iter(images)
         for piece in sequence:
             if isinstance(piece, str):

@@ -27,7 +27,7 @@ from tests.policies.golden import (
     watched,
 )
 
-from naive_inputs import WORD, HistoryBatch, NaiveProcessor, StepInput
+from naive_inputs import WORD, HistoryBatch, NaiveProcessor, StepInput, padded
 from openvima.policies.nn.action_head import ObservationTokens, decode_bins, encode_bins
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, to_unit_range
 from openvima.policies.nn.decoder import Decoder, PrefixDecoder
@@ -232,7 +232,7 @@ def _filled(steps: Sequence[StepInput]) -> tuple[list[StepInput], list[int]]:
     counts = [len(step.objects) for step in steps]
     nowhere = np.zeros((max(counts), 2))
     filled = [
-        replace(step, objects=step.objects.pad(max(counts)), positions=nowhere, grasps=nowhere)
+        replace(step, objects=padded(step.objects, max(counts)), positions=nowhere, grasps=nowhere)
         for step in steps
     ]
     return filled, counts

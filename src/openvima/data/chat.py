@@ -11,16 +11,16 @@ import inspect
 import json
 import math
 import re
-import struct
 import sys
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from openvima.data.chat_settings import DEFAULT_ENLARGE, ChatView, Points, check_format
 from openvima.errors import AnswerError, echo
@@ -296,31 +296,10 @@ def wording_hash() -> str:
 
 def encode_picture(rgb: np.ndarray, enlarge: int) -> bytes:
     """Encode an image, shape (3, H, W), uint8, as a PNG file of `enlarge` times its size, unsmoothed."""
-    _, height, width = rgb.shape
-    # Filters: 1 is the difference to the left pixel, 2 that to the row above. So repetitions are zeros, and
-    # those of rows are compressed once, to be inserted where the compressor refers to nothing before.
-    rows = np.zeros((height, 1 + 3 * enlarge * width), np.uint8)
-    rows[:, 0] = 1
-    for channel, values in enumerate(np.diff(rgb, axis=2, prepend=np.uint8(0))):
-        rows[:, 1 + channel :: 3 * enlarge] = values
-    repeated = (b"\2" + bytes(3 * enlarge * width)) * (enlarge - 1)
-    packer = zlib.compressobj(1, wbits=-15, strategy=zlib.Z_RLE)
-    inserted = packer.compress(repeated) + packer.flush(zlib.Z_FULL_FLUSH)
-    # Adler-32 is two sums, of the bytes and of the first sum after each: `repeated` moves them on like this.
-    high, low = divmod(zlib.adler32(repeated, 0), 1 << 16)
-    data, checksum = [b"\x78\x01"], 1
-    for row in map(bytes, rows):
-        data += [packer.compress(row), packer.flush(zlib.Z_FULL_FLUSH), inserted]
-        second, first = divmod(zlib.adler32(row, checksum), 1 << 16)
-        checksum = (second + len(repeated) * first + high) % 65521 << 16 | (first + low) % 65521
-    data += [packer.flush(), checksum.to_bytes(4, "big")]
-    size = enlarge * width, enlarge * height
-    head = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)  # eight bits of red, green and blue
-    chunks = ((b"IHDR", head), (b"IDAT", b"".join(data)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
-    )
+    pixels = channels_last(rgb).repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+    file = BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG", compress_level=1)
+    return file.getvalue()
 
 
 def tool_in(observation: Mapping) -> str:

@@ -6,7 +6,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,7 @@ def summarise_shard(path: Path) -> ShardSummary:
         "redraws": _sum(table, "redraws"),
         "skipped": dict(sorted(skipped.items())),
     }
-    entry = {**counts, **fingerprint(path), **envelope.to_entry()}
+    entry = {**counts, **fingerprint(path), **asdict(envelope)}
     return ShardSummary(path.name, entry, _make_index_part(table, path.name, spans))
 
 

@@ -12,7 +12,7 @@ from functools import lru_cache
 from math import prod
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -342,13 +342,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     def __len__(self) -> int:
         return len(self.dataset)
 
-    @overload
-    def __getitem__(self, index: int) -> PreprocessedEpisode: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[PreprocessedEpisode]: ...
-    def __getitem__(self, index: int | slice) -> PreprocessedEpisode | list[PreprocessedEpisode]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
+    def __getitem__(self, index: int) -> PreprocessedEpisode:  # type: ignore[override]  # nobody slices
         name, row = self.dataset.locate(index)
         return self._files[name][row]
 

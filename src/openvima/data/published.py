@@ -160,19 +160,13 @@ class PublishedData(Sequence[Demonstration]):
             )
         return self._read(self._place_of[key])
 
-    def demonstrations(
-        self, task: str | None = None, on_broken: Callable[[Broken], None] | None = None
-    ) -> Iterator[Demonstration]:
+    def demonstrations(self, on_broken: Callable[[Broken], None] | None = None) -> Iterator[Demonstration]:
         """Read all episodes that are whole.
 
         Args:
-            task: Those of this task only; old or new name.
             on_broken: Called with each one that is not.
         """
-        wanted = None if task is None else current_task(task) or task
         for place in self.places:
-            if wanted not in (None, place.key.task):
-                continue
             found = read_place(self._source, place)
             if isinstance(found, Demonstration):
                 yield found

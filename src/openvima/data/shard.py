@@ -46,36 +46,31 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """What lies around the records.
+    """What lies around the records, as the manifest names it.
 
     Args:
-        file_bytes: Size of the whole file.
+        bytes: Size of the whole file.
         head_bytes: Bytes before the first record.
         tail_bytes: Bytes after the last one.
-        crc32: CRC-32 of head and tail.
+        frame_crc32: CRC-32 of head and tail.
     """
 
-    file_bytes: int
+    bytes: int
     head_bytes: int
     tail_bytes: int
-    crc32: int
-
-    def to_entry(self) -> dict[str, int]:
-        """Return what the manifest holds of a shard's envelope."""
-        names = ("bytes", "head_bytes", "tail_bytes", "frame_crc32")
-        return dict(zip(names, (self.file_bytes, self.head_bytes, self.tail_bytes, self.crc32), strict=True))
+    frame_crc32: int
 
     def fault_in(self, content: memoryview) -> str:
         """Say what is wrong around the records in a file's content; nothing if all is as it was."""
-        if len(content) != self.file_bytes:
-            return f"it has {len(content):,} of {self.file_bytes:,} bytes"
-        is_same = _envelope_crc32(content, self.head_bytes, self.tail_bytes) == self.crc32
+        if len(content) != self.bytes:
+            return f"it has {len(content):,} of {self.bytes:,} bytes"
+        is_same = _envelope_crc32(content, self.head_bytes, self.tail_bytes) == self.frame_crc32
         return "" if is_same else "the checksum of its schema and footer is wrong"
 
     @staticmethod
     def from_entry(entry: Mapping[str, Any]) -> "Envelope":
         """Read a shard's entry in the manifest."""
-        return Envelope(entry["bytes"], entry["head_bytes"], entry["tail_bytes"], entry["frame_crc32"])
+        return Envelope(*(entry[name] for name in Envelope.__slots__))
 
 
 def map_file(path: Path) -> memoryview:

@@ -7,7 +7,6 @@ ever.
 
 import pickle
 from collections.abc import Callable, Sequence
-from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ class DemonstrationDataset(Dataset):
     """Whole demonstrations with their images, by number.
 
     A plain `DataLoader` makes batches of them, with any number of workers: items of `tensors_of` are joined
-    by `collate`. A slice is a `DemonstrationDataset` of those demonstrations.
+    by `collate`.
 
     Args:
         demonstrations: The folder of demonstrations, or its path.
@@ -42,7 +41,7 @@ class DemonstrationDataset(Dataset):
         >>> items = DemonstrationDataset("demos")
         >>> items[0]["rgb_top"].shape
         torch.Size([2, 3, 128, 256])
-        >>> batch = next(iter(DataLoader(items[:100], batch_size=8)))
+        >>> batch = next(iter(DataLoader(items, batch_size=8)))
         >>> batch["rgb_top"].shape
         torch.Size([8, 4, 3, 128, 256])
     """
@@ -55,22 +54,12 @@ class DemonstrationDataset(Dataset):
         given = demonstrations
         self.demonstrations = given if isinstance(given, Demonstrations) else Demonstrations(given)
         self.transform = transform or tensors_of
-        self._rows = range(len(self.demonstrations))
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.demonstrations)
 
-    def __getitem__(self, index: int | slice) -> Any:
-        if isinstance(index, slice):
-            part = copy(self)
-            part._rows = self._rows[index]
-            return part
-        try:
-            row = self._rows[index]
-        except IndexError:
-            last = len(self) - 1
-            raise IndexError(f"episode {index} of {len(self)}; count from 0 to {last}.") from None
-        return self.transform(self.demonstrations[row])
+    def __getitem__(self, index: int) -> Any:
+        return self.transform(self.demonstrations[index])
 
 
 class DemonstrationTensors(dict[str, Any]):

@@ -170,7 +170,8 @@ def freeze_crops(
         features = [black[: parallel.is_first]]  # it has index 0
         for number in parallel.part_of(len(chunks)):
             cache, start = chunks[number]
-            images = np.concatenate([episode.images for episode in cache[start : start + CHUNK]])
+            rows = range(start, min(start + CHUNK, len(cache)))
+            images = np.concatenate([cache[row].images for row in rows])
             features.append(learner.network.encode_images(torch.from_numpy(images).to(device)))
     learner.features = parallel.rows_of_all(torch.cat(features))
 

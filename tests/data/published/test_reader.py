@@ -107,7 +107,7 @@ def test_the_folder_of_one_task_is_enough(tmp_path: Path) -> None:
 def test_old_and_new_names_select_a_task(path: Path, name: str) -> None:
     assert PublishedData(path, tasks=[name]).keys == (("visual_manipulation", "000004"),)
     assert PublishedData(path).read(name, "000004").seed == 3
-    assert [demo.seed for demo in PublishedData(path).demonstrations(name)] == [3]
+    assert [demo.seed for demo in PublishedData(path, tasks=[name])] == [3]
 
 
 def test_what_is_not_there_is_said(path: Path, tmp_path: Path) -> None:
