@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from openvima.policies.architectures import VimaConfig, vima
+from openvima.policies.architectures import TokenPolicyConfig, vima
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
@@ -42,7 +42,7 @@ def to_published(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     return result
 
 
-def small_vima() -> VimaConfig:
+def small_vima() -> TokenPolicyConfig:
     """VIMA as published, with few and narrow layers."""
     text = TextEncoderConfig(width=32, num_layers=2, num_heads=2, head_width=8, hidden_width=16)
     prompt = PromptEncoderConfig(

@@ -186,7 +186,7 @@ def test_settings_in_the_file_say_how_images_are_prepared(foreign, settings, tmp
         ({"MODEL": {"ANCHOR_GENERATOR": {"OFFSET": 0.5}}}, "OFFSET is 0.5; only 0.0 is supported"),
         ({"MODEL": {"ANCHOR_GENERATOR": {"SIZES": [[32, 64, 128, 256, 512]]}}}, "one per level"),
         ({"MODEL": {"ROI_BOX_HEAD": {"POOLER_TYPE": "ROIAlign"}}}, "only 'ROIAlignV2'"),
-        ({"INPUT": {"FORMAT": "YUV"}}, "channel order 'yuv'"),
+        ({"INPUT": {"FORMAT": "YUV"}}, "channel_order 'yuv'"),
         ({"MODEL": {"RPN": {"POST_NMS_TOPK_TEST": "many"}}}, "invalid settings"),
     ],
 )

@@ -110,9 +110,7 @@ def test_weights_beyond_the_range_of_float16_are_not_written(small_sizes, tmp_pa
     model = build_network(small_sizes, seed=0)
     with torch.no_grad():
         model.observation_out.weight[0, 0] = -7e4
-    with pytest.raises(
-        InputFileError, match=r"beyond 6\.55e\+04, the most that float16 holds: observation_out"
-    ):
+    with pytest.raises(InputFileError, match="weights that are not finite: observation_out"):
         save_checkpoint(model, tmp_path / "checkpoint", dtype=torch.float16)
     assert not list(tmp_path.iterdir())
     save_checkpoint(model, tmp_path / "checkpoint")

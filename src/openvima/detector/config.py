@@ -98,10 +98,6 @@ class DetectorConfig:
 
     def __post_init__(self) -> None:
         backbone, problems = self.backbone, []
-        if backbone.block not in ("basic", "bottleneck"):
-            problems.append(unknown_name("block", backbone.block, ("basic", "bottleneck")))
-        if self.channel_order not in ("rgb", "bgr"):
-            problems.append(unknown_name("channel order", self.channel_order, ("rgb", "bgr")))
         if len(backbone.depths) != len(backbone.widths) or not backbone.depths:
             problems.append(
                 f"depths has {len(backbone.depths)} stages and widths {len(backbone.widths)}; give both one "
@@ -112,16 +108,6 @@ class DetectorConfig:
                 f"anchor_sizes has {len(self.anchor_sizes)} numbers; the pyramid has {backbone.num_levels} "
                 "levels."
             )
-        for name in (
-            "num_classes",
-            "rpn_pre_nms_top_n",
-            "rpn_post_nms_top_n",
-            "box_pool_size",
-            "mask_pool_size",
-            "max_detections",
-        ):
-            if getattr(self, name) < 1:
-                problems.append(f"{name} is {getattr(self, name)}; it must be at least 1.")
         if problems:
             raise ConfigError(" ".join(problems))
 

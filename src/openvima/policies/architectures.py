@@ -9,7 +9,7 @@ objects and J images in all prompts, I image tokens of all prompts, M latents.
 import math
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 import torch
@@ -50,6 +50,7 @@ class TokenPolicyConfig:
     """Sizes of a policy.
 
     Args:
+        architecture: Its name.
         images: Image tokens: those of an object encoder; or of a transformer over whole frames, one per
             patch, or with a class token one per pair of frames.
         prompt: The prompt encoder.
@@ -63,7 +64,7 @@ class TokenPolicyConfig:
             trains it, instead of from the head alone; see `point_at_objects`. It adds no weights.
     """
 
-    architecture: ClassVar[str]
+    architecture: Literal["vima", "gato", "flamingo", "gpt", "midas"]
     images: ObjectEncoderConfig | VitConfig
     prompt: PromptEncoderConfig
     decoder: AnyDecoderConfig
@@ -101,8 +102,7 @@ class TokenPolicyConfig:
         return InputLayout("frames", tokens)
 
 
-@dataclass(frozen=True, slots=True)
-class VimaConfig(TokenPolicyConfig):
+def vima(of: Size) -> TokenPolicyConfig:
     """VIMA: objects, and cross-attention to the prompt.
 
     One token for each object in each view.
@@ -119,30 +119,23 @@ class VimaConfig(TokenPolicyConfig):
 
     Source: VIMA (Jiang et al. 2023), section 4.
     """
-
-    architecture: ClassVar[str] = "vima"
-
-
-def vima(of: Size) -> VimaConfig:
-    """Return VIMA in a size."""
     images = ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width)
-    return VimaConfig(images, of.prompt, of.decoder(), BinsConfig(of.hidden_width, of.action_width))
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return TokenPolicyConfig("vima", images, of.prompt, of.decoder(), head)
 
 
-def nano_bins() -> VimaConfig:
+def nano_bins() -> TokenPolicyConfig:
     """As the pointer model `nano`, with the published head: fused views, convolutions, a query token."""
     crop = ConvConfig(width=32, output_width=128)
     images = ObjectEncoderConfig(
         crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
     )
     decoder = DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4)
-    return VimaConfig(
-        images, size("nano").prompt, decoder, BinsConfig(256, action_width=64), query_token=True
-    )
+    head = BinsConfig(256, action_width=64)
+    return TokenPolicyConfig("vima", images, size("nano").prompt, decoder, head, query_token=True)
 
 
-@dataclass(frozen=True, slots=True)
-class GatoConfig(TokenPolicyConfig):
+def gato(of: Size) -> TokenPolicyConfig:
     """VIMA-Gato: the patches of frames, and the prompt as prefix.
 
     Patches of both views in one causal sequence.
@@ -153,18 +146,13 @@ class GatoConfig(TokenPolicyConfig):
 
     Source: VIMA (Jiang et al. 2023), baselines; after Gato (Reed et al. 2022).
     """
-
-    architecture: ClassVar[str] = "gato"
-
-
-def gato(of: Size) -> GatoConfig:
-    """Return VIMA-Gato in a size."""
     head = BinsConfig(of.hidden_width, of.action_width)
-    return GatoConfig(of.frame_encoder(class_token=False), of.prompt, of.prefix_decoder(), head)
+    return TokenPolicyConfig(
+        "gato", of.frame_encoder(class_token=False), of.prompt, of.prefix_decoder(), head
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class FlamingoConfig(TokenPolicyConfig):
+def flamingo(of: Size) -> TokenPolicyConfig:
     """VIMA-Flamingo: resampled patches of frames, and cross-attention to the prompt.
 
     A Perceiver resampler over the patches of both views.
@@ -176,18 +164,12 @@ class FlamingoConfig(TokenPolicyConfig):
 
     Source: VIMA (Jiang et al. 2023), baselines; after Flamingo (Alayrac et al. 2022).
     """
-
-    architecture: ClassVar[str] = "flamingo"
-
-
-def flamingo(of: Size) -> FlamingoConfig:
-    """Return VIMA-Flamingo in a size."""
     head = BinsConfig(of.hidden_width, of.action_width)
-    return FlamingoConfig(of.frame_encoder(class_token=False), of.prompt, of.decoder(), head, of.resampler())
+    images = of.frame_encoder(class_token=False)
+    return TokenPolicyConfig("flamingo", images, of.prompt, of.decoder(), head, of.resampler())
 
 
-@dataclass(frozen=True, slots=True)
-class GptConfig(TokenPolicyConfig):
+def gpt(of: Size) -> TokenPolicyConfig:
     """VIMA-GPT: one token per pair of frames, and the prompt as prefix.
 
     The class vectors of both views, side by side, are one token.
@@ -198,18 +180,11 @@ class GptConfig(TokenPolicyConfig):
 
     Source: VIMA (Jiang et al. 2023), baselines; after GPT (Radford et al. 2018).
     """
-
-    architecture: ClassVar[str] = "gpt"
-
-
-def gpt(of: Size) -> GptConfig:
-    """Return VIMA-GPT in a size."""
     head = BinsConfig(of.hidden_width, of.action_width)
-    return GptConfig(of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), head)
+    return TokenPolicyConfig("gpt", of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), head)
 
 
-@dataclass(frozen=True, slots=True)
-class MidasConfig(TokenPolicyConfig):
+def midas(of: Size) -> TokenPolicyConfig:
     """MIDAS: objects with a token for each view, and the prompt as prefix.
 
     Object tokens for each view, the prompt as prefix, and one token per action component.
@@ -222,13 +197,8 @@ class MidasConfig(TokenPolicyConfig):
 
     Source: MIDAS (Li et al. 2023).
     """
-
-    architecture: ClassVar[str] = "midas"
-
-
-def midas(of: Size) -> MidasConfig:
-    """Return MIDAS in a size."""
-    return MidasConfig(
+    return TokenPolicyConfig(
+        "midas",
         ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width),
         replace(of.prompt, visual_residual=True),
         of.prefix_decoder(),

@@ -3,28 +3,21 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from reprlib import repr as short
-from typing import Any, get_args
+from typing import Any
 
 import torch
 
 from openvima.errors import ConfigError, unknown_name
-from openvima.policies.architectures import (
-    FlamingoConfig,
-    GatoConfig,
-    GptConfig,
-    MidasConfig,
-    TokenPolicy,
-    VimaConfig,
-)
+from openvima.policies.architectures import TokenPolicy, TokenPolicyConfig
 from openvima.policies.config_fields import build_config, check_limits
 from openvima.policies.nn.layers import MetaInit
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.pointer.model import Pointer
+from openvima.policies.presets import PUBLISHED
 
-PolicyConfig = VimaConfig | GatoConfig | FlamingoConfig | GptConfig | MidasConfig | PointerConfig
-ARCHITECTURES: dict[str, type[PolicyConfig]] = {kind.architecture: kind for kind in get_args(PolicyConfig)}
+PolicyConfig = TokenPolicyConfig | PointerConfig
 
 
 def config_to_dict(config: PolicyConfig) -> dict[str, Any]:
@@ -40,11 +33,13 @@ def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"policy is {short(values)}; it must be a mapping of architecture and sizes.")
-    architecture = values.get("architecture")
-    if not isinstance(architecture, str) or architecture not in ARCHITECTURES:
-        raise ConfigError(unknown_name("architecture", short(architecture).strip("'"), ARCHITECTURES))
+    architecture, known = values.get("architecture"), (*PUBLISHED, PointerConfig.architecture)
+    if architecture not in known:
+        raise ConfigError(unknown_name("architecture", short(architecture).strip("'"), known))
+    if architecture in PUBLISHED:
+        return build_config(TokenPolicyConfig, values, "policy")
     sizes = {name: value for name, value in values.items() if name != "architecture"}
-    return build_config(ARCHITECTURES[architecture], sizes, "policy")
+    return build_config(PointerConfig, sizes, "policy")
 
 
 def appearance_width(config: PolicyConfig) -> int:

@@ -23,10 +23,10 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published import load_published
 from openvima.policies.t5 import T5Tokenizer, tokenizer_for
 from openvima.policies.tensor_files import (
+    check_finite,
     check_replaceable,
     described,
     file_digest,
-    listed,
     mismatches,
     read_description,
     read_safetensors,
@@ -105,7 +105,7 @@ def write_checkpoint(
         raise InputFileError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
     weights = network.state_dict() if weights is None else weights
     tensors = {name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in weights.items()}
-    _check_range(tensors, weights)
+    check_finite(tensors, folder / WEIGHTS_FILE)  # as beyond the range of float16
     write_safetensors(tensors, folder / WEIGHTS_FILE)
     values = {
         "policy": _KIND,
@@ -201,19 +201,6 @@ def _check(network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, sourc
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
             "Use the config that was written with the weights."
         )
-
-
-def _check_range(stored: Mapping[str, torch.Tensor], weights: Mapping[str, torch.Tensor]) -> None:
-    """Reject weights that overflow to infinity when stored; infinities of the network itself pass."""
-    overflown = [
-        name
-        for name, tensor in stored.items()
-        if bool((tensor.isinf() & ~weights[name].detach().cpu().isinf()).any())
-    ]
-    if overflown:
-        dtype = stored[overflown[0]].dtype
-        most = f"weights beyond {torch.finfo(dtype).max:.4g}, the most that {described(dtype)} holds"
-        raise InputFileError(f"{listed(most, overflown, limit=_MAX_LISTED)[0]}. Store them in float32.")
 
 
 def _outline(folder: Path, config: PolicyConfig) -> PolicyNetwork:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
-from openvima.policies.architectures import MidasConfig, VimaConfig
 from openvima.policies.build import PolicyConfig
 from openvima.policies.config_fields import check_limits
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
@@ -107,7 +106,7 @@ def with_image_tokens(config: PolicyConfig, name: str) -> PolicyConfig:
     if isinstance(config, PointerConfig):
         raise _not_of_pointers(f"image_tokens is {name!r}", "objects alone")
     images = config.images
-    if not isinstance(config, VimaConfig | MidasConfig) or not isinstance(images, ObjectEncoderConfig):
+    if config.architecture not in ("vima", "midas") or not isinstance(images, ObjectEncoderConfig):
         raise ConfigError(
             f"image_tokens is {name!r}, but this network has {own!r} alone; take a preset vima-… or midas-…."
         )
