@@ -166,12 +166,12 @@ def test_of_objects_in_one_place_the_smaller_comes_first_whatever_its_id() -> No
 
 
 def test_whole_frames_are_halved_with_halves_rounded_up() -> None:
-    rgb = noise(shape=(8, 12))
+    rgb = noise()
     frames = whole_frames(rgb)
-    assert frames.crops.shape == (2, 1, 3, 4, 6)
+    assert frames.crops.shape == (2, 1, 3, 64, 128)
     assert frames.masks.tolist() == [[True], [True]]
     for v, view in enumerate(VIEWS):
-        blocks = rgb[view].astype(int).reshape(3, 4, 2, 6, 2).sum(axis=(2, 4))
+        blocks = rgb[view].astype(int).reshape(3, 64, 2, 128, 2).sum(axis=(2, 4))
         np.testing.assert_array_equal(frames.crops[v, 0], (blocks + 2) // 4)
 
 

@@ -15,8 +15,6 @@ from openvima.errors import DatasetError, echo
 from openvima.hub import dataset_name
 from openvima.multiprocess import Report
 
-_MOST_ROWS, _NUM_FIRST, _NUM_LAST = 16, 10, 5  # of a histogram; one with more is cut to its ends
-
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
@@ -31,13 +29,9 @@ class Histogram:
     counts: dict[str, int]
 
     def rows(self) -> list[tuple[str, int, float, float]]:
-        """Return value, count, its fraction of all and of the largest; 0 where values are left out."""
+        """Return value, count, and its fraction of all and of the largest."""
         total, most = sum(self.counts.values()), max(self.counts.values())
-        rows = [(label, count, count / total, count / most) for label, count in self.counts.items()]
-        if len(rows) > _MOST_ROWS:
-            num_left_out = len(rows) - _NUM_FIRST - _NUM_LAST
-            rows[_NUM_FIRST:-_NUM_LAST] = [(f"… {num_left_out} more …", 0, 0.0, 0.0)]
-        return rows
+        return [(label, count, count / total, count / most) for label, count in self.counts.items()]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ FILE.py:FUNCTION               the same, from a Python file
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from openvima.perception.objects import (
     ObjectViews,
     make_hidden_objects,
 )
+from openvima.policies.base import torch_threads
 from openvima.policies.naming import WEIGHTS_FILE, checkpoint_folder
 from openvima.scene import PromptImage
 from openvima.user_code import call_function, is_code, load_function, source_hash
@@ -136,12 +136,8 @@ def detected_object_cache(
         DatasetError: The folder is not writable.
         FolderLockedError: Another process writes the cache.
     """
-
-    def say(done: int, total: int, note: str) -> None:
-        if report is not None:
-            report(done, total, "detecting objects")
-
-    with _one_thread():
+    say = report and (lambda done, total, note: report(done, total, "detecting objects"))
+    with torch_threads(1):
         return open_object_cache(
             dataset, folder=folder, boxes=boxes, workers=workers, report=say, timeout_s=timeout_s
         )
@@ -183,12 +179,3 @@ def _folder_of(source: str) -> Path | None:
     """The folder of a trained detector; None for other forms."""
     name, _, folder = source.partition("=")
     return detector_folder(folder or None) if name == DETECTOR else None
-
-
-def _one_thread() -> AbstractContextManager[None]:
-    """Limit torch to one thread if it is installed; a custom extractor may not need it."""
-    try:
-        from openvima.policies.base import torch_threads
-    except ImportError:
-        return nullcontext()
-    return torch_threads(1)

@@ -158,23 +158,19 @@ def whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
     The frames are halved in both directions by averages over 2 × 2 pixels, rounded half up.
 
     Args:
-        rgb: View name to image, shape (3, H, W), uint8; both of equal size, height and width even.
+        rgb: View name to image, shape (3, 128, 256), uint8.
 
     Returns:
-        One slot, its crops of shape (2, 1, 3, H / 2, W / 2).
+        One slot, its crops of shape (2, 1, 3, 64, 128).
 
     Raises:
         PolicyError: A view is missing.
         ShapeError: An image has another shape or dtype.
     """
-    front, top = (_check_rgb(view, frame) for view, frame in by_view(rgb, "rgb").items())
-    height, width = front.shape[1:]
-    if top.shape != front.shape or height % 2 or width % 2 or not front.size:
-        raise ShapeError(
-            f"the frames are {front.shape} and {top.shape}; both must have the same even height and width."
-        )
+    frames = list(camera_frames(rgb, "rgb").values())
+    height, width = frames[0].shape[1:]
     halves = np.empty((len(VIEWS), 1, 3, height // 2, width // 2), np.uint8)
-    for view, frame in enumerate((front, top)):
+    for view, frame in enumerate(frames):
         halve_frame(frame, halves[view, 0])
     centre = np.array([(width - 1) // 2, (height - 1) // 2])
     boxes = np.tile(np.array([*centre, height - 1, width - 1]), (len(VIEWS), 1, 1))

@@ -8,7 +8,6 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from openvima.errors import ShapeError
 from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import (
     GROUND_TRUTH,
@@ -18,7 +17,6 @@ from openvima.perception.objects import (
     part_of,
     whole_frames,
 )
-from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
 from openvima.scene.prompt import PLACEHOLDER
 
@@ -206,7 +204,7 @@ def extract_observation(
         ShapeError: An image has another shape or dtype.
     """
     if kind == "frames":
-        return _whole_frames(part_of(observation, "rgb"))
+        return whole_frames(part_of(observation, "rgb"))
     if FOUND in observation:
         return observation[FOUND]
     if extractor is None:
@@ -265,22 +263,12 @@ def _extract_prompt_image(
     image: PromptImage, kind: InputKind, extractor: ObjectExtractor | None
 ) -> ObjectViews:
     if kind == "frames":
-        return _whole_frames(image.rgb)
+        return whole_frames(image.rgb)
     if isinstance(image, FoundImage):
         return image.found
     if extractor is None:
         return GROUND_TRUTH.in_prompt_image(image)
     return _number(extractor.in_prompt_image(image))
-
-
-def _whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
-    frames = whole_frames(rgb)
-    if frames.crops.shape[-2:] != IMAGE_SIZES["frames"]:
-        height, width = (2 * length for length in IMAGE_SIZES["frames"])
-        raise ShapeError(
-            f"the frames are {rgb[VIEWS[0]].shape}; this policy takes those of (3, {height}, {width})."
-        )
-    return frames
 
 
 def _number(found: ObjectViews) -> ObjectViews:

@@ -122,7 +122,7 @@ def _bars(histogram: "Histogram") -> Iterator[str]:
     yield histogram.title
     width = max(map(len, histogram.counts))
     for label, count, share, length in histogram.rows():
-        bar = f"{'█' * max(1, round(_BAR_WIDTH * length))} {count:,} ({share:.1%})" if count else ""
+        bar = f"{'█' * max(1, round(_BAR_WIDTH * length))} {count:,} ({share:.1%})"
         yield f"  {label:>{width}}  {bar}".rstrip()
 
 
