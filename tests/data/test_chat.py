@@ -251,7 +251,7 @@ def test_llava_has_a_mark_for_each_image(conversed: Path) -> None:
 def test_exports_are_repeatable_and_not_overwritten(conversed: Path, chats: Path) -> None:
     again = export_chat(str(conversed), str(conversed.parent / "again"), form=EXPORTED, questions=3)
     assert (again / "train.jsonl").read_bytes() == (chats / "train.jsonl").read_bytes()
-    with pytest.raises(DatasetError, match="is there already"):
+    with pytest.raises(DatasetError, match="is not empty"):
         export_chat(conversed, again)
     with pytest.raises(ConfigError, match="questions is -1"):
         export_chat(conversed, conversed.parent / "other", questions=-1)

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
+from openvima.atomic_io import atomic_folder, folder_lock
 from openvima.data.chat import (
     DEFAULT_FORMAT,
     ChatFormat,
@@ -25,7 +25,8 @@ from openvima.data.chat import (
 )
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
-from openvima.errors import ConfigError, DatasetError
+from openvima.data.subsets import check_out
+from openvima.errors import ConfigError
 from openvima.input_files import as_path
 from openvima.multiprocess import Report
 from openvima.perception.objects import ObjectExtractor
@@ -72,8 +73,7 @@ def export_chat(
     if questions < 0:
         raise ConfigError(f"questions is {questions}; it must be at least 0.")
     dataset, out = Dataset(data, tasks=tasks), as_path(out)
-    if out.exists() and not (out.is_dir() and all(map(is_lock_file, out.iterdir()))):
-        raise DatasetError(f"{out} is there already; give another folder.")
+    check_out(out, [dataset.path], force=False)
     with folder_lock(out), atomic_folder(out) as folder:
         (folder / _IMAGES).mkdir()
         with (folder / EXAMPLES_NAME).open("w", encoding="utf-8") as lines:

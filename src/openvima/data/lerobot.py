@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima import __version__
-from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
+from openvima.atomic_io import atomic_folder, folder_lock
 from openvima.data.lerobot_frames import (
     DenseTrajectory,
     FrameLayout,
@@ -29,6 +29,7 @@ from openvima.data.lerobot_frames import (
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE
+from openvima.data.subsets import check_out
 from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import settle
 from openvima.multiprocess import Report
@@ -480,7 +481,7 @@ class LerobotConfig:
         force: Replace the export that is at `out`.
 
     Raises:
-        ConfigError: A value is not allowed, or `out` holds `data`.
+        ConfigError: A value is not allowed.
     """
 
     data: Path
@@ -491,13 +492,8 @@ class LerobotConfig:
 
     def __post_init__(self) -> None:
         settle(self, paths=("data", "out"), names=("tasks",))
-        problems = []
         if self.pixels not in PIXEL_FORMATS:
-            problems.append(f"pixels is {self.pixels!r}; allowed are {', '.join(PIXEL_FORMATS)}.")
-        if self.data.resolve().is_relative_to(self.out.resolve()):
-            problems.append(f"{self.out} holds the demonstrations themselves; give another folder.")
-        if problems:
-            raise ConfigError(" ".join(problems))
+            raise ConfigError(f"pixels is {self.pixels!r}; allowed are {', '.join(PIXEL_FORMATS)}.")
 
 
 def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
@@ -522,7 +518,7 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     dataset = Dataset(config.data, tasks=config.tasks)
     if not len(dataset):
         raise DatasetError(f"{config.data} has no episodes to export.")
-    _check_out(config)
+    check_out(config.out, [config.data], force=config.force, is_own=lambda out: (out / INFO_PATH).is_file())
     settings = dense_settings(dataset)
     fps = CONTROL_HZ if settings else 1  # a whole number of float32 seconds, by which LeRobot finds frames
     with folder_lock(config.out), atomic_folder(config.out) as folder:
@@ -568,15 +564,6 @@ def _has_joints(table: pa.Table) -> bool:
 
 def _lengths(lists: pa.ListArray) -> np.ndarray:
     return lists.value_lengths().to_numpy()
-
-
-def _check_out(config: LerobotConfig) -> None:
-    out = config.out
-    is_taken = not all(map(is_lock_file, out.iterdir())) if out.is_dir() else out.exists()
-    if is_taken and not config.force:
-        raise DatasetError(f"{out} is there already; give another folder, or --force to replace it.")
-    if is_taken and not (out / INFO_PATH).is_file():
-        raise DatasetError(f"{out} holds other things than an export, so --force does not replace it.")
 
 
 def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig, fps: int) -> None:

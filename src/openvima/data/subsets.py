@@ -43,13 +43,28 @@ _NUM_NAMED = 3  # duplicates that a message names
 _NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, CACHE_FOLDER)
 
 
-def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:
+def _holds_data_sets_only(folder: Path) -> bool:
+    """Whether a folder is a data set, or holds some, and nothing besides."""
+    entries = [entry for entry in folder.iterdir() if not is_lock_file(entry)]
+    if (folder / MANIFEST_NAME).is_file():
+        return all(entry.suffix == ".arrow" or entry.name in _NAMES for entry in entries)
+    return all((entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in entries)
+
+
+def check_out(
+    out: Path,
+    sources: Sequence[Path],
+    *,
+    force: bool,
+    is_own: Callable[[Path], bool] = _holds_data_sets_only,
+) -> None:
     """Refuse a folder that holds something, or that lies where it would harm a source.
 
     Args:
         out: The folder to write.
         sources: The data sets to read.
-        force: Whether a data set that is there may be replaced.
+        force: Whether what an earlier command wrote there may be replaced.
+        is_own: Whether such a command wrote a folder.
 
     Raises:
         DatasetError: Another folder must be given.
@@ -67,16 +82,8 @@ def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:
         return
     if not force:
         raise DatasetError(f"{out} is not empty. Give another folder, or --force to replace it.")
-    if not _holds_data_sets_only(out):
-        raise DatasetError(f"{out} holds other things than data sets, so --force does not replace it.")
-
-
-def _holds_data_sets_only(folder: Path) -> bool:
-    """Whether a folder is a data set, or holds some, and nothing besides."""
-    entries = [entry for entry in folder.iterdir() if not is_lock_file(entry)]
-    if (folder / MANIFEST_NAME).is_file():
-        return all(entry.suffix == ".arrow" or entry.name in _NAMES for entry in entries)
-    return all((entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in entries)
+    if not is_own(out):
+        raise DatasetError(f"{out} holds other things than --force would write, so it is not replaced.")
 
 
 def identify_source(manifest: Mapping[str, Any]) -> dict[str, Any]:

@@ -43,6 +43,7 @@ from openvima.policies.sizes import Size, size
 from openvima.render.camera import CAMERAS, unproject
 
 _LINEAR_RANGE = 4.0
+Architecture = Literal["vima", "gato", "flamingo", "gpt", "midas"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,7 @@ class TokenPolicyConfig:
             trains it, instead of from the head alone; see `point_at_objects`. It adds no weights.
     """
 
-    architecture: Literal["vima", "gato", "flamingo", "gpt", "midas"]
+    architecture: Architecture
     images: ObjectEncoderConfig | VitConfig
     prompt: PromptEncoderConfig
     decoder: AnyDecoderConfig

@@ -9,7 +9,7 @@ from openvima.atomic_io import restore_folder
 from openvima.errors import InputFileError, PolicyError, unknown_name
 from openvima.hub import HubName, fetch, hub_name
 from openvima.input_files import as_path, as_text, read_text
-from openvima.policies.presets import PRESETS, PUBLISHED, check_preset
+from openvima.policies.presets import PRESETS, check_preset
 from openvima.user_code import is_code
 
 WEIGHTS_FILE = "model.safetensors"
@@ -206,14 +206,10 @@ def unknown_policy(name: str, others: Sequence[str]) -> str:
 
 def _without_weights(preset: str) -> str:
     """Compose the message for a preset where weights are expected: how to get some."""
-    architecture, _, size = preset.rpartition("-")
-    needs_t5 = architecture in PUBLISHED and size != "nano"
-    t5 = " --t5 t5-base" if needs_t5 else ""
-    elsewhere = ", or see docs/policies.md for the published weights" if t5 and architecture == "vima" else ""
     return (
         f"{preset!r} is a preset: sizes of a network, without weights. Train it (`openvima train --preset "
-        f"{preset}{t5} --data DEMOS --out RUN`) and name the folder RUN, or name a bundled checkpoint "
-        f"({', '.join(BUNDLED)}){elsewhere}."
+        f"{preset} --data DEMOS --out RUN`) and name the folder RUN, or name a bundled checkpoint "
+        f"({', '.join(BUNDLED)})."
     )
 
 

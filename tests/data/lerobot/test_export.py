@@ -285,7 +285,7 @@ def test_a_second_export_has_the_same_bytes_and_is_replaced_only_by_force(
     again = export_lerobot(LerobotConfig(source, tmp_path / "again"))
     assert digests(again) == digests(export)
     config = LerobotConfig(source, again, pixels="yuv420p")
-    with pytest.raises(DatasetError, match="is there already; give another folder, or --force"):
+    with pytest.raises(DatasetError, match="is not empty"):
         export_lerobot(config)
     assert digests(again) == digests(export)
     export_lerobot(replace(config, force=True))
