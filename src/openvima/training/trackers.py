@@ -64,7 +64,7 @@ class TensorBoardTracker(Tracker):
     def __init__(self, run: Path, first: int) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(run / BOARD_FOLDER), purge_step=first)
+        self._writer: Any = SummaryWriter(str(run / BOARD_FOLDER), purge_step=first)
 
     def add(self, prefix: str, values: Mapping[str, float], step: int) -> None:
         """Log named numbers."""
