@@ -41,10 +41,11 @@ def main(
     if as_json:
         print(json.dumps([_record(spec) for spec in specs], indent=1, ensure_ascii=False))
         return 0
-    from rich.table import Table
+    from rich.table import Column, Table
     from rich.text import Text
 
-    columns = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
+    names = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
+    columns = [Column(name, overflow="fold") for name in names]
     table = Table(*columns, title=f"{len(specs)} tasks", show_lines=True)
     for spec in specs:
         table.add_row(

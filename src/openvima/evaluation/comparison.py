@@ -294,11 +294,10 @@ def default_pairs(results: Results) -> list[tuple[str, str]]:
     learned = [name for name, kind in kinds.items() if kind in TRAINED_KINDS]
     others = [name for name, kind in kinds.items() if name not in learned[:1] and kind != "oracle"]
     pairs = [(learned[0], other) for other in others] if learned else []
-    return [pair for pair in pairs if can_be_compared(results, *pair)][:_MOST_PAIRS]
+    return [pair for pair in pairs if _have_common_episodes(results, *pair)][:_MOST_PAIRS]
 
 
-def can_be_compared(results: Results, a: str, b: str) -> bool:
-    """Whether two policies, or a policy with an ablation, have any episode in common."""
+def _have_common_episodes(results: Results, a: str, b: str) -> bool:
     rows_a, rows_b = _rows_of(results, a), _rows_of(results, b)
     return any(_pair(rows_a[cell], rows_b[cell]) for cell in rows_a.keys() & rows_b.keys())
 

@@ -93,7 +93,7 @@ def write_report(
         comparisons=comparisons,
         confirmations=confirmations,
         all_confirmed=bool(confirmations) and all(each.confirmed for each in confirmations),
-        ablations=tables.ablated_policies(results),
+        ablations=tables.ablations_by_policy(results),
         families=tables.family_table(results, published=with_published),
         published_tasks=published.published_task_table(results) if with_published else None,
         published_results=published.published_rows(results, published.published_models())

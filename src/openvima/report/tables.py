@@ -2,17 +2,11 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 from openvima.errors import UnknownTaskError
-from openvima.evaluation.comparison import (
-    ABLATION_SEPARATOR,
-    Comparison,
-    Difference,
-    can_be_compared,
-    compare_pairs,
-)
+from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import Results
 from openvima.evaluation.statistics import Interval, mean_of_rates
 from openvima.policies.naming import ORACLE
@@ -27,7 +21,7 @@ from openvima.report.published import (
     unpublished_settings,
 )
 from openvima.report.table import Estimate, Line, Table
-from openvima.report.text import ablation_name, counted, points, points_span
+from openvima.report.text import ablation_name, counted
 from openvima.tasks.registry import task_spec
 
 _MOST_TASKS = 4  # that are named for a cause of failure
@@ -250,10 +244,18 @@ def result_table(results: Results) -> Table:
     return Table("results", caption, ("level", "task", *policies), tuple(lines))
 
 
+def ablations_by_policy(results: Results) -> dict[str, list[str]]:
+    """Return the input ablations that each policy was evaluated with; without any it is left out."""
+    found: dict[str, list[str]] = {}
+    for policy, ablation in dict.fromkeys((row.policy, row.ablation) for row in results.rows):
+        if ablation:
+            found.setdefault(policy, []).append(ablation)
+    return found
+
+
 def ablation_tables(results: Results) -> list[Table]:
     """Level means of each policy that was evaluated with input ablations, plain and under each of them."""
-    ablated = dict.fromkeys(row.policy for row in results.rows if row.ablation)
-    return [_ablation_table(results, policy) for policy in ablated]
+    return [_ablation_table(results, *found) for found in ablations_by_policy(results).items()]
 
 
 def _task_table(results: Results, policy: str) -> Table:
@@ -269,15 +271,14 @@ def _task_table(results: Results, policy: str) -> Table:
     return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
 
 
-def _ablation_table(results: Results, policy: str) -> Table:
+def _ablation_table(results: Results, policy: str, ablations: Sequence[str]) -> Table:
     levels = results.levels()
-    ablations = dict.fromkeys(row.ablation for row in results.rows if row.policy == policy)
     lines = [
         Line(
             ablation_name(ablation) if ablation else "none",
             tuple(_mean(results, policy, level, ablation) for level in levels),
         )
-        for ablation in ablations
+        for ablation in ("", *ablations)
     ]
     caption = (
         f"Success rates of {policy} (%) with input ablations, means over the tasks of each level, with "
@@ -321,57 +322,3 @@ def _made_of(results: Results, policy: str | None = None) -> str:
     episodes = sorted({row.episodes for row in rows})
     number = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
     return f"{number} a task.{unpublished_settings(results)}"
-
-
-_BOUNDS = ("oracle", "random")  # kinds of policies that bound a score
-
-
-@dataclass(frozen=True, slots=True)
-class AblatedPolicy:
-    """A policy that was evaluated with input ablations.
-
-    Args:
-        policy: Its name.
-        ablations: Names of its ablations.
-        columns: Policy and ablation of each column: its plain score, its ablations, bounds of the score.
-        changes: By how much an ablation changes the mean of a level, in points with interval; ≈ marks noise.
-    """
-
-    policy: str
-    ablations: tuple[str, ...]
-    columns: tuple[tuple[str, str], ...]
-    changes: dict[tuple[str, str], str]
-
-
-def ablated_policies(results: Results) -> list[AblatedPolicy]:
-    """Collect the policies with ablations."""
-    ablations: dict[str, dict[str, None]] = {}
-    for row in results.rows:
-        if row.ablation:
-            ablations.setdefault(row.policy, {})[row.ablation] = None
-    return [
-        _ablated(results, policy, tuple(ablations[policy]))
-        for policy in results.policy_names()
-        if policy in ablations
-    ]
-
-
-def _ablated(results: Results, policy: str, ablations: tuple[str, ...]) -> AblatedPolicy:
-    bounds = [
-        (name, "")
-        for name in results.policy_names()
-        if name != policy and results.policies.get(name, {}).get("kind") in _BOUNDS
-    ]
-    columns = ((policy, ""), *((policy, ablation) for ablation in ablations), *bounds)
-    return AblatedPolicy(policy, ablations, columns, _changes(results, policy, ablations))
-
-
-def _changes(results: Results, policy: str, ablations: tuple[str, ...]) -> dict[tuple[str, str], str]:
-    names = {ablation: f"{policy}{ABLATION_SEPARATOR}{ablation}" for ablation in ablations}
-    pairs = {a: (name, policy) for a, name in names.items() if can_be_compared(results, name, policy)}
-    return {
-        (ablation, change.level): f"{points(change.difference, 0)} ({points_span(change.interval, 0)})"
-        + (" ≈" if change.verdict == "noise" else "")
-        for ablation, comparison in zip(pairs, compare_pairs(results, list(pairs.values())), strict=True)
-        for change in comparison.levels
-    }
