@@ -88,16 +88,7 @@ def cache_dir() -> Path:
     try:
         return as_path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "openvima"
     except ConfigError:
-        return temporary_cache_dir()
-
-
-def temporary_cache_dir() -> Path:
-    """Return this user's folder for derived files among the temporary ones. It may not exist yet."""
-    user = f"-{os.getuid()}" if hasattr(os, "getuid") else ""  # on Windows each user has temporary files
-    try:
-        return Path(tempfile.gettempdir()) / f"openvima{user}"
-    except FileNotFoundError:  # none can be written: nothing is kept
-        return Path(os.devnull) / "openvima"
+        return Path(tempfile.gettempdir()) / f"openvima-{os.getuid()}"
 
 
 if TYPE_CHECKING:
@@ -114,7 +105,7 @@ def open_regular(file: Path) -> BufferedReader:
         OSError: There is no such file, or it cannot be read.
         InputFileError: It is no regular file.
     """
-    descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise InputFileError(f"{file} is no regular file, but a folder, pipe or device; give a regular file.")

@@ -4,7 +4,6 @@ Only `ray_imap_unordered` imports Ray: `pip install openvima[scale]`.
 """
 
 import contextlib
-import importlib
 import math
 import multiprocessing
 import os
@@ -161,11 +160,7 @@ def defer_sigint() -> Iterator[None]:
     """Defer SIGINT to the end of the block; processes that start inside never receive it.
 
     Ctrl-C reaches every process of a terminal, so a worker that is still importing would print a traceback.
-    No effect on Windows.
     """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
     resource_tracker.ensure_running()  # its start unblocks signals
     pending: list[int] = []
     # Blocking covers this thread and the processes that it starts. Another thread, such as one of a BLAS
@@ -220,7 +215,6 @@ def _warn(found: Sequence[UnknownWordWarning]) -> None:
 
 
 RAY_POLL_S = 0.5
-COUNT_INTERVAL_S = 1.0  # one message per job and second
 CANCEL_S = 20.0  # for jobs to end after an error or Ctrl-C
 CONNECT_S = 10.0
 RETRIES = 2  # of a job whose machine or process died
@@ -274,7 +268,7 @@ def ray_imap_unordered(
         num_workers: Concurrent jobs; None: one per CPU of the cluster.
         address: "HOST:PORT" of the cluster's head, "ray://HOST:PORT", or "auto". None uses the Ray
             session of this process, or starts one on this machine and stops it at the end.
-        report: Called repeatedly with the sum of all counts.
+        report: Called repeatedly with the sum of the counts of finished jobs.
 
     Yields:
         An item and its result, as they finish.
@@ -354,11 +348,7 @@ def _run_all(
     num_workers: int,
     report: Callable[[int], None],
 ) -> Iterator[tuple[Any, Any]]:
-    counts = [0] * len(items)
-    # On the machine of this process, without which nothing goes on anyway.
-    strategies = importlib.import_module("ray.util.scheduling_strategies")
-    here = strategies.NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-    progress = ray.remote(num_cpus=0, scheduling_strategy=here)(_ProgressActor).remote()
+    total = 0
     # Ray's own retries have no limit where memory runs out.
     remote = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": _environment()})(_run_counted)
     waiting, running, deaths = deque(range(len(items))), {}, Counter[int]()
@@ -366,14 +356,14 @@ def _run_all(
         while True:
             while len(running) < num_workers and waiting:
                 slot = waiting.popleft()
-                running[remote.remote(job, items[slot], slot, progress)] = slot
+                running[remote.remote(job, items[slot])] = slot
             if not running:
                 return
             done, _ = ray.wait(list(running), timeout=RAY_POLL_S)
             for reference in done:
                 slot = running.pop(reference)
                 try:
-                    result, counts[slot], found = ray.get(reference)
+                    result, number, found = ray.get(reference)
                 except _lost(ray):
                     deaths[slot] += 1
                     if deaths[slot] > RETRIES:
@@ -381,11 +371,9 @@ def _run_all(
                     waiting.appendleft(slot)
                     continue
                 _warn(found)
+                total += number
                 yield items[slot], result
-            for slot, number in ray.get(progress.read.remote()).items():
-                if slot in running.values():
-                    counts[slot] = number
-            report(sum(counts))
+            report(total)
     except ray.exceptions.RayTaskError as error:
         if isinstance(error.cause, ray.exceptions.RayError):  # the job could not be unpickled
             raise ConfigError(
@@ -431,29 +419,8 @@ def _first_line(error: Exception) -> str:
     return lines[0].strip().rstrip(".")
 
 
-class _ProgressActor:
-    """Actor that holds the counts of running jobs."""
-
-    def __init__(self) -> None:
-        self._counts: dict[int, int] = {}
-
-    def write(self, slot: int, number: int) -> None:
-        self._counts[slot] = number
-
-    def read(self) -> dict[int, int]:
-        return self._counts
-
-
-def _run_counted(job: Job, item: Any, slot: int, progress: Any) -> tuple[Any, int, list[UnknownWordWarning]]:
+def _run_counted(job: Job, item: Any) -> tuple[Any, int, list[UnknownWordWarning]]:
     """Run a job in a worker; return its result, its last count and its unknown words."""
-    last, next_s = 0, 0.0
-
-    def count(number: int) -> None:
-        nonlocal last, next_s
-        last = number
-        if time.monotonic() >= next_s:
-            next_s = time.monotonic() + COUNT_INTERVAL_S
-            progress.write.remote(slot, number)
-
+    counts = [0]
     with unknown_words() as found:
-        return job(item, count), last, found
+        return job(item, counts.append), counts[-1], found
