@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw
 
 from openvima.catalog.geometry import Assets
 from openvima.errors import echo
-from openvima.render import TOP, channels_last, project
+from openvima.render import TOP, channels_last, project, unproject
 from openvima.render.rasteriser import Rasteriser
-from openvima.scene import Scene
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 from openvima.scene.explanation import Explanation, ObjectProbability, PlaceProbability
 from openvima.video.prompt_strip import INK, MUTED, PAPER, Colour, font
 
@@ -78,7 +78,7 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
         rows = [(each.probability, _name_of(each, explanation.objects, names)) for each in places[:3]]
         _draw_choices(draw, (WIDTH // 2 + 12, top), "place", rows)
         if len(explanation.yaw_rad):
-            _draw_rotation(draw, explanation, top + 88)
+            _draw_rotation(draw, explanation, top + 104)
     return np.asarray(canvas)
 
 
@@ -137,16 +137,15 @@ def _box_mask(each: ObjectProbability, shape: tuple[int, ...]) -> np.ndarray:
 def _tint_heat_maps(panel: np.ndarray, explanation: Explanation) -> None:
     """Colour the table by the probabilities of both positions."""
     rows, columns = np.indices((TOP.height * ENLARGE, WIDTH))
+    points = unproject(np.stack([columns, rows], -1) / ENLARGE, TOP)[..., :2]
+    low, high = np.array(WORKSPACE_LOW), np.array(WORKSPACE_HIGH)
+    is_inside = ((low <= points) & (points < high)).all(axis=-1)
+    shares = (points[is_inside] - low) / (high - low)
     for pose, colour in HEAT_COLOURS.items():
-        heat = explanation.heat_map(pose)
-        x = 0.25 + 0.5 * np.arange(len(heat) + 1) / len(heat)
-        y = -0.5 + np.arange(heat.shape[1] + 1) / heat.shape[1]
-        edge_rows = project(np.stack([x, np.zeros_like(x), np.zeros_like(x)], -1), TOP)[:, 1] * ENLARGE
-        edge_columns = project(np.stack([np.full_like(y, 0.5), y, np.zeros_like(y)], -1), TOP)[:, 0] * ENLARGE
-        i, j = np.searchsorted(edge_rows, rows) - 1, np.searchsorted(edge_columns, columns) - 1
-        is_inside = (i >= 0) & (i < len(heat)) & (j >= 0) & (j < heat.shape[1])
-        probabilities = np.where(is_inside, heat[i.clip(0, len(heat) - 1), j.clip(0, heat.shape[1] - 1)], 0)
-        _blend(panel[: len(rows)], colour, heat_opacity(probabilities))
+        heat, opacity = explanation.heat_map(pose), np.zeros(rows.shape)
+        x, y = (shares * heat.shape).astype(int).T
+        opacity[is_inside] = heat_opacity(heat[x, y])
+        _blend(panel[: len(rows)], colour, opacity)
 
 
 def _blend(image: np.ndarray, colour: Colour, alpha: np.ndarray) -> None:
@@ -170,34 +169,18 @@ def _draw_place(draw: ImageDraw.ImageDraw, place: PlaceProbability) -> None:
 
 
 def _draw_action(draw: ImageDraw.ImageDraw, explanation: Explanation) -> None:
-    """Draw an arrow from pick to place, or around a point where the object is only rotated."""
-    start, end = (_pixel(explanation.action[f"{pose}_position"]) for pose in ("pose0", "pose1"))
-    yaw = _yaw(explanation.action["pose1_rotation"]) - _yaw(explanation.action["pose0_rotation"])
-    yaw = (yaw + math.pi) % (2 * math.pi) - math.pi
-    if math.dist(start, end) >= 24:
-        points = [start, end]
-    elif abs(yaw) > 0.01:
-        side = math.pi if start[0] > WIDTH - 60 else 0.0  # labels are above and below
-        angles = np.linspace(side + yaw / 2, side - yaw / 2, 24)  # rows count downwards
-        points = [(start[0] + 48 * math.cos(a), start[1] + 48 * math.sin(a)) for a in angles]
-    else:
+    """Draw an arrow from pick to place, unless the object is only rotated."""
+    start, end = (np.array(_pixel(explanation.action[f"{pose}_position"])) for pose in ("pose0", "pose1"))
+    length = np.linalg.norm(end - start)
+    if length < 24:
         return
-    tip, before = np.array(points[-1]), np.array(points[-2])
-    forward = (tip - before) / np.linalg.norm(tip - before)
-    side = np.array([-forward[1], forward[0]])
-    neck = tip - 14 * forward
-    shaft = [points[0], tuple(neck)] if len(points) == 2 else points[:-1]
+    forward = (end - start) / length
+    side, neck = np.array([-forward[1], forward[0]]), end - 14 * forward
     for colour, border in ((INK, 2), (PAPER, 0)):  # a white arrow with a dark border
-        draw.line([(float(x), float(y)) for x, y in shaft], fill=colour, width=4 + 2 * border, joint="curve")
-        wide = 7 + 1.5 * border
-        head = [tip + 2 * border * forward, neck - border * forward + wide * side]
-        head.append(neck - border * forward - wide * side)
-        draw.polygon([(float(x), float(y)) for x, y in head], fill=colour)
-
-
-def _yaw(quaternion: np.ndarray) -> float:
-    x, y, z, w = (float(value) for value in quaternion)
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        back, wide = neck - border * forward, (7 + 1.5 * border) * side
+        head = np.array([end + 2 * border * forward, back + wide, back - wide])
+        draw.line([*start, *neck], fill=colour, width=4 + 2 * border)
+        draw.polygon(head.ravel().tolist(), fill=colour)
 
 
 def _draw_labels(
@@ -267,19 +250,9 @@ def _shortened(text: str, width: int) -> str:
 
 
 def _draw_rotation(draw: ImageDraw.ImageDraw, explanation: Explanation, top: int) -> None:
-    """Draw the distribution of the rotation, from half a turn clockwise to half a turn counter-clockwise."""
-    yaw, best = explanation.yaw_rad, int(explanation.yaw_probabilities.argmax())
-    angle = round(math.degrees(yaw[best]))
-    direction = "clockwise" if angle < 0 else "counter-clockwise" if angle > 0 else ""
-    text = f"rotation {abs(angle)}° {direction}".rstrip()
-    draw.text((12, top + 12), text, font=font(13, bold=True), fill=PLACE, anchor="lm")
-    probability = percent(explanation.yaw_probabilities[best])
-    draw.text((12, top + 29), probability, font=font(13), fill=INK, anchor="lm")
-    left, right, base = 250, WIDTH - 30, top + 22
-    draw.line((left, base, right, base), fill=MUTED)
-    for value, probability in zip(yaw, explanation.yaw_probabilities, strict=True):
-        x = left + (right - left) * (math.pi - value) / (2 * math.pi)
-        if probability >= LEAST_SHOWN / 4:
-            draw.rectangle((x - 2, base - 20 * probability, x + 2, base), fill=PLACE)
-    for x, label in ((left, "180°"), ((left + right) / 2, "0°"), (right, "−180°")):
-        draw.text((x, base + 3), label, font=font(12), fill=MUTED, anchor="ma")
+    """Write the most probable rotation."""
+    best = int(explanation.yaw_probabilities.argmax())
+    angle, probability = round(math.degrees(explanation.yaw_rad[best])), explanation.yaw_probabilities[best]
+    direction = " clockwise" if angle < 0 else " counter-clockwise" if angle > 0 else ""
+    text = f"rotation {abs(angle)}°{direction}: {percent(probability)}"
+    draw.text((12, top), text, font=font(13, bold=True), fill=PLACE, anchor="lm")

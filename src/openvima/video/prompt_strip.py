@@ -19,7 +19,6 @@ PAPER: Colour = (255, 255, 255)
 EDGE: Colour = (208, 213, 220)
 MUTED: Colour = (91, 100, 114)
 _CLOSING = ".,;:!?)"  # no space before these
-_ENLARGE = 4  # supersampling of thumbnails
 _ROW_HEIGHT = 18  # pixels of a row of attention
 
 
@@ -51,16 +50,16 @@ def thumbnail(image: PromptImage, height: int = 72) -> Image.Image:
         height: Height of the thumbnail in pixels.
 
     Returns:
-        RGB image of that height, with rounded corners on white.
+        RGB image of that height, with a thin frame.
     """
     pixels = np.ascontiguousarray(channels_last(image.rgb["front"]))
     if image.kind == "object":
         pixels = cut_to_object(pixels, image.segm["front"])
     rows, columns = pixels.shape[:2]
     width = max(1, round(columns * height / rows))
-    # enlarged without smoothing first, so that textures keep their edges
-    sharp = Image.fromarray(pixels).resize((columns * _ENLARGE, rows * _ENLARGE), Image.Resampling.NEAREST)
-    return _rounded(sharp.resize((width, height), Image.Resampling.BOX), radius=max(2, height // 12))
+    picture = Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX)
+    ImageDraw.Draw(picture).rectangle((0, 0, width - 1, height - 1), outline=EDGE)
+    return picture
 
 
 def draw_prompt_strip(
@@ -89,7 +88,7 @@ def draw_prompt_strip(
     pieces = [_piece(part, image_height, typeface, font_size) for part in prompt_pieces(prompt)]
     if any(len(row) > len(pieces) for _, row in weights):
         pieces.append(_piece("(end)", image_height, typeface, font_size))
-    lines = _wrap(_fitting(pieces, width - 2 * margin), width - 2 * margin)
+    lines = _wrap(pieces, width - 2 * margin)
     heights = [max(piece.height for piece in line) for line in lines]
     attended = _ROW_HEIGHT * len(weights) + (4 if weights else 0)
     total = sum(heights) + margin * (len(lines) + 1) + attended * len(lines)
@@ -154,18 +153,6 @@ def _piece(part: "str | PromptImage", image_height: int, typeface, font_size: in
     return _Piece(picture, picture.width, picture.height, space)
 
 
-def _fitting(pieces: list[_Piece], width: int) -> list[_Piece]:
-    """Scale down thumbnails that are wider than a line."""
-    fitting = []
-    for piece in pieces:
-        if not isinstance(piece.content, str) and piece.width > width:
-            height = max(1, piece.height * width // piece.width)
-            picture = piece.content.resize((width, height), Image.Resampling.BOX)
-            piece = _Piece(picture, width, height, piece.space)
-        fitting.append(piece)
-    return fitting
-
-
 def _wrap(pieces: list[_Piece], width: int) -> list[list[_Piece]]:
     lines: list[list[_Piece]] = [[]]
     used = 0
@@ -196,22 +183,5 @@ def cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
     height = max(height, width // 2)
     top = int(rows[0] + rows[-1] + 1 - height) // 2
     left = int(columns[0] + columns[-1] + 1 - width) // 2
-    cut = np.full((height, width, 3), 255, dtype=np.uint8)
-    source_rows, source_columns = segm.shape
-    row0, row1 = max(top, 0), min(top + height, source_rows)
-    column0, column1 = max(left, 0), min(left + width, source_columns)
-    cut[row0 - top : row1 - top, column0 - left : column1 - left] = pixels[row0:row1, column0:column1]
-    return cut
-
-
-def _rounded(picture: Image.Image, radius: int) -> Image.Image:
-    scale = 4  # the mask is drawn larger and scaled down for a smooth edge
-    size = (picture.width * scale, picture.height * scale)
-    mask, edge = Image.new("L", size, 0), Image.new("L", size, 0)
-    box = (0, 0, size[0] - 1, size[1] - 1)
-    ImageDraw.Draw(mask).rounded_rectangle(box, radius * scale, fill=255)
-    ImageDraw.Draw(edge).rounded_rectangle(box, radius * scale, outline=255, width=scale)
-    framed = Image.new("RGB", picture.size, PAPER)
-    framed.paste(picture, mask=mask.resize(picture.size, Image.Resampling.BOX))
-    framed.paste(EDGE, mask=edge.resize(picture.size, Image.Resampling.BOX))
-    return framed
+    padded = np.pad(pixels, ((height, height), (width, width), (0, 0)), constant_values=255)
+    return padded[top + height : top + 2 * height, left + width : left + 2 * width]
