@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from openvima.errors import DatasetError
@@ -16,9 +16,7 @@ _KINDS = (  # part of a metric's name, and whether it is a fraction
     ("success", True),
 )
 _HELD_OUT = "validation_"
-_HELD_OUT_LABEL = "held out"
 _MOST_CURVES = 4  # in one chart
-_MOST_RUNS = 6  # as many as the page has colours
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,27 +47,20 @@ def find_metrics(run: Path) -> Path:
 
 
 def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
-    """Read the charts of several training runs.
+    """Read the charts of training runs; those of several say in their titles whose they are.
 
     Args:
         runs: Run folders or their `metrics.jsonl`.
 
-    Returns:
-        First the charts that several runs share, with one curve each, then those of each run.
-
     Raises:
         DatasetError: A run has no record, or a damaged one.
     """
-    if len(runs) == 1:
-        return read_charts(find_metrics(runs[0]))
-    labels = run_labels(runs)
-    charts = {label: read_charts(find_metrics(run)) for label, run in zip(labels, runs, strict=True)}
-    single = [
-        Chart(f"{label} · {chart.title}", chart.curves, chart.percent)
-        for label, of_run in charts.items()
-        for chart in of_run
+    labels = [f"{label} · " for label in run_labels(runs)] if len(runs) > 1 else [""] * len(runs)
+    return [
+        replace(chart, title=label + chart.title)
+        for label, run in zip(labels, runs, strict=True)
+        for chart in read_charts(find_metrics(run))
     ]
-    return _overlaid(charts) + single
 
 
 def run_labels(folders: Sequence[Path]) -> list[str]:
@@ -119,22 +110,6 @@ def read_charts(metrics: Path) -> list[Chart]:
     return charts
 
 
-def _overlaid(charts: dict[str, list[Chart]]) -> list[Chart]:
-    """One chart for each title that several runs have, with one curve a run: held out, where it can be."""
-    titles = dict.fromkeys(chart.title for of_run in charts.values() for chart in of_run)
-    shared = []
-    for title in titles:
-        of_title = {run: chart for run, found in charts.items() for chart in found if chart.title == title}
-        curves = {run: _main_curve(chart) for run, chart in list(of_title.items())[:_MOST_RUNS]}
-        if len(curves) > 1:
-            shared.append(Chart(f"All runs · {title}", curves, next(iter(of_title.values())).percent))
-    return shared
-
-
-def _main_curve(chart: Chart) -> Curve:
-    return chart.curves.get(_HELD_OUT_LABEL, next(iter(chart.curves.values())))
-
-
 def _chosen(names: list[str]) -> list[str]:
     """All metrics of a kind, or the held-out ones alone where all would be too many."""
     held_out = [name for name in names if name.startswith(_HELD_OUT)]
@@ -149,5 +124,5 @@ def _stage_title(name: str) -> str:
 def _label(name: str, kind: str) -> str:
     """Name of a curve, such as "pick, held out" for "validation_pick_accuracy"."""
     what = name.removeprefix(_HELD_OUT).replace(kind, "").strip("_/").replace("_", " ")
-    seen = _HELD_OUT_LABEL if name.startswith(_HELD_OUT) else "training data"
+    seen = "held out" if name.startswith(_HELD_OUT) else "training data"
     return f"{what}, {seen}" if what else seen

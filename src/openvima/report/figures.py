@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from itertools import cycle
 from typing import Any
 
-from openvima.evaluation.results import Results
 from openvima.evaluation.statistics import Interval
 from openvima.html import render_page
 from openvima.report.table import Estimate, Line, Table
@@ -133,36 +132,6 @@ _STYLE: Any = {
     "axes.spines.right": False,
     "axes.spines.left": False,
 }
-
-
-def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str:
-    """Draw the success rates of one level: a heading a task, below it a dot with its interval a policy.
-
-    Args:
-        results: The evaluation.
-        level: One of its levels.
-        colours: Name of each policy to the CSS variable of its colour.
-
-    Returns:
-        An `<svg>` element.
-    """
-    tasks, lines_a_task = results.tasks(level), len(colours) + 1.6  # the heading stands above its dots
-    num_lines = lines_a_task * len(tasks)
-    figure, axes = _panel(0.45 + 0.155 * num_lines)
-    for number, task in enumerate(tasks):
-        axes.text(0, lines_a_task * number + 0.55, task, fontsize=9.5, color=_INK, va="center")
-    for line, (policy, variable) in enumerate(colours.items()):
-        rows = {n: row for n, task in enumerate(tasks) if (row := results.row(policy, task, level))}
-        heights = [lines_a_task * number + 1.55 + line for number in rows]
-        low, high = zip(*(row.interval for row in rows.values()), strict=True) if rows else ((), ())
-        style: Any = {"color": _series(variable)}
-        axes.hlines(heights, _percent(low), _percent(high), linewidth=2.4, alpha=0.45, **style)
-        axes.plot(_percent(row.rate for row in rows.values()), heights, "o", markersize=5, **style)
-    axes.set_xlim(-2, 102)
-    axes.set_ylim(num_lines, -0.2)
-    axes.set_xticks(*_PERCENT_TICKS)
-    axes.set_yticks([])
-    return _themed(figure, f"level-{level}", f"Success rates at level {level}", colours.values())
 
 
 def rate_chart(rates: RateFigure, title: str, name: str, colours: Mapping[str, str]) -> str:

@@ -99,7 +99,7 @@ def write_report(
         published_results=published.published_rows(results, published.published_models())
         if with_published
         else [],
-        training_charts=read_run_charts(records) if records else [],
+        training_charts=read_run_charts(records),
         command=command or default_command(results),
     )
     return atomic_write_file(out, page)

@@ -1,13 +1,12 @@
 """Published success rates of the papers' models, for comparison."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
 from openvima.evaluation.results import Results
-from openvima.report.figures import RateCurve, RatePoint
 from openvima.report.table import Estimate, Line, Table
 from openvima.scene.action import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
@@ -164,22 +163,6 @@ def published_rows(
     return rows
 
 
-def published_coverage(results: Results) -> str:
-    """Say on how many of a level's tasks the means rest, where it is not all."""
-    tasks = {level: results.tasks(level) for level in results.levels() if published_tasks(level)}
-    partial = [
-        f"{len(set(own) & published_tasks(level).keys())} of {len(published_tasks(level))} at {level}"
-        for level, own in tasks.items()
-        if published_tasks(level).keys() != set(own)
-    ]
-    if not partial:
-        return "Published means are over the same tasks."
-    return (
-        f"Published means are over the same tasks: {', '.join(partial)}. There, only "
-        f"{' '.join(BESIDE)} has published rates for every task."
-    )
-
-
 def _by_task() -> list[dict]:
     return _content()["tasks"]
 
@@ -206,43 +189,3 @@ def published_task_table(results: Results) -> Table | None:
     columns = ("task", "level", *policies, *(f"{model} {size} (published)" for model, size in models))
     caption = f"Success rates (%) by task, measured ones with 95 % intervals. {BY_TASK}"
     return Table("published-tasks", caption, columns, tuple(lines))
-
-
-def model_size_curves(level: str) -> list[RateCurve]:
-    """Published success rates of a level over the number of parameters, trained on all data.
-
-    The quantity is the size of the controller, without the text encoder.
-    """
-    models = [model for model in published_models() if model.data_fraction == 1 and not model.aside]
-    return _curves(models, level, name=lambda m: m.model, x=lambda m: m.num_parameters)
-
-
-def data_fraction_curves(level: str) -> list[RateCurve]:
-    """Published success rates of a level over the fraction of the demonstrations used for training."""
-    published = [model for model in published_models() if not model.aside]
-    fewer = {(model.model, model.size) for model in published if model.data_fraction < 1}
-    models = [model for model in published if (model.model, model.size) in fewer]
-    return _curves(models, level, name=lambda m: f"{m.model} {m.size}", x=lambda m: m.data_fraction)
-
-
-def _curves(
-    models: Iterable[PublishedModel],
-    level: str,
-    *,
-    name: Callable[[PublishedModel], str],
-    x: Callable[[PublishedModel], float],
-) -> list[RateCurve]:
-    points: dict[str, list[RatePoint]] = {}
-    for model in models:
-        if level in model.levels:
-            rate = model.levels[level]
-            points.setdefault(name(model), []).append(RatePoint(x(model), rate / 100, mark=model.mark(level)))
-    return [
-        RateCurve(name, tuple(sorted(found, key=lambda point: point.x)), published=True)
-        for name, found in points.items()
-    ]
-
-
-def size_ticks(curves: Sequence[RateCurve]) -> dict[float, str]:
-    """Names of the sizes of curves, as in 2e6: "2M"."""
-    return {point.x: f"{point.x / 1e6:.3g}M" for curve in curves for point in curve.points}

@@ -14,7 +14,6 @@ from openvima.report.published import (
     BESIDE,
     is_comparable,
     leading_models,
-    published_coverage,
     published_rate,
     published_rows,
     published_task_table,
@@ -24,12 +23,9 @@ from openvima.report.table import Estimate, Line, Table
 from openvima.report.text import ablation_name, counted
 from openvima.tasks.registry import task_spec
 
-_MOST_TASKS = 4  # that are named for a cause of failure
-_MOST_CAUSES = 8  # listed for a policy
-
 
 class FailureCause(NamedTuple):
-    """A cause of failed episodes, with its fraction of all episodes and the tasks with the most."""
+    """A cause of failed episodes, with its fraction of all episodes and their number by task."""
 
     kind: str
     episodes: int
@@ -46,15 +42,15 @@ def failure_causes(results: Results, policy: str) -> list[FailureCause]:
             tasks.setdefault(kind, Counter())[row.task] += count
     episodes = sum(row.episodes for row in rows)
     ranked = sorted(tasks.items(), key=lambda item: (-item[1].total(), item[0]))
-    causes = [
-        FailureCause(kind, counts.total(), counts.total() / episodes, _by_task(counts))
-        for kind, counts in ranked[:_MOST_CAUSES]
+    return [
+        FailureCause(
+            kind,
+            counts.total(),
+            counts.total() / episodes,
+            ", ".join(f"{task} {count}" for task, count in counts.most_common()),
+        )
+        for kind, counts in ranked
     ]
-    rare = ranked[_MOST_CAUSES:]
-    if rare:
-        count = sum(counts.total() for _, counts in rare)
-        causes.append(FailureCause(counted(len(rare), "rarer cause"), count, count / episodes, ""))
-    return causes
 
 
 def oracle_horizon_means(results: Results, level: str) -> list[tuple[float, Interval] | None]:
@@ -67,14 +63,6 @@ def oracle_horizon_means(results: Results, level: str) -> list[tuple[float, Inte
         means.append(mean_of_rates(counts) if rows else None)
         differs = differs or any(row.successes_oracle_horizon < row.successes for row in rows)
     return means if differs else []
-
-
-def _by_task(counts: Counter[str]) -> str:
-    """The tasks with the most, and how many more there are."""
-    ranked = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-    named = ", ".join(f"{task} {count}" for task, count in ranked[:_MOST_TASKS])
-    rest = len(ranked) - _MOST_TASKS
-    return f"{named} and {counted(rest, 'other task')}" if rest > 0 else named
 
 
 FAMILIES = (  # in the paper's order
@@ -186,20 +174,19 @@ def compact_tables(results: Results, *, published: bool = True) -> list[Table]:
     """Means by level alone, the best policy of each level in bold; the oracle, an upper bound, is none."""
     table = _mean_table(results, published=published and is_comparable(results))
     rivals = [n for n in results.policy_names() if results.policies.get(n, {}).get("kind") != ORACLE]
-    for column in range(len(results.levels())):
-        measured = [line.cells[column] for line in table.lines if line.name in rivals]
-        best = max((cell.value for cell in measured if isinstance(cell, Estimate)), default=None)
-        table = replace(table, lines=tuple(_emphasise(line, column, best, rivals) for line in table.lines))
-    return [table]
+    best = [
+        max((cell.value for cell in column if isinstance(cell, Estimate)), default=None)
+        for column in zip(*(line.cells for line in table.lines if line.name in rivals), strict=True)
+    ]
+    lines = [
+        replace(line, cells=tuple(map(_emphasise, line.cells, best))) if line.name in rivals else line
+        for line in table.lines
+    ]
+    return [replace(table, lines=tuple(lines))]
 
 
-def _emphasise(line: Line, column: int, best: float | None, rivals: Sequence[str]) -> Line:
-    cell = line.cells[column]
-    if not isinstance(cell, Estimate) or cell.value != best or line.name not in rivals:
-        return line
-    cells = list(line.cells)
-    cells[column] = replace(cell, is_best=True)
-    return replace(line, cells=tuple(cells))
+def _emphasise(cell: Estimate | str, best: float | None) -> Estimate | str:
+    return replace(cell, is_best=True) if isinstance(cell, Estimate) and cell.value == best else cell
 
 
 def _mean_table(results: Results, *, published: bool) -> Table:
@@ -219,8 +206,8 @@ def _mean_table(results: Results, *, published: bool) -> Table:
             lines.append(Line(f"{name} (published)", cells, starts_group=number == 0))
         caption += (
             " Rows marked “published” were not measured here: they are those of the VIMA and MIDAS papers, "
-            f"in another simulator. {published_coverage(results)} Means over all tasks of a level are mostly "
-            "read off figures, to about 0.2 points, those with ~ to about 0.5."
+            "in another simulator, over the same tasks. Means over all tasks of a level are mostly read off "
+            "figures, to about 0.2 points, those with ~ to about 0.5."
         )
     return Table("levels", caption, ("policy", *levels), tuple(lines))
 

@@ -1,12 +1,10 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
-import re
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from openvima.errors import cut
 from openvima.evaluation.ablations import INPUT_ABLATIONS, names_in
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import DECLARED, Results
@@ -239,25 +237,6 @@ def finding(comparison: Comparison, difference: Difference | None = None) -> str
         return f"On {where}, {a} − {b} is {size}: not significant."
     doubt = ", though not by the adjusted exact test" if difference.verdict == "unsure" else ""
     return f"On {where}, {a} is better than {b}: {size}{doubt}."
-
-
-_MAX_CHARACTERS = 300  # results come from anywhere
-_NAMED = re.compile(r"(distractor )?object \d+ \(([^()]*)\)")
-_UNNAMED = re.compile(r"(distractor )?\bobject\b(?: \d+)?")
-
-
-def plain_reason(reason: str) -> str:
-    """Write the reason of a failure, or a kind of reasons, in plain English.
-
-    Example:
-        >>> plain_reason("distractor object 7 (red ring) is where object 6 (tan star) is")
-        'the red ring, a distractor, is where the tan star is'
-        >>> plain_reason("object left the workspace")
-        'an object left the workspace'
-    """
-    text = cut(reason, _MAX_CHARACTERS)
-    text = _NAMED.sub(lambda found: f"the {found[2]}" + (", a distractor," if found[1] else ""), text)
-    return _UNNAMED.sub(lambda found: "a distractor" if found[1] else "an object", text)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 import re
 from collections import ChainMap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from itertools import product
 from string import Formatter
@@ -15,19 +15,11 @@ from openvima.env.config import EnvConfig
 from openvima.errors import ConfigError, unknown_name
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS
 from openvima.policies.presets import PUBLISHED, SIZE_NAMES
-from openvima.report.published import (
-    PublishedModel,
-    data_fraction_curves,
-    leading_models,
-    model_size_curves,
-    published_models,
-    size_ticks,
-)
+from openvima.report.published import leading_models, published_models
 from openvima.studies.study import (
     L4_TASKS,
     NANO_POINTER,
     TRAINING_TASKS,
-    PublishedPoint,
     Run,
     Study,
     StudyInputs,
@@ -111,6 +103,8 @@ class _Names(dict[str, Any]):
     def __init__(self, inputs: StudyInputs) -> None:
         scale, tasks = inputs.scale, (*TRAINING_TASKS, *L4_TASKS)
         whole = [model for model in published_models() if model.data_fraction == 1]
+        sized = [model for model in whole if not model.aside]
+        fewer = {(m.model, m.size) for m in published_models() if m.data_fraction < 1 and not m.aside}
         super().__init__(
             inputs=inputs,
             scale=scale,
@@ -125,14 +119,18 @@ class _Names(dict[str, Any]):
                 SimpleNamespace(name=size, parameters=1e6 * int(size.removesuffix("m")))
                 for size in SIZE_NAMES[1 : SIZE_NAMES.index(scale.name) + 1]
             ],
-            size_ticks=size_ticks(model_size_curves("L1")),
-            published_sizes=published_points(scale.levels, model_size_curves),
-            published_fractions=published_points(scale.levels, data_fraction_curves),
-            published_leading=_points(leading_models()),
-            published_vima=_points(m for m in whole if m.model == "VIMA"),
-            published_midas=_points(
+            size_ticks={model.num_parameters: model.size for model in sized},
+            published_sizes=published_points(
+                sized, series=lambda model: model.model, x=lambda model: model.num_parameters
+            ),
+            published_fractions=published_points(
+                (m for m in published_models() if (m.model, m.size) in fewer), x=lambda m: m.data_fraction
+            ),
+            published_leading=published_points(leading_models()),
+            published_vima=published_points(m for m in whole if m.model == "VIMA"),
+            published_midas=published_points(
                 (m for m in whole if m.model.startswith("MIDAS") and m.size == "92M"),
-                "autoregressive, residual",
+                x=lambda model: "autoregressive, residual",
             ),
         )
 
@@ -151,15 +149,6 @@ class _Names(dict[str, Any]):
                 f"{', '.join(_T5_SIZES)}, or 't5-base' to fetch them from the Hugging Face Hub."
             )
         return "" if where in _T5_SIZES else f"{where}/"
-
-
-def _points(models: Iterable[PublishedModel], x: str = "") -> tuple[PublishedPoint, ...]:
-    """Points of models at each level; on the axis is the level, or `x`."""
-    return tuple(
-        PublishedPoint(f"{model.model} {model.size}", x or level, level, rate / 100, model.mark(level))
-        for model in models
-        for level, rate in model.levels.items()
-    )
 
 
 def _fill(value: Any, names: Mapping[str, Any]) -> Any:

@@ -10,7 +10,7 @@ from openvima.errors import ConfigError, unknown_name
 from openvima.evaluation.sources import policy_sources
 from openvima.policies.naming import SMALL
 from openvima.policies.presets import SIZE_NAMES
-from openvima.report.figures import RateCurve
+from openvima.report.published import PublishedModel
 
 NANO = "nano"
 TRAINING_TASKS = (  # of the papers
@@ -260,19 +260,22 @@ class PublishedPoint:
 
 
 def published_points(
-    levels: Iterable[str], curves_of: Callable[[str], Iterable[RateCurve]]
+    models: Iterable[PublishedModel],
+    *,
+    series: Callable[[PublishedModel], str] = lambda model: f"{model.model} {model.size}",
+    x: Callable[[PublishedModel], float | str] = lambda model: "",
 ) -> tuple[PublishedPoint, ...]:
-    """Return the points of published curves, such as those of `openvima.report.published`.
+    """Return the points of published models, such as those of `openvima.report.published`, at each level.
 
     Args:
-        levels: Levels.
-        curves_of: Curves of a level.
+        models: The models.
+        series: Name of the curve of a model.
+        x: Value or name on the x axis; where it is empty, the level is on it.
     """
     return tuple(
-        PublishedPoint(curve.name, point.x, level, point.rate, point.mark)
-        for level in levels
-        for curve in curves_of(level)
-        for point in curve.points
+        PublishedPoint(series(model), x(model) or level, level, rate / 100, model.mark(level))
+        for model in models
+        for level, rate in model.levels.items()
     )
 
 
