@@ -12,7 +12,6 @@ from openvima.data.lerobot import LerobotConfig
 from openvima.data.published import ImportConfig
 from openvima.data.subsets import MergeConfig, SubsetConfig
 from openvima.evaluation import EvaluationConfig, Results, score
-from openvima.evaluation.config import plan
 from openvima.policies import RandomPolicy, load_policy
 
 
@@ -92,9 +91,3 @@ def test_data_and_results_are_named_by_text_path_and_home(home: Path) -> None:
         results.write(kind("~/results.json"))
         assert Results.read(kind("~/results.json")).rows == results.rows
     assert not Path("~").exists()
-
-
-def test_batches_of_other_processes_have_whole_paths(home: Path) -> None:
-    (home / "lr=0.001").mkdir()
-    (batch,) = plan(EvaluationConfig("lr=0.001", tasks="rotate", levels="L1", episodes=1))  # type: ignore
-    assert batch.with_whole_paths().source == str(home / "lr=0.001")

@@ -1,6 +1,7 @@
 """Compilation of kernels by Numba, cached where a folder can be written."""
 
 import contextlib
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -11,10 +12,11 @@ def njit(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function when it is first called, and keep the result for later processes.
 
     It is kept in NUMBA_CACHE_DIR, else beside the code, else in the user's cache folder. Where none of them
-    can be written, each process compiles anew.
+    can be written, and for users without a home, each process compiles anew.
     """
-    compiled = numba.njit(kernel)
-    if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # made from the environment
+    compiled, config = numba.njit(kernel), numba.config  # its names are made from the environment
+    has_home = os.path.expanduser("~") != "~"  # else Numba would make a folder of that name
+    if not config.DISABLE_JIT and (config.CACHE_DIR or has_home):  # type: ignore[attr-defined]
         with contextlib.suppress(RuntimeError):  # no folder can be written
             compiled.enable_caching()
     return compiled

@@ -192,6 +192,11 @@ def echo(text: str, limit: int = MAX_ECHO) -> str:
     return kept if len(text) <= limit else kept[: limit - 1] + "…"
 
 
+def one_line(error: BaseException) -> str:
+    """Return the message of an error in one line of limited length."""
+    return " ".join(str(error).split())[:MAX_ECHO].rstrip(".") or type(error).__name__
+
+
 def differences(there: Mapping[str, object], here: Mapping[str, object]) -> list[str]:
     """Say which settings of a file differ from those given, for an error."""
     return [

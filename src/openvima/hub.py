@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
-from openvima.errors import ServerError, echo
+from openvima.errors import ServerError, echo, one_line
 from openvima.imports import import_extra
 
 HubKind = Literal["model", "dataset"]
@@ -97,7 +97,6 @@ def commit(
     files: Mapping[str, Path | bytes],
     *,
     kind: HubKind = "model",
-    message: str,
     private: bool = False,
 ) -> HubName:
     """Write files to a repository in one commit; it is created if there is none.
@@ -106,7 +105,6 @@ def commit(
         name: The repository; its revision is the branch, which is created too.
         files: Path in the repository to a local file or content. Other files in it stay.
         kind: Kind of repository.
-        message: Message of the commit.
         private: Whether a new repository is private.
 
     Returns:
@@ -127,7 +125,7 @@ def commit(
         if name.revision:
             api.create_branch(name.repo, branch=name.revision, repo_type=kind, exist_ok=True)
         done = api.create_commit(
-            name.repo, additions, commit_message=message, repo_type=kind, revision=name.revision
+            name.repo, additions, commit_message="Push with openvima", repo_type=kind, revision=name.revision
         )
     return replace(name, revision=done.oid)
 
@@ -142,10 +140,6 @@ def _failures(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # the client passes on those of its HTTP library, which has changed before
-        reasons = [_first_line(each) for each in (error, error.__cause__) if each is not None]
+        causes = [each for each in (error, error.__cause__) if each is not None]
+        reasons = [echo(f"{type(each).__name__}: {one_line(each)}") for each in causes]
         raise ServerError(f"{what} failed: {'; '.join(reasons)}") from error
-
-
-def _first_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}{f': {echo(lines[0])}' if lines else ''}"

@@ -29,17 +29,7 @@ def lazy_names(
             return getattr(import_module(f"{package}.{modules[name]}"), name)
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
-    def public_names() -> list[str]:
-        module = sys.modules[package]
-        present = {
-            name
-            for name, value in vars(module).items()
-            if name.startswith("__")
-            or (isinstance(value, ModuleType) and value.__name__ == f"{package}.{name}")
-        }
-        return sorted({*module.__all__, *present})
-
-    return load, public_names
+    return load, lambda: sorted(sys.modules[package].__all__)
 
 
 # How torch, MuJoCo, Arrow, threads and the loader of shared libraries say that there is no memory. Libraries

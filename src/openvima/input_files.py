@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from openvima.errors import ConfigError, InputFileError
+from openvima.errors import ConfigError, InputFileError, one_line
 
 Given = str | os.PathLike[str]
 
@@ -95,7 +95,6 @@ if TYPE_CHECKING:
     import PIL.Image
 
 MAX_TEXT_BYTES = 64 * 1024  # of a config; the longest of the package has 10 kB
-_MAX_REASON = 200  # characters
 
 
 def open_regular(file: Path) -> BufferedReader:
@@ -221,8 +220,3 @@ class _StrictLoader(yaml.SafeLoader):
         if len(found) < len(node.value):
             raise yaml.YAMLError(f"it has a key twice: {', '.join(map(str, found))[:80]}")
         return found
-
-
-def one_line(error: Exception) -> str:
-    """Return the message of an error in one line of limited length."""
-    return " ".join(str(error).split())[:_MAX_REASON].rstrip(".") or type(error).__name__

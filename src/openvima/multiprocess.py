@@ -22,7 +22,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
 
-from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, unknown_words
+from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, one_line, unknown_words
 from openvima.imports import import_extra
 
 POLL_S = 0.2
@@ -318,7 +318,7 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
     except (ConnectionError, RuntimeError, ValueError) as error:
         hint = " If it asks for a token, RAY_AUTH_TOKEN must hold it here too." if address else ""
         raise ConfigError(
-            f"cannot use Ray at {address or 'this machine'}: {_first_line(error)}.{hint}"
+            f"cannot use Ray at {address or 'this machine'}: {one_line(error)}.{hint}"
         ) from error
     try:
         yield
@@ -356,7 +356,7 @@ def _run_all(
         while True:
             while len(running) < num_workers and waiting:
                 slot = waiting.popleft()
-                running[remote.remote(job, items[slot])] = slot
+                running[remote.remote(job, items[slot], os.getcwd())] = slot
             if not running:
                 return
             done, _ = ray.wait(list(running), timeout=RAY_POLL_S)
@@ -377,13 +377,13 @@ def _run_all(
     except ray.exceptions.RayTaskError as error:
         if isinstance(error.cause, ray.exceptions.RayError):  # the job could not be unpickled
             raise ConfigError(
-                f"a machine of the Ray cluster cannot do the work ({_first_line(error.cause)}). "
+                f"a machine of the Ray cluster cannot do the work ({one_line(error.cause)}). "
                 "All of them need this version of openvima, with what its extras and your tasks import."
             ) from None
         raise error.cause from None  # what the job raised
     except ray.exceptions.RayError as error:
         raise WorkerError(
-            f"a worker of the Ray cluster died ({_first_line(error)}); often for lack of memory. "
+            f"a worker of the Ray cluster died ({one_line(error)}); often for lack of memory. "
             "Whole files were kept, and the same command continues."
         ) from None
     finally:
@@ -414,13 +414,13 @@ def _environment() -> dict[str, str]:
     return {**own, **WORKER_VARIABLES, "OPENVIMA_CALL": str(time.time_ns())}
 
 
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0].strip().rstrip(".")
+def _run_counted(job: Job, item: Any, folder: str) -> tuple[Any, int, list[UnknownWordWarning]]:
+    """Run a job in a worker; return its result, its last count and its unknown words.
 
-
-def _run_counted(job: Job, item: Any) -> tuple[Any, int, list[UnknownWordWarning]]:
-    """Run a job in a worker; return its result, its last count and its unknown words."""
+    Relative paths are those of the folder, where the worker's machine has it.
+    """
+    with contextlib.suppress(OSError):
+        os.chdir(folder)
     counts = [0]
     with unknown_words() as found:
         return job(item, counts.append), counts[-1], found

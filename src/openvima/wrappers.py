@@ -123,8 +123,7 @@ class FlatObservation(gymnasium.ObservationWrapper):
         max_prompt_objects: Rows for objects in the prompt's images; likewise.
 
     Raises:
-        ConfigError: The environment does not observe `rgb` and `segm`, or a number of rows is no integer
-            of at least 1.
+        ConfigError: The environment does not observe `rgb` and `segm`.
     """
 
     def __init__(self, env: gymnasium.Env, *, max_objects: int = 18, max_prompt_objects: int = 18) -> None:
@@ -132,9 +131,6 @@ class FlatObservation(gymnasium.ObservationWrapper):
         self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
         if not {"rgb", "segm"} <= set(self._base.modalities):
             raise ConfigError(f"modalities are {self._base.modalities}; FlatObservation needs rgb and segm.")
-        if not all(_is_count(rows) for rows in (max_objects, max_prompt_objects)):
-            given = f"{max_objects!r} and {max_prompt_objects!r}"
-            raise ConfigError(f"rows are {given}; give an integer of at least 1 for each.")
         self.max_objects, self.max_prompt_objects = max_objects, max_prompt_objects
         size = (max_objects + max_prompt_objects) * OBJECT_SIZE + NUM_BUCKETS + 1
         size += TOOL_SIZE * (self._base.control == END_EFFECTOR)
@@ -216,7 +212,7 @@ shape (3 × max_prompt_images, 128 / shrink, 256 / shrink), zeros where there is
         shrink: Images are averaged over squares of so many pixels a side: 1, 2 or 4.
 
     Raises:
-        ConfigError: The environment does not observe `rgb`, or a number is not allowed.
+        ConfigError: The environment does not observe `rgb`, or `shrink` is another number.
     """
 
     def __init__(self, env: gymnasium.Env, *, max_prompt_images: int = 4, shrink: int = 2) -> None:
@@ -224,11 +220,8 @@ shape (3 × max_prompt_images, 128 / shrink, 256 / shrink), zeros where there is
         self._base: Any = env.unwrapped  # a TabletopEnv, as in `FlatObservation`
         if "rgb" not in self._base.modalities:
             raise ConfigError(f"modalities are {self._base.modalities}; ImageObservation needs rgb.")
-        if not _is_count(max_prompt_images) or shrink not in (1, 2, 4):
-            raise ConfigError(
-                f"max_prompt_images is {max_prompt_images!r} and shrink {shrink!r}; give an integer of at "
-                "least 1, and 1, 2 or 4."
-            )
+        if shrink not in (1, 2, 4):
+            raise ConfigError(f"shrink is {shrink!r}; allowed are 1, 2 and 4.")
         self.max_prompt_images, self.shrink = max_prompt_images, shrink
         shape = CAMERAS["top"].height // shrink, CAMERAS["top"].width // shrink
         images = {**dict.fromkeys(CAMERAS, 3), "prompt": 3 * max_prompt_images}
@@ -329,10 +322,6 @@ class ProgressReward(gymnasium.Wrapper):
         ids = {object_of(problem.goals[index]) for index in open_goals if index in stage} - {None}
         poses = [self._base.scene[object_id].pose for object_id in ids]
         return min((math.hypot(pose.x - point[0], pose.y - point[1]) for pose in poses), default=0.0)
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 1
 
 
 def _scaled(points: np.ndarray) -> np.ndarray:

@@ -74,7 +74,6 @@ def test_frames_of_a_level_are_generated_without_a_folder(detector, capsys):
         (["--held-out", "0.1", "--frames", "0"], r"frames is 0; .* no data are given"),
         (["--level", "L9"], "no level 'L9'"),
         (["--seed", "-1"], "seed is -1"),
-        (["--prompt-prob", "7"], "prompt-prob is 7"),
         (["--device", "abacus"], "device 'abacus' cannot be used here"),
     ],
 )

@@ -13,20 +13,15 @@ from openvima.evaluation.verification import verify_results
 from openvima.render import gallery
 
 
-def test_tasks_lists_prompt_tool_levels_and_steps_for_machines_too(capsys):
+def test_tasks_lists_prompt_tool_levels_and_steps(capsys):
     assert main(["tasks"]) == 0
     shown = capsys.readouterr().out
     assert "sweep_without_exceeding" in shown and "spatula" in shown and "train L1 L2" in shown
-    assert main(["tasks", "--json"]) == 0
-    tasks = {task["name"]: task for task in json.loads(capsys.readouterr().out)}
-    assert tasks["rotate"]["levels"] == ["train", "L1", "L2", "L3", "L5"]
-    assert tasks["rotate"]["max_steps"] == tasks["rotate"]["oracle_max_steps"] + 2
-    assert "{" in tasks["visual_manipulation"]["prompt"]
 
 
 def test_tasks_lists_those_of_a_level(capsys):
-    assert main(["tasks", "--level", "L4", "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)) == 4
+    assert main(["tasks", "--level", "L4"]) == 0
+    assert "4 tasks" in capsys.readouterr().out
     assert main(["tasks", "--level", "L9"]) == 2
     assert "there is no level 'L9'" in capsys.readouterr().err
 
@@ -35,9 +30,6 @@ def test_tasks_describes_the_options_of_a_task(capsys):
     assert main(["tasks", "rotate"]) == 0
     shown = capsys.readouterr().out
     assert "30+60+90" in shown and "Further objects, 0 … 6" in shown
-    assert main(["tasks", "rotate", "--json"]) == 0
-    options = json.loads(capsys.readouterr().out)["options"]
-    assert options["difficulty"]["default"] == "easy" and "3 or 5" in options["difficulty"]["description"]
     assert main(["tasks", "rotat"]) == 2
     assert "Did you mean 'rotate'" in capsys.readouterr().err
 

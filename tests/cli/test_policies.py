@@ -1,6 +1,5 @@
 """The verb `policies`: the list, one policy, and published files made into folders."""
 
-import json
 from collections.abc import Iterator
 from functools import cache
 
@@ -49,19 +48,6 @@ def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys,
     assert rows["preset"][3:] == [*size.parts, "total", "trained", "frozen"]
 
 
-@pytest.mark.slow
-def test_the_list_can_be_read_by_machines(capsys) -> None:
-    assert main(["policies", "--json"]) == 0
-    records = {record["name"]: record for record in json.loads(capsys.readouterr().out)}
-    assert list(records)[: len(PRESETS)] == list(PRESETS)
-    record = records["gato-200m"]
-    keys = ("architecture", "width", "layers", "heads")
-    assert tuple(record[key] for key in keys) == ("gato", 768, 22, 24)
-    total = record["parameters"].pop("total")
-    for kind in ("trainable", "frozen"):
-        assert sum(count[kind] for count in record["parameters"].values()) == total[kind] > 0
-
-
 def test_a_preset_is_shown_with_all_of_its_sizes(capsys) -> None:
     assert main(["policies", "show", "gpt-nano"]) == 0
     shown = capsys.readouterr().out
@@ -72,9 +58,8 @@ def test_a_preset_is_shown_with_all_of_its_sizes(capsys) -> None:
 def test_a_checkpoint_and_a_published_file_are_shown_by_their_path(published, tmp_path, capsys) -> None:
     save_checkpoint(build_network(small_vima(), seed=0), tmp_path / "saved")
     for path in (tmp_path / "saved", published):
-        assert main(["policies", "show", str(path), "--json"]) == 0
-        record = json.loads(capsys.readouterr().out)
-        assert (record["width"], record["config"]["decoder"]["num_layers"]) == (32, 1)
+        assert main(["policies", "show", str(path)]) == 0
+        assert "vima, width 32, 1 layer, 2 heads" in capsys.readouterr().out
 
 
 def test_a_published_file_becomes_a_policy(published, tmp_path, capsys) -> None:

@@ -177,8 +177,8 @@ def test_moved_boxes_follow_from_the_episode_and_change_the_actions_of_networks_
     [
         ("masked_word:0.2", "Did you mean 'masked_words'"),
         ("masked_words", "needs a rate, such as masked_words:0.2"),
-        ("masked_words:0", "must be a number above 0 to 1"),
-        ("masked_words:1.5", "must be a number above 0 to 1"),
+        ("masked_words:-1", "must be a number from 0 to 1"),
+        ("masked_words:1.5", "must be a number from 0 to 1"),
         ("masked_words:nan", "must be a number"),
         ("noisy_boxes:2.5", "must be an integer from 1 to 32"),
         ("num_distractors:99", "must be an integer from 0 to 6"),

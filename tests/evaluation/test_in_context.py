@@ -11,7 +11,7 @@ from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv, save_episode
 from openvima.errors import ConfigError, OracleError, PolicyError, PromptError, UnknownPolicyError
 from openvima.evaluation import EvaluationConfig, Results, play
-from openvima.evaluation.ablations import ABLATIONS, EXAMPLE_PROMPTS, IN_CONTEXT, ORACLE_DEMONSTRATION, ablate
+from openvima.evaluation.ablations import ABLATIONS, IN_CONTEXT, ORACLE_DEMONSTRATION, ablate
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, in_context_prompt
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
@@ -66,9 +66,15 @@ def test_other_tasks_and_prompts_are_refused() -> None:
 
 def test_all_leaves_out_prompts_with_an_example() -> None:
     (source,) = policy_sources(("untrained",))
-    asked = EvaluationConfig(("untrained",), ablations=("all", *EXAMPLE_PROMPTS)).ablations_of(source)
-    assert asked == (*(name for name in ABLATIONS if name != "detected_boxes"), *EXAMPLE_PROMPTS)
-    assert not {*EXAMPLE_PROMPTS} & {
+    asked = EvaluationConfig(
+        ("untrained",), ablations=("all", IN_CONTEXT, ORACLE_DEMONSTRATION)
+    ).ablations_of(source)
+    assert asked == (
+        *(name for name in ABLATIONS if name != "detected_boxes"),
+        IN_CONTEXT,
+        ORACLE_DEMONSTRATION,
+    )
+    assert not {IN_CONTEXT, ORACLE_DEMONSTRATION} & {
         *EvaluationConfig(("untrained",), ablations=("all",)).ablations_of(source)
     }
 

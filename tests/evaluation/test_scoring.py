@@ -121,9 +121,8 @@ def test_a_policy_that_raises_in_one_episode_loses_that_episode_only(error, tmp_
     assert "no idea" in outcomes[2].reason
     assert results.rows[0].failures[POLICY_ERROR] == 1
     (found,) = results.policy_errors()
-    assert str(found).startswith(
-        "1 of 4 episodes of mine ended by an error of the policy; first in visual_manipulation, L1, seed 2: "
-    )
+    assert (found["raised"], found["episodes"]) == (1, 4)
+    assert found["first"].startswith("first in visual_manipulation, L1, seed 2: ")
     assert Results.read(results.write(tmp_path / "results.json")) == results
 
 

@@ -107,8 +107,7 @@ def test_a_task_file_is_all_that_demonstrations_and_scores_need(tmp_path: Path) 
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    names = [entry["name"] for entry in json.loads(openvima("tasks", "--json"))]
-    assert "put_between" in names
+    assert "put_between" in openvima("tasks")
     openvima("generate", "--tasks=put_between", "--episodes=6", "--workers=2", f"--out={tmp_path / 'd'}")
     assert len(Dataset(tmp_path / "d")) == 6
     scores = openvima(

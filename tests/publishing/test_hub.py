@@ -67,7 +67,6 @@ def test_the_card_of_demonstrations_counts_them_and_names_their_licence(hub: Loc
     _, metadata, text = repository.commits[name.revision]["README.md"].decode().split("---\n", 2)
     values = yaml.safe_load(metadata)
     assert values["license"] == ["mit", "cc-by-4.0"]
-    assert values["size_categories"] == ["n<1K"]
     assert "| rotate | 2 | " in text
     assert Dataset(demos).manifest["content_hash"] in text
     assert "hf://owner/demos@first" in text

@@ -51,7 +51,6 @@ def evaluate(
     level: str | None = None,
     frames: int = 400,
     held_out: float | None = None,
-    prompt_prob: float = 0.25,
     seed: int = 0,
     device: str = "cpu",
     as_json: Json = False,
@@ -67,7 +66,6 @@ def evaluate(
         frames: Number of images, rounded up to pairs of views.
         held_out: Use only the demonstrations of --data that a training with this validation fraction holds
             out, such as 0.02; by default all.
-        prompt_prob: Probability of a prompt image instead of an observation.
         seed: Seed of the image sampling; also the first seed of generated episodes.
         device: cpu or cuda.
         as_json: Print JSON instead of a table.
@@ -83,15 +81,15 @@ def evaluate(
     loaded = load_detector(detector, device=device)
     with (
         _one_thread(),
-        _frames(data, level, frames, held_out, prompt_prob, seed) as sampler,
+        _frames(data, level, frames, held_out, seed) as sampler,
         progress_bar("evaluating") as bar,
     ):
         counted = _counted(held_out_frames(sampler, frames, seed=seed), frames, bar)
         result = evaluate_detector(lambda rgb: loaded.detect(rgb, ""), counted)
     if as_json:
         source = {"data": str(data), "held_out": held_out} if data else {"level": level or LEVEL}
-        source |= {"prompt_prob": prompt_prob, "seed": seed}
-        print(json.dumps({"detector": str(detector or "bundled"), **source, **asdict(result)}))
+        name = str(detector or "bundled")
+        print(json.dumps({"detector": name, **source, "seed": seed, **asdict(result)}))
     else:
         _print_result(result)
     return 0
@@ -104,8 +102,6 @@ def show(
     data: Path | None = None,
     level: str | None = None,
     frames: int = 12,
-    prompt_prob: float = 0.25,
-    score: float = 0.1,
     seed: int = 0,
 ) -> int:
     """Draw detections: masks, boxes and scores; ground-truth boxes are dashed.
@@ -118,8 +114,6 @@ def show(
         data: Folder of demonstrations; by default the oracle generates episodes of all tasks of the level.
         level: train, L1 to L8, instead of --data; by default L3, with novel objects and textures.
         frames: Number of images, rounded up to pairs of views.
-        prompt_prob: Probability of a prompt image instead of an observation.
-        score: Least score of the detections that are drawn; by default all that a policy gets.
         seed: Seed of the image sampling; also the first seed of generated episodes.
 
     Returns:
@@ -133,9 +127,9 @@ def show(
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out is {str(out)!r}; give the name of a PNG file, ending in .png.")
     loaded = load_detector(detector)
-    with _one_thread(), _frames(data, level, frames, None, prompt_prob, seed) as sampler:
+    with _one_thread(), _frames(data, level, frames, None, seed) as sampler:
         images = [
-            draw_detections(frame, loaded.detect(frame.rgb, ""), score=score)
+            draw_detections(frame, loaded.detect(frame.rgb, ""))
             for frame in held_out_frames(sampler, frames, seed=seed)
         ]
     save_grid(images, out)
@@ -180,7 +174,6 @@ def _frames(
     level: str | None,
     frames: int,
     held_out: float | None,
-    prompt_prob: float,
     seed: int,
 ) -> "Iterator[FrameSampler]":
     """Frames of a folder, or of temporary demonstrations."""
@@ -191,9 +184,8 @@ def _frames(
     problems = []
     if frames < 1:
         problems.append(f"frames is {frames}; it must be at least 1.")
-    for name, value in (("held-out", held_out), ("prompt-prob", prompt_prob)):
-        if value is not None and not 0 <= value <= 1:
-            problems.append(f"{name} is {value:g}; it must be between 0 and 1.")
+    if held_out is not None and not 0 <= held_out <= 1:
+        problems.append(f"held-out is {held_out:g}; it must be between 0 and 1.")
     if data is not None and level is not None:
         problems.append(f"both data and level are given ({data} and {level}); leave one of them out.")
     if data is None and held_out is not None:
@@ -207,11 +199,11 @@ def _frames(
 
         dataset = Dataset(data)
         episodes = None if held_out is None else split_episodes(dataset, held_out)[1]
-        yield FrameSampler(dataset, episodes, prompt_prob=prompt_prob)
+        yield FrameSampler(dataset, episodes)
         return
     with tempfile.TemporaryDirectory() as folder:
         _generate(Path(folder, "demos"), level or LEVEL, frames, seed)
-        yield FrameSampler(Dataset(Path(folder, "demos")), prompt_prob=prompt_prob)
+        yield FrameSampler(Dataset(Path(folder, "demos")))
 
 
 @contextmanager

@@ -300,8 +300,13 @@ def _print_scores(results: "Results", path: Path, *, as_json: bool) -> None:
         print(json.dumps(json.loads(path.read_text(encoding="utf-8"))["rows"]))
     else:
         print_results(results)
-    for ended in (*results.invalid_actions(), *results.policy_errors()):
-        print(f"Warning: {ended}", file=sys.stderr)
+    for count, cause, found in (
+        ("invalid", "an invalid action", results.invalid_actions()),
+        ("raised", "an error of the policy", results.policy_errors()),
+    ):
+        for each in found:
+            of = f"{each[count]} of {each['episodes']} episodes of {each['policy']}"
+            print(f"Warning: {of} ended by {cause}; {each['first']}", file=sys.stderr)
     if unneeded := results.unneeded_prompts():
         print(f"Warning: {unneeded}", file=sys.stderr)
     for name, what in results.policies.items():

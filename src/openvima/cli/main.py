@@ -1,12 +1,10 @@
 """The `openvima` program: dispatches to the module of the verb and reports errors in one line."""
 
-import argparse
 import importlib
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
 from typing import Any
 
 from openvima import __version__
@@ -123,10 +121,10 @@ def _module(verb: str) -> str:
 
 def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, int]:
     """Return the line that reports an exception, and the exit status; raise it if it is a bug."""
-    name, out = type(error).__name__, _out(rest)
+    name = type(error).__name__
     if lacks_memory(error):
         remedy = "lower the size of batches or the number of workers"
-        return f"out of memory while working on {out}; {remedy}. Complete files were kept.", 1
+        return f"out of memory; {remedy}. Complete files were kept.", 1
     if isinstance(error, OpenVimaError):
         from openvima.cli.options import name_options
 
@@ -136,7 +134,7 @@ def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, i
         raise error
     reason = error.strerror or name
     if error.errno in NO_SPACE:
-        return f"cannot write {error.filename or out}: {reason}. {FREE_SPACE}", 1
+        return f"cannot write {error.filename or 'a file'}: {reason}. {FREE_SPACE}", 1
     if error.filename is None:
         return f"{name}: {error}", 1
     return f"cannot use {error.filename}: {reason}. Give a path that can be read and written.", 2
@@ -152,13 +150,6 @@ def _setting_names(verb: str, rest: Sequence[str]) -> list[str]:
 
         return setting_names(TrainingConfig)
     return setting_names(module.COMMANDS[rest[0]] if hasattr(module, "COMMANDS") else module.main)
-
-
-def _out(words: Sequence[str]) -> str:
-    """Return the path that the arguments of a verb name as --out, else the current folder."""
-    known = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    known.add_argument("--out", nargs="?")
-    return known.parse_known_args([*words])[0].out or str(Path.cwd())
 
 
 @contextmanager

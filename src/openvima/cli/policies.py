@@ -1,6 +1,5 @@
 """`openvima policies`: list networks and trained policies, show one, convert, export and push checkpoints."""
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -13,7 +12,6 @@ if TYPE_CHECKING:
     from openvima.policies.build import PolicyConfig, PolicySize
     from openvima.policies.naming import BundledPolicy
 
-Json = Annotated[bool, tyro.conf.arg(name="json")]
 Precision = Literal["float32", "bfloat16", "float16", "float64"]
 _NOTES = (
     "layers: self-attention, in vima and flamingo with cross-attention to the prompt before it",
@@ -23,13 +21,10 @@ _NOTES = (
 DEFAULT = "list"  # what `openvima policies` does without a further word
 
 
-def list_(*, as_json: Json = False) -> int:
+def list_() -> int:
     """List the presets with parameter counts by part, the bundled checkpoints, and learners of your own.
 
     Example: openvima policies
-
-    Args:
-        as_json: Print JSON instead of a table.
 
     Returns:
         Exit status.
@@ -42,28 +37,18 @@ def list_(*, as_json: Json = False) -> int:
     from openvima.policies.build import policy_size
     from openvima.policies.checkpoint import read_info
 
-    sizes = {name: policy_size(preset(name)) for name in PRESETS}
-    installed = {name: policy for name, policy in BUNDLED.items() if policy.is_installed}
-    trained = {name: policy_size(read_info(policy.folder).config) for name, policy in installed.items()}
-    if as_json:
-        records = [{"name": name, **_record(size)} for name, size in sizes.items()]
-        records += [{"name": name, **_record(trained[name]), **_facts(installed[name])} for name in installed]
-        records += [{"name": name, "code": source} for name, source in own_policies().items()]
-        print(json.dumps(records, indent=1))
-        return 0
-    _print_table(sizes)
-    for name, policy in installed.items():
-        parameters = _millions(trained[name].parameters.total)
-        print(f"\n{name}, a bundled checkpoint, {parameters} M parameters")
-        _print_facts(policy)
+    _print_table({name: policy_size(preset(name)) for name in PRESETS})
+    for name, policy in BUNDLED.items():
+        if policy.is_installed:
+            parameters = policy_size(read_info(policy.folder).config).parameters
+            print(f"\n{name}, a bundled checkpoint, {_millions(parameters.total)} M parameters")
+            _print_facts(policy)
     for name, source in own_policies().items():
         print(f"\n{name}, a learner of your own, {source}")
     return 0
 
 
-def show(
-    policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")], *, as_json: Json = False
-) -> int:
+def show(policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")]) -> int:
     """Show one policy: parameter counts by part, and its config.
 
     Example: openvima policies show vima-200m
@@ -71,7 +56,6 @@ def show(
     Args:
         policy: Name of a preset or of a bundled checkpoint, a run folder or checkpoint folder, a published
             file, or OWNER/NAME[@REVISION] on the Hugging Face Hub.
-        as_json: Print JSON.
 
     Returns:
         Exit status.
@@ -84,12 +68,6 @@ def show(
 
     config, bundled = _config(policy), BUNDLED.get(policy)
     size = policy_size(config)
-    if as_json:
-        facts = _facts(bundled) if bundled else {}
-        print(
-            json.dumps({"name": policy, **_record(size), **facts, "config": config_to_dict(config)}, indent=1)
-        )
-        return 0
     import yaml
 
     print(f"{policy}: {_summary(size)}")
@@ -163,7 +141,6 @@ def push_to_hub(
     results: Path | None = None,
     licence: str = "mit",
     private: bool = False,
-    message: str = "",
     dry_run: bool = False,
 ) -> int:
     """Push a checkpoint to the Hugging Face Hub, with a generated model card.
@@ -180,7 +157,6 @@ def push_to_hub(
         results: Folder of an evaluation of these weights.
         licence: Identifier of the licence of the weights.
         private: Make a new repository private.
-        message: Of the commit.
         dry_run: Print the card and list the files; nothing is sent.
 
     Returns:
@@ -191,8 +167,7 @@ def push_to_hub(
     if dry_run:
         print_files(policy_files(source, name, results=results, licence=licence))
     else:
-        done = push_policy(source, name, results=results, licence=licence, private=private, message=message)
-        print(done)
+        print(push_policy(source, name, results=results, licence=licence, private=private))
     return 0
 
 
@@ -220,31 +195,10 @@ def _summary(size: "PolicySize") -> str:
     )
 
 
-def _facts(policy: "BundledPolicy") -> dict[str, object]:
-    return {
-        "bytes": policy.weights.stat().st_size,
-        "trained_on": policy.trained_on,
-        "model_card": str(policy.model_card),
-    }
-
-
 def _print_facts(policy: "BundledPolicy") -> None:
     print(f"  weights:     {policy.weights.stat().st_size / 1e6:.1f} MB")
     print(f"  trained on:  {policy.trained_on}")
     print(f"  model card:  {policy.model_card}")
-
-
-def _record(size: "PolicySize") -> dict[str, object]:
-    return {
-        "architecture": size.architecture,
-        "width": size.width,
-        "layers": size.num_layers,
-        "heads": size.num_heads,
-        "parameters": {
-            part: {"trainable": count.trainable, "frozen": count.frozen}
-            for part, count in {**size.parts, "total": size.parameters}.items()
-        },
-    }
 
 
 def _print_table(sizes: dict[str, "PolicySize"]) -> None:
@@ -252,27 +206,17 @@ def _print_table(sizes: dict[str, "PolicySize"]) -> None:
     from rich.table import Table
 
     table = Table(title="parameters in millions", box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
-    rows = [_cells(name, size) for name, size in sizes.items()]
-    for number, name in enumerate(rows[0]):
+    first, *_ = sizes.values()
+    for number, name in enumerate(
+        ("preset", "width", "layers", "heads", *first.parts, "total", "trained", "frozen")
+    ):
         table.add_column(name, justify="right" if number else "left", no_wrap=True)
-    for row in rows:
-        table.add_row(*row.values())
+    for name, size in sizes.items():
+        counts = [count.total for count in (*size.parts.values(), size.parameters)]
+        millions = map(_millions, (*counts, size.parameters.trainable, size.parameters.frozen))
+        table.add_row(name, str(size.width), str(size.num_layers), str(size.num_heads), *millions)
     print_table(table)
     print(*_NOTES, sep="\n")
-
-
-def _cells(name: str, size: "PolicySize") -> dict[str, str]:
-    total = size.parameters
-    return {
-        "preset": name,
-        "width": str(size.width),
-        "layers": str(size.num_layers),
-        "heads": str(size.num_heads),
-        **{part: _millions(count.total) for part, count in size.parts.items()},
-        "total": _millions(total.total),
-        "trained": _millions(total.trainable),
-        "frozen": _millions(total.frozen),
-    }
 
 
 def _millions(count: int) -> str:

@@ -1,6 +1,5 @@
 """`openvima quickstart`: the whole way from nothing to a scored policy, in one command."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -52,7 +51,7 @@ def main(
     data = _generate(out / "demonstrations", demonstrations, seed, workers)
     run = _train(data, out / "trained", seed)
     _evaluate(run, out, episodes, seed, workers)
-    _summary(out)
+    print(f"Report: {out / 'report.html'}")
     return 0
 
 
@@ -74,7 +73,7 @@ def _first_look(path: Path, seed: int) -> None:
 
     env = TabletopEnv("visual_manipulation", level="train")
     save_episode_image(env, path, seed=seed)
-    _say(f"First look: the oracle solves an episode, see {path}")
+    print(f"First look: the oracle solves an episode, see {path}", file=sys.stderr)
 
 
 def _generate(folder: Path, demonstrations: int, seed: int, workers: int) -> Path:
@@ -96,7 +95,8 @@ def _train(data: Path, run: Path, seed: int) -> Path:
 
 
 def _evaluate(run: Path, out: Path, episodes: int, seed: int, workers: int) -> None:
-    from openvima.evaluation import EvaluationConfig
+    from openvima.cli.evaluate import print_results
+    from openvima.evaluation import EvaluationConfig, Results
     from openvima.report import evaluate_and_report
 
     config = EvaluationConfig(
@@ -109,22 +109,5 @@ def _evaluate(run: Path, out: Path, episodes: int, seed: int, workers: int) -> N
         out=out,
     )
     with progress_bar("3/3 evaluation") as report:
-        evaluate_and_report(config, progress=report)
-
-
-def _summary(out: Path) -> None:
-    rows = json.loads((out / "results.json").read_text(encoding="utf-8"))["rows"]
-    policies = list(dict.fromkeys(row["policy"] for row in rows))
-    width = max(map(len, policies))
-    for policy in policies:
-        shares = []
-        for level in LEVELS:
-            of_level = [r for r in rows if r["policy"] == policy and r["level"] == level]
-            mean = sum(r["successes"] / r["episodes"] for r in of_level) / len(of_level)
-            shares.append(f"{level} {100 * mean:5.1f} %")
-        print(f"{policy:<{width}}   {'   '.join(shares)}")
-    print(f"Report: {out / 'report.html'}")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+        path = evaluate_and_report(config, progress=report)
+    print_results(Results.read(path))

@@ -3,18 +3,13 @@
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from openvima.cli.terminal import parse_list
-
-if TYPE_CHECKING:
-    from openvima.evaluation.comparison import Comparison, Merged
-    from openvima.evaluation.results import Results
-    from openvima.report.text import Confirmation
-    from openvima.video.encoder import Clip
 
 
 def main(
@@ -53,10 +48,14 @@ def main(
     from openvima.evaluation.comparison import compare_pairs, default_pairs, merge
     from openvima.evaluation.results import Results
     from openvima.evaluation.verification import is_marked_verified
+    from openvima.report import write_report
     from openvima.report.curves import run_labels
+    from openvima.report.page import default_command
     from openvima.report.table import latex, markdown
     from openvima.report.tables import compact_tables, paper_tables
     from openvima.report.text import Confirmation, finding
+    from openvima.report.videos import REPORT_NAME, require_extra
+    from openvima.video.encoder import load_clips
 
     _check(results, out)
     evaluations = {path: Results.read(path) for path in dict.fromkeys(results)}
@@ -66,10 +65,11 @@ def main(
     comparisons = compare_pairs(merged.results, pairs)
     confirmations = [
         # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
-        Confirmation.of(found, label if len(labels) > 1 else "DIR", confirmed=is_marked_verified(path))
-        for label, (path, found) in zip(labels, evaluations.items(), strict=True)
+        Confirmation(label if len(labels) > 1 else "DIR", is_marked_verified(path))
+        for label, path in zip(labels, evaluations, strict=True)
     ]
-    if out is not None and (write := {".md": markdown, ".tex": latex}.get(out.suffix.lower())):
+    write = None if out is None else {".md": markdown, ".tex": latex}.get(out.suffix.lower())
+    if out is not None and write is not None:
         confirmed = all(each.confirmed for each in confirmations)
         written = (
             paper_tables(merged.results, comparisons, published=published, confirmed=confirmed)
@@ -86,17 +86,28 @@ def main(
         for comparison in comparisons:
             for difference in comparison.means:
                 print(finding(comparison, difference), file=said)
-    if out is not None or not as_json:
-        path = _page(
-            evaluations,
-            merged,
-            comparisons,
-            out or _default_out(evaluations),
-            runs,
-            published=published,
-            confirmations=confirmations,
-        )
-        print(f"Report: {path}", file=said)
+    if out is None and as_json:
+        return 0
+    require_extra()
+    clips = [
+        replace(clip, policy=names.get(clip.policy, clip.policy))  # as in the common report
+        for path, names in zip(evaluations, merged.names.values(), strict=True)
+        for clip in load_clips(_folder(path))
+    ]
+    # Several have no place in common, and each may have a report of its own.
+    beside = Path() if len(evaluations) > 1 else _folder(results[0])
+    path = write_report(
+        merged.results,
+        out or beside / REPORT_NAME,
+        command="\n".join(default_command(found) for found in evaluations.values()),
+        runs=runs,
+        clips=clips,
+        comparisons=comparisons,
+        notes=merged.notes,
+        with_published=published,
+        confirmations=confirmations,
+    )
+    print(f"Report: {path}", file=said)
     return 0
 
 
@@ -120,54 +131,6 @@ def _pairs(names: str) -> list[tuple[str, str]]:
     if not others:
         raise ConfigError(f"--compare is {names!r}; give two or more policies with commas in between.")
     return [(first, other) for other in others]
-
-
-def _page(
-    evaluations: dict[Path, "Results"],
-    merged: "Merged",
-    comparisons: "Sequence[Comparison]",
-    out: Path,
-    records: Sequence[Path],
-    *,
-    published: bool,
-    confirmations: "Sequence[Confirmation]",
-) -> Path:
-    from openvima.report import write_report
-    from openvima.report.page import default_command
-    from openvima.report.videos import require_extra
-
-    require_extra()
-    return write_report(
-        merged.results,
-        out,
-        command="\n".join(default_command(found) for found in evaluations.values()),
-        runs=records,
-        clips=_clips(evaluations, merged),
-        comparisons=comparisons,
-        notes=merged.notes,
-        with_published=published,
-        confirmations=confirmations,
-    )
-
-
-def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]:
-    """Videos of all evaluations, under the names that policies have in the common report."""
-    from dataclasses import replace
-
-    from openvima.video.encoder import load_clips
-
-    return [
-        replace(clip, policy=names.get(clip.policy, clip.policy))
-        for path, names in zip(evaluations, merged.names.values(), strict=True)
-        for clip in load_clips(_folder(path))
-    ]
-
-
-def _default_out(evaluations: dict[Path, "Results"]) -> Path:
-    """Beside the results; several have no place in common, and each may have a report of its own."""
-    from openvima.report.videos import REPORT_NAME
-
-    return _folder(next(iter(evaluations))) / REPORT_NAME if len(evaluations) == 1 else Path(REPORT_NAME)
 
 
 def _folder(path: Path) -> Path:

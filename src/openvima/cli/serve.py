@@ -14,7 +14,6 @@ def main(
     *,
     port: int = 8000,
     host: str = "127.0.0.1",
-    token: str | None = None,
     name: str | None = None,
     device: str = "cpu",
     threads: int = 1,
@@ -37,9 +36,8 @@ def main(
             that makes a policy of your own, a published file, OWNER/NAME[@REVISION] on the Hub,
             random, untrained or untrained:PRESET (random weights).
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
-        host: Interface to listen on. Any but the loopback interface needs a token.
-        token: Word that clients must know; by default that of the environment variable OPENVIMA_SERVE_TOKEN,
-            which, unlike an option, other users of this machine do not see. Clients read it from there, too.
+        host: Interface to listen on. Any but the loopback interface needs a token, a word that clients must
+            know: that of the environment variable OPENVIMA_SERVE_TOKEN. Clients read it from there, too.
         name: Name in the metadata; by default that of the folder or file.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         threads: Threads that a network computes with on the cpu. More than one are faster for large networks,
@@ -67,7 +65,7 @@ def main(
     settings = ServerConfig(
         host=host,
         port=port,
-        token=token or os.environ.get(TOKEN_VARIABLE) or None,
+        token=os.environ.get(TOKEN_VARIABLE) or None,
         max_message_bytes=max_message_mb * 2**20,
         max_episodes=max_episodes,
         max_connections=max_connections,

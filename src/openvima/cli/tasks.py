@@ -1,6 +1,5 @@
 """`openvima tasks`: list the tasks."""
 
-import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 def main(
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None,
     *,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     level: str | None = None,
 ) -> int:
     """List the tasks: prompt, tool, levels, steps and success rate of the oracle; or describe one.
@@ -26,7 +24,6 @@ def main(
 
     Args:
         name: Task to describe, with its options for --task-options.
-        as_json: Print JSON instead of a table.
         level: List the tasks of this level only: train, L1 to L8.
 
     Returns:
@@ -36,11 +33,8 @@ def main(
     from openvima.tasks.registry import tasks_of
 
     if name is not None:
-        return _describe(task_spec(name), as_json=as_json)
+        return _describe(task_spec(name))
     specs = [task_spec(name) for name in tasks_of(level)]
-    if as_json:
-        print(json.dumps([_record(spec) for spec in specs], indent=1, ensure_ascii=False))
-        return 0
     from rich.table import Column, Table
     from rich.text import Text
 
@@ -59,39 +53,28 @@ def main(
         )
     print_table(table)
     print("steps: the oracle's limit, and what a policy may add to it")
-    print("oracle: success rate in %, over all levels (--json: each)")
+    print("oracle: success rate in %, over all levels")
     print("`openvima tasks TASK` lists the options of a task")
     return 0
 
 
-def _describe(spec: "TaskSpec", *, as_json: bool) -> int:
+def _describe(spec: "TaskSpec") -> int:
     """Print one task with its options."""
     from rich.table import Table
 
-    if as_json:
-        print(json.dumps(_record(spec), indent=1, ensure_ascii=False))
-        return 0
-    options = _options(spec)
+    descriptions = option_descriptions(spec)
     table = Table("option", "default", "description", title=f"options of {spec.name}")
-    for name, option in options.items():
-        table.add_row(name, _shown(option["default"]), str(option["description"]))
+    for name, default in spec.options.items():
+        table.add_row(name, _shown(default), descriptions[name])
     families = ", ".join(spec.families).replace("_", " ")
     for line in (f"{spec.name}: {spec.summary}", f"Prompt: {spec.template}"):
         print(line)
     print(f"Levels: {', '.join(spec.levels)}. At most {spec.max_steps} steps. Family: {families}.")
-    if options:
+    if descriptions:
         print_table(table)
-    if "difficulty" in options:
+    if "difficulty" in descriptions:
         print(f"Example: openvima demo {spec.name} --task-options difficulty=hard")
     return 0
-
-
-def _options(spec: "TaskSpec") -> dict[str, dict[str, object]]:
-    descriptions = option_descriptions(spec)
-    return {
-        name: {"default": default, "description": descriptions[name]}
-        for name, default in spec.options.items()
-    }
 
 
 def _shown(default: object) -> str:
@@ -101,21 +84,6 @@ def _shown(default: object) -> str:
     if isinstance(default, tuple | list):
         return "+".join(map(str, default))
     return "" if default is None else str(default)
-
-
-def _record(spec: "TaskSpec") -> dict[str, object]:
-    return {
-        "name": spec.name,
-        "families": list(spec.families),
-        "summary": spec.summary,
-        "prompt": spec.template,
-        "end_effector": spec.end_effector,
-        "levels": list(spec.levels),
-        "oracle_max_steps": spec.oracle_max_steps,
-        "max_steps": spec.max_steps,
-        "oracle": oracle_record(spec.name),
-        "options": _options(spec),
-    }
 
 
 def _percent(record: Mapping[str, Mapping[str, int]]) -> str:

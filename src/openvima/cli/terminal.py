@@ -77,11 +77,9 @@ def progress_bar(label: str) -> Iterator[Report]:
     )
     from rich.table import Column
 
-    is_wide = console.width >= 80
-    first = 18 if is_wide else None
     columns = (
-        TextColumn("{task.description}", table_column=Column(no_wrap=True, min_width=first)),
-        *([BarColumn(bar_width=16)] if is_wide else []),
+        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+        BarColumn(bar_width=16),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
         TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TimeRemainingColumn(compact=True, table_column=Column(no_wrap=True)),
@@ -90,20 +88,14 @@ def progress_bar(label: str) -> Iterator[Report]:
     )
     progress = Progress(*columns, console=console, refresh_per_second=4, expand=True)
     task = progress.add_task(label, total=None, note="")
-    has_begun = False
 
     def report(done: int, total: int, note: str) -> None:
-        nonlocal has_begun
-        has_begun = True
+        progress.start()  # not before: what ends in an error at once shows no bar
         progress.update(task, completed=done, total=total, note=note)
 
-    progress.start()
     try:
         yield report
     finally:
-        if not has_begun:  # what follows, mostly an error, says it all
-            progress.update(task, visible=False)
-            progress.live.transient = True
         progress.stop()
 
 
@@ -117,41 +109,22 @@ def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> R
     Returns:
         A callback `report(done, total, note)`.
     """
-    stage, stages_ended, shown_s, start = None, set[str](), 0.0, (0.0, 0)
+    stage, stages_ended, shown_s = None, set[str](), 0.0
 
     def report(done: int, total: int, note: str) -> None:
-        nonlocal stage, shown_s, start
+        nonlocal stage, shown_s
         now_s, before = clock(), stage
         word = note.partition(" ")[0].rstrip(":,")
         stage = word if any(map(str.isalpha, word)) else ""
-        if stage != before:
-            start = now_s, done
         is_end = done == total and stage not in stages_ended
         if stage != before or is_end or now_s - shown_s >= LINE_S:
             shown_s = now_s
             if done == total:
                 stages_ended.add(stage)
-            pace = _pace(done - start[1], now_s - start[0], total - done)
-            share = f" ({100 * done // total} %)" if total else ""
-            text = f"{label}: {done:,} of {total:,}{share}{pace}{f'; {note}' if note else ''}"
+            text = f"{label}: {done:,} of {total:,}{f'; {note}' if note else ''}"
             print(text, file=sys.stderr, flush=True)
 
     return report
-
-
-def _pace(done: int, seconds: float, left: int) -> str:
-    """Say how fast it is since the stage began, and how long it still takes; empty at the beginning."""
-    if not (done > 0 and seconds > 0):
-        return ""
-    rate = done / seconds
-    speed = f"{rate:.1f}/s" if rate >= 1 else f"{60 * rate:.1f}/min"
-    return f", {speed}" + (f", {_duration(left / rate)} left" if left else "")
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}"
 
 
 if TYPE_CHECKING:

@@ -170,13 +170,11 @@ class Rate:
         least: Smallest rate.
         most: Largest rate.
         example: A rate, for errors; an integer where rates are whole numbers.
-        is_open: Whether the smallest rate itself is excluded.
     """
 
     least: float
     most: float
     example: float
-    is_open: bool = False
 
     def parse(self, text: str) -> float | None:
         """Return the number, or None where the text is no rate."""
@@ -184,12 +182,11 @@ class Rate:
             rate = type(self.example)(text)
         except ValueError:
             return None
-        return rate if self.least <= rate <= self.most and not (self.is_open and rate == self.least) else None
+        return rate if self.least <= rate <= self.most else None
 
     def __str__(self) -> str:
         kind = "an integer" if isinstance(self.example, int) else "a number"
-        start = "above" if self.is_open else "from"
-        return f"{kind} {start} {self.least} to {self.most}"
+        return f"{kind} from {self.least} to {self.most}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +235,7 @@ def _in_words(rewrite: Callable[[str, float, np.random.Generator], str]) -> Chan
     return change
 
 
-_PROBABILITY = Rate(0, 1, 0.2, is_open=True)
+_PROBABILITY = Rate(0, 1, 0.2)
 
 # Those that one name joins are applied in this order.
 INPUT_ABLATIONS = {
@@ -356,8 +353,6 @@ INPUT_ABLATIONS = {
 }
 ABLATIONS = ("no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects", DETECTED_BOXES)
 """What "all" stands for; detected boxes only where a detector is given."""
-EXAMPLE_PROMPTS = (IN_CONTEXT, ORACLE_DEMONSTRATION)
-"""Replace the task's description by an example; not part of "all", as they add information."""
 MORE_ABLATIONS = ("all", RANDOM, ORACLE)
 """Names that evaluations take beside those of ablations."""
 

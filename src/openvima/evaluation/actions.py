@@ -10,7 +10,7 @@ import pyarrow as pa
 from openvima.atomic_io import atomic_write
 from openvima.data.shard import DAMAGE_ERRORS
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, PolicyError
+from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, PolicyError, one_line
 from openvima.evaluation.results import Row
 from openvima.evaluation.rollout_policies import Decision, Explainer, Observation, RolloutPolicy
 from openvima.input_files import open_regular
@@ -148,7 +148,7 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
     except DatasetError:
         raise
     except (StopIteration, *DAMAGE_ERRORS) as error:
-        raise DatasetError(f"{path} is damaged ({(str(error).splitlines() or [repr(error)])[0]}).") from None
+        raise DatasetError(f"{path} is damaged ({one_line(error)}).") from None
     numbers = numbers.reshape(-1, width)
     counts = [outcome.steps for row in rows for outcome in row.outcomes]
     if len(numbers) != sum(counts) or min(counts, default=0) < 0:

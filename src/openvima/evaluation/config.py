@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from openvima.catalog.packs import ASSET_PACKS, load_assets
+from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, brief_repr, unknown_name
@@ -31,7 +31,7 @@ from openvima.evaluation.ablations import (
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import PolicySource, policy_sources
-from openvima.input_files import as_path, settle
+from openvima.input_files import settle
 from openvima.multiprocess import engine_problems
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene.action import steps_per_primitive
@@ -39,7 +39,7 @@ from openvima.serving.chat import DEFAULT_VLM, VlmConfig
 from openvima.serving.lerobot import lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
 from openvima.tasks.sampling import MAX_SEED, check_task_options, check_text_form, takes_prompts
-from openvima.user_code import is_code, with_absolute_path
+from openvima.user_code import is_code
 
 REFERENCE_POLICIES = (RANDOM, ORACLE)  # lower and upper bound
 DEFAULT_EPISODES = 200  # as in the published tables
@@ -301,22 +301,6 @@ class Batch:
         del settings["vlm"]  # the fingerprint stands for it
         content = json.dumps([settings, fingerprint], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:24]
-
-    def with_whole_paths(self) -> "Batch":
-        """Return the batch for a process with another working directory."""
-        source, assets, boxes = self.source, self.env_config.assets, self.boxes
-        kind = PolicyRef.parse(source).kind
-        if kind == "code":
-            source = with_absolute_path(source)
-        elif kind == "path":
-            source = str(Path(source).absolute())
-        if is_code(assets):
-            assets = with_absolute_path(assets)
-        elif assets not in ASSET_PACKS:
-            assets = str(as_path(assets).absolute())
-        name, is_trained, folder = boxes.partition("=")
-        boxes = f"{name}={as_path(folder).absolute()}" if is_trained else with_absolute_path(boxes)
-        return replace(self, source=source, env_config=replace(self.env_config, assets=assets), boxes=boxes)
 
 
 def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.errors import DatasetError, OpenVimaError, PolicyError, brief_repr, echo, unknown_name
+from openvima.errors import DatasetError, OpenVimaError, PolicyError, brief_repr, echo
 from openvima.evaluation.ablations import DETECTED_BOXES, ablated_environment
 from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
@@ -115,22 +115,14 @@ def evaluated_episode(
         trust_code: Run the code that a run folder names.
 
     Raises:
-        DatasetError: There are no such results, or no such episode in them.
+        DatasetError: There are no such results.
         AssetError: The results name a function as their assets; pass it as `assets`.
     """
     folder = Path(folder)
     results = Results.read(folder)
     row = results.row(policy, task, level, ablation)
-    if row is None:
-        cells = [
-            f"{r.policy}, {r.task}, {r.level}{f', {r.ablation}' if r.ablation else ''}" for r in results.rows
-        ]
-        asked = f"{policy}, {task}, {level}{f', {ablation}' if ablation else ''}"
-        raise DatasetError(unknown_name(f"row in {folder} of", asked, cells))
-    numbers = [outcome.seed for outcome in row.outcomes]
-    if seed not in numbers:
-        raise DatasetError(f"{folder} has no seed {seed} there; it has {numbers[0]} to {numbers[-1]}.")
-    place, config = numbers.index(seed), results.config
+    assert row is not None  # chosen among those that there are, as the seed
+    place, config = [outcome.seed for outcome in row.outcomes].index(seed), results.config
     if config.get("control", PRIMITIVES) != PRIMITIVES:
         raise DatasetError(f"{folder} has control {echo(str(config['control']))}; only primitives are shown.")
     batch = Batch(

@@ -21,7 +21,7 @@ from openvima.scene.explanation import Explanation
 from openvima.sim.primitive_state import FRAMES_PER_SECOND
 from openvima.video.encoder import Animation, png
 from openvima.video.prompt_strip import MUTED, PAPER, draw_prompt_strip, font
-from openvima.video.recorder import ENLARGE, EpisodeRecorder, SceneRenderer
+from openvima.video.recorder import EpisodeRecorder, SceneRenderer
 
 _GAP = 12  # pixels between the parts
 
@@ -34,7 +34,6 @@ def record_episode(
     *,
     title: str = "",
     with_prompt: bool = True,
-    enlarge: int = ENLARGE,
     explain: bool = False,
     may_fail: bool = False,
 ) -> EpisodeOutcome:
@@ -47,8 +46,7 @@ def record_episode(
         path: The MP4 file to write.
         title: Caption below the scene; no caption if empty.
         with_prompt: Whether to draw the prompt above the scene.
-        enlarge: Factor on the benchmark's images.
-        explain: Whether to draw what the policy considered beside the scene, at the default size.
+        explain: Whether to draw what the policy considered beside the scene.
         may_fail: As for `openvima.evaluation.rollout.play`.
 
     Returns:
@@ -59,9 +57,7 @@ def record_episode(
     """
     explainer = _explainer(policy) if explain else None
     begin_episode(env, start)
-    with EpisodeRecorder(
-        env, path, title=title, with_prompt=with_prompt, enlarge=enlarge, explain=explainer
-    ) as recorder:
+    with EpisodeRecorder(env, path, title=title, with_prompt=with_prompt, explain=explainer) as recorder:
         (outcome,) = play([env], [start], policy, after_step=recorder.record_step, may_fail=may_fail)
         recorder.record_outcome(outcome.success if env.episode.problem.goals else None, outcome.steps)
     return outcome

@@ -139,30 +139,6 @@ class LevelMean:
 
 
 @dataclass(frozen=True, slots=True)
-class EarlyEnds:
-    """Episodes of one policy that one kind of failure ended, under any ablation.
-
-    Args:
-        policy: Name of the policy.
-        count: Number of such episodes.
-        episodes: Number of all its episodes.
-        first: Task, level and seed of the first one, and what was wrong.
-        cause: What ended them, for messages.
-    """
-
-    policy: str
-    count: int
-    episodes: int
-    first: str
-    cause: str
-
-    def __str__(self) -> str:
-        return (
-            f"{self.count} of {self.episodes} episodes of {self.policy} ended by {self.cause}; {self.first}"
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class Results:
     """A finished evaluation.
 
@@ -231,13 +207,13 @@ class Results:
         """The same means by policy, ablation and level; the ablation is empty for the plain score."""
         return {(mean.policy, mean.ablation, mean.level): mean for mean in self.level_means()}
 
-    def invalid_actions(self) -> list[EarlyEnds]:
-        """Count invalid actions by policy, for the policies that have any."""
-        return self._ended_by(BAD_ACTION, "an invalid action")
+    def invalid_actions(self) -> list[dict[str, Any]]:
+        """Count invalid actions by policy, for the policies that have any, as JSON values."""
+        return self._ended_by(BAD_ACTION, "invalid")
 
-    def policy_errors(self) -> list[EarlyEnds]:
-        """Count exceptions of policies in `reset` and `act`, for the policies that have any."""
-        return self._ended_by(POLICY_ERROR, "an error of the policy")
+    def policy_errors(self) -> list[dict[str, Any]]:
+        """Count exceptions of policies in `reset` and `act` by policy, as JSON values."""
+        return self._ended_by(POLICY_ERROR, "raised")
 
     def unneeded_prompts(self) -> str:
         """Say which tasks a policy mostly solves without a prompt; empty if there is none."""
@@ -248,7 +224,7 @@ class Results:
         ]
         return f"prompts are hardly needed: without one {', '.join(solved)}." if solved else ""
 
-    def _ended_by(self, kind: str, cause: str) -> list[EarlyEnds]:
+    def _ended_by(self, kind: str, count: str) -> list[dict[str, Any]]:
         found = []
         for policy in self.policy_names():
             rows = [row for row in self.rows if row.policy == policy]
@@ -257,24 +233,17 @@ class Results:
                 row, outcome = ended[0]
                 first = f"first in {row.task}, {row.level}, seed {outcome.seed}: {outcome.reason}"
                 episodes = sum(row.episodes for row in rows)
-                found.append(EarlyEnds(policy, len(ended), episodes, first, cause))
+                found.append({"policy": policy, count: len(ended), "episodes": episodes, "first": first})
         return found
 
     def to_json(self) -> str:
         """Return the text of `results.json`; equal results give equal bytes."""
-        early = {
-            "invalid_actions": ("invalid", self.invalid_actions()),
-            "policy_errors": ("raised", self.policy_errors()),
-        }
+        early = {"invalid_actions": self.invalid_actions(), "policy_errors": self.policy_errors()}
         content = {
             "schema": SCHEMA,
             "rows": [_row_record(row) for row in self.rows],
             "levels": [_level_record(mean) for mean in self.level_means()],
-            **{
-                key: [_early_ends_record(each, count) for each in found]
-                for key, (count, found) in early.items()
-                if found
-            },
+            **{key: found for key, found in early.items() if found},
             "policies": self.policies,
             "config": self.config,
             "versions": self.versions,
@@ -394,15 +363,6 @@ def _row_from_record(record: Mapping[str, Any]) -> Row:
     outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
     names = (record["policy"], record["task"], record["level"])
     return Row(*names, record["oracle_max_steps"], outcomes, record.get("ablation", ""))
-
-
-def _early_ends_record(found: EarlyEnds, count: str) -> dict[str, object]:
-    return {
-        "policy": found.policy,
-        count: found.count,
-        "episodes": found.episodes,
-        "first": found.first,
-    }
 
 
 def _level_record(mean: LevelMean) -> dict[str, object]:

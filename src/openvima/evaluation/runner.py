@@ -309,11 +309,7 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Ro
         jobs = [job for job in jobs if job not in chats]
         if not jobs:
             return
-    whole = config.engine == "ray"  # its workers have other working directories
-    sent = {replace(job, batch=job.batch.with_whole_paths()) if whole else job: job for job in jobs}
-    found = imap_with_engine(config.engine, play_batch, list(sent), config.workers, address=config.address)
-    for job, played in found:
-        yield sent[job], played
+    yield from imap_with_engine(config.engine, play_batch, jobs, config.workers, address=config.address)
 
 
 def _play_chats(jobs: Sequence[Job], num_threads: int) -> Iterator[tuple[Job, Rollouts]]:

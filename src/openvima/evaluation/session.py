@@ -3,14 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from openvima.catalog import Assets
-from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.env.episode_file import load_episode
 from openvima.env.tabletop import TabletopEnv, VideoFrame
 from openvima.errors import (
@@ -347,8 +345,6 @@ def play(
     device: str = DEFAULT_DEVICE,
     boxes: str = "",
     trust_code: bool = False,
-    title: str | None = None,
-    explain: bool = False,
 ) -> PlayResult:
     """Play one episode, composed or sampled.
 
@@ -363,8 +359,6 @@ def play(
         device: Where a network computes: "cpu", in float64, or "cuda", in float32.
         boxes: Detector instead of the true boxes, as for `openvima demo --boxes`; only with a name.
         trust_code: Run the code that a run folder names.
-        title: Caption of the video; by default task and policy.
-        explain: Draw what the policy considered beside the video.
 
     Returns:
         Actions, outcome and final scene.
@@ -389,22 +383,15 @@ def play(
     if video is not None and video.suffix.lower() != ".mp4":
         raise ConfigError(f"video is {str(video)!r}; videos are MP4 files; give a name that ends in .mp4.")
     rollout_policy = _load(policy, episode, device=device, boxes=boxes, trust_code=trust_code)
-    if explain:
-        rollout_policy.explainer()  # raises now
     session = EpisodeSession(
-        episode, rollout_policy, assets=assets, compat=compat, record=video is not None, explain=explain
+        episode, rollout_policy, assets=assets, compat=compat, record=video is not None, explain=False
     )
     if video is None:
         outcome = _run(session)
     else:
         name = policy if isinstance(policy, str) else type(policy).__name__
-        caption = f"{episode.task} · {Path(name).name}" if title is None else title
-        with EpisodeRecorder(
-            session.env,
-            video,
-            title=caption,
-            explain=partial(_explanation, session) if explain else None,
-        ) as recorder:
+        title = f"{episode.task} · {Path(name).name}"
+        with EpisodeRecorder(session.env, video, title=title) as recorder:
             outcome = _run(session, recorder)
             recorder.record_outcome(outcome.success if episode.problem.goals else None, outcome.steps)
     scenes = [*(step.before for step in session.steps), session.scene] if frames else []
@@ -430,13 +417,6 @@ def _run(session: EpisodeSession, recorder: EpisodeRecorder | None = None) -> Ep
     return session.outcome
 
 
-def _explanation(session: EpisodeSession) -> Explanation:
-    explanation = session.steps[-1].proposal.explanation
-    if explanation is None:
-        raise PolicyError("explain() of the policy returned None for an episode that goes on.")
-    return explanation
-
-
 def _load(
     policy: str | Policy, episode: Episode, *, device: str, boxes: str, trust_code: bool
 ) -> RolloutPolicy:
@@ -444,16 +424,6 @@ def _load(
     if not isinstance(policy, str):
         return PromptedRolloutPolicy(policy)
     PolicySource(policy, policy, trust_code).check()
-    batch = Batch(
-        policy,
-        policy,
-        episode.task,
-        episode.level,
-        first_seed=episode.seed,
-        episodes=1,
-        env_config=DEFAULT_ENV_CONFIG,
-        device=device,
-        boxes=boxes,
-        trust_code=trust_code,
-    )
+    where = (episode.task, episode.level, episode.seed, 1)
+    batch = Batch(policy, policy, *where, device=device, boxes=boxes, trust_code=trust_code)
     return load_rollout_policy(batch)

@@ -13,7 +13,7 @@ means of the seeds are independent and their variance holds both sources: var(me
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
+from statistics import NormalDist, fmean, stdev
 
 Interval = tuple[float, float]
 Counts = Sequence[tuple[int, int]]  # (successes, episodes) of each task
@@ -235,10 +235,8 @@ def mcnemar(only_a: int, only_b: int) -> tuple[float, float]:
     Source: Q. McNemar 1947; mid-p: Fagerland, Lydersen and Laake 2013.
     """
     tosses, fewer = only_a + only_b, min(only_a, only_b)
-    ways, tail = 1, 1  # to toss `index` heads, and at most that many; whole numbers, hence exact
-    for index in range(1, fewer + 1):
-        ways = ways * (tosses - index + 1) // index
-        tail += ways
+    ways = math.comb(tosses, fewer)  # to toss so many heads; whole numbers, hence exact
+    tail = sum(math.comb(tosses, heads) for heads in range(fewer + 1))
     everything = 2**tosses
     if only_a == only_b:
         return 1.0, 1 - ways / (2 * everything)
@@ -323,17 +321,11 @@ class SeedMean:
         mean: Unweighted mean over seeds and tasks.
         interval: 95 % interval that holds both the variation of seeds and the noise of episodes.
         seeds: Mean of each seed, and its interval from episodes alone.
-        sd: Standard deviation of the means of the seeds; None with one seed.
-        episode_sd: Standard deviation that the noise of episodes alone gives the mean of a seed.
-        training_sd: What remains: the standard deviation between trainings; None with one seed.
     """
 
     mean: float
     interval: Interval
     seeds: tuple[tuple[float, Interval], ...]
-    sd: float | None
-    episode_sd: float
-    training_sd: float | None
 
 
 def mean_over_seeds(counts: Sequence[Counts]) -> SeedMean:
@@ -346,19 +338,13 @@ def mean_over_seeds(counts: Sequence[Counts]) -> SeedMean:
     Args:
         counts: For each seed those of each task, tasks in the same order.
 
-    Source: variance components of a one-way random-effects model, S. R. Searle et al., "Variance Components",
-        1992; Student's interval, "Student", 1908. Seeds apart from test noise: X. Bouthillier et al.,
+    Source: Student's interval, "Student", 1908. Seeds apart from test noise: X. Bouthillier et al.,
         "Accounting for variance in machine learning benchmarks", 2021.
     """
     seeds = tuple(map(mean_of_rates, counts))
     pooled = [(sum(s for s, _ in task), sum(n for _, n in task)) for task in zip(*counts, strict=True)]
     mean, interval = mean_of_rates(pooled)
-    means = [seed for seed, _ in seeds]
-    episode_variance = sum(map(_episode_variance, counts)) / len(counts)
-    sd = _sd(means)
-    training_sd = None if sd is None else math.sqrt(max(0.0, sd * sd - episode_variance))
-    interval = _widen(interval, means, least=0.0)
-    return SeedMean(mean, interval, seeds, sd, math.sqrt(episode_variance), training_sd)
+    return SeedMean(mean, _widen(interval, [seed for seed, _ in seeds], least=0.0), seeds)
 
 
 def difference_over_seeds(pairs: Sequence[Sequence[PairCounts]]) -> tuple[float, Interval]:
@@ -413,22 +399,8 @@ def _within(angle: float, degrees: int) -> float:
 
 def _widen(interval: Interval, values: Sequence[float], *, least: float) -> Interval:
     """Widen an interval to Student's of the values of several seeds, between `least` and 1."""
-    sd = _sd(values)
-    if sd is None:
-        return interval
-    mean = sum(values) / len(values)
-    half = student_quantile(_CONFIDENCE, len(values) - 1) * sd / math.sqrt(len(values))
-    return max(least, min(interval[0], mean - half)), min(1.0, max(interval[1], mean + half))
-
-
-def _sd(values: Sequence[float]) -> float | None:
     if len(values) < 2:
-        return None
-    mean = sum(values) / len(values)
-    return math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
-
-
-def _episode_variance(counts: Counts) -> float:
-    """Unbiased variance of the mean of one seed over its tasks, from episodes alone."""
-    each = [s / n * (1 - s / n) / max(1, n - 1) for s, n in counts]
-    return sum(each) / len(each) ** 2
+        return interval
+    mean = fmean(values)
+    half = student_quantile(_CONFIDENCE, len(values) - 1) * stdev(values) / math.sqrt(len(values))
+    return max(least, min(interval[0], mean - half)), min(1.0, max(interval[1], mean + half))

@@ -10,7 +10,6 @@ from typing import Any
 
 import yaml
 
-from openvima import __version__
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, fingerprint
 from openvima.data.reader import Dataset
 from openvima.errors import (
@@ -59,7 +58,6 @@ def push_policy(
     results: str | Path | None = None,
     licence: str = "mit",
     private: bool = False,
-    message: str = "",
 ) -> HubName:
     """Push a checkpoint to the Hugging Face Hub in one commit, with its tokenizer and a model card.
 
@@ -71,7 +69,6 @@ def push_policy(
             pushed too.
         licence: Identifier of the licence of the weights.
         private: Whether a new repository is private.
-        message: Of the commit.
 
     Returns:
         The repository at the new commit, which `load_policy` takes as text.
@@ -84,7 +81,7 @@ def push_policy(
         MissingExtraError: torch or `huggingface_hub` is not installed.
     """
     target, files = repository(name), policy_files(source, name, results=results, licence=licence)
-    return commit(target, files, message=message or f"Push with openvima {__version__}", private=private)
+    return commit(target, files, private=private)
 
 
 def policy_files(
@@ -127,7 +124,6 @@ def policy_card(
         "library_name": "openvima",
         "pipeline_tag": "robotics",
         "tags": TAGS,
-        **({} if scores is None else {"model-index": [_model_index(target, scores)]}),
     }
     confirmed = file is not None and is_marked_verified(file)
     parts = [
@@ -168,24 +164,6 @@ def _of_weights(path: Path, sha256: str) -> Results:
         )
     rows = tuple(row for row in results.rows if row.policy == named[0])
     return replace(results, rows=rows, policies={named[0]: results.policies[named[0]]})
-
-
-def _model_index(name: HubName, scores: Results) -> dict[str, Any]:
-    """Level means as the Hub lists them."""
-    return {
-        "name": name.repo.partition("/")[2],
-        "results": [
-            {
-                "task": {"type": "robotics"},
-                "dataset": {"type": "vima-bench", "name": f"VIMA-Bench {mean.level}"},
-                "metrics": [
-                    {"type": "success_rate", "name": "success rate (%)", "value": round(100 * mean.mean, 1)}
-                ],
-            }
-            for mean in scores.level_means()
-            if not mean.ablation
-        ],
-    }
 
 
 def _network(folder: Path) -> str:
@@ -262,12 +240,7 @@ def _use_policy(name: HubName) -> str:
     return f"{fenced(shell, 'sh')}\n{fenced(python, 'python')}"
 
 
-_SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
-
-
-def push_demonstrations(
-    folder: str | Path, name: str, *, private: bool = False, message: str = ""
-) -> HubName:
+def push_demonstrations(folder: str | Path, name: str, *, private: bool = False) -> HubName:
     """Push a finished data set to the Hugging Face Hub in one commit, with a dataset card.
 
     Shards, index and manifest are pushed; object caches are not.
@@ -276,7 +249,6 @@ def push_demonstrations(
         folder: Folder of demonstrations.
         name: The repository, as OWNER/NAME or OWNER/NAME@BRANCH; it is created if there is none.
         private: Whether a new repository is private.
-        message: Of the commit.
 
     Returns:
         The repository at the new commit; `Dataset` takes it with "hf://" in front.
@@ -288,8 +260,7 @@ def push_demonstrations(
         MissingExtraError: `huggingface_hub` is not installed.
     """
     target, files = repository(name), demonstrations_files(folder, name)
-    note = message or f"Push with openvima {__version__}"
-    return commit(target, files, kind="dataset", message=note, private=private)
+    return commit(target, files, kind="dataset", private=private)
 
 
 def demonstrations_files(folder: str | Path, name: str) -> dict[str, Path | bytes]:
@@ -325,7 +296,6 @@ def demonstrations_card(dataset: Dataset, name: str) -> str:
         "license": [checked_licence(licence) for licence in manifest["licence"].split(" AND ")],
         "task_categories": ["robotics"],
         "tags": TAGS,
-        "size_categories": [next((s for n, s in _SIZES.items() if counts["episodes"] < n), "1M<n<10M")],
     }
     provenance = {
         "episodes": f"{counts['episodes']:,}",

@@ -247,7 +247,7 @@ def _themed(figure: Any, name: str, title: str, variables: Iterable[str]) -> str
     colours = {_series(variable): variable for variable in variables}
     for stand_in, variable in (colours | {_INK: "--ink", _MUTED: "--muted", _GRID: "--line"}).items():
         svg = svg.replace(stand_in, f"var({variable})")
-    view_box = re.search(r'viewBox="([^"]*)"', svg)
+    width, height = 72 * figure.get_size_inches()
     body = svg[svg.index("<defs>") :]
     for pattern, replacement in (
         (r"<style.*?</style>", ""),  # would apply to the whole page
@@ -258,8 +258,8 @@ def _themed(figure: Any, name: str, title: str, variables: Iterable[str]) -> str
         (r'(url\(|href=")#', rf"\1#{name}-"),
     ):
         body = re.sub(pattern, replacement, body, flags=re.DOTALL)
-    size = view_box.group(1) if view_box else ""
-    return f'<svg viewBox="{size}" role="img" aria-label="{html.escape(title)}">{body.rstrip()}'
+    head = f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{html.escape(title)}">'
+    return head + body.rstrip()
 
 
 # CSS variables of the style sheet.
@@ -289,8 +289,3 @@ def rate_figure_html(figure: RateFigure) -> str:
         ],
         table=rate_table(figure),
     )
-
-
-def table_html(table: Table) -> str:
-    """Write a table as HTML, for a page with the package's style sheet."""
-    return render_page("report/table", table=table)

@@ -181,11 +181,6 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def listed(names: list[str]) -> str:
-    """Join names as in a sentence."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 def headline(results: Results) -> str:
     """The finding in one line: what the trained policy, or else the first one, reaches on its first level."""
     played = results.level_means()
@@ -194,16 +189,6 @@ def headline(results: Results) -> str:
     first = (trained or means)[0]
     tasks = counted(len(first.tasks), "task")
     return f"{first.policy} solves {percent(first.mean)} of {first.level} episodes ({tasks})"
-
-
-def findings(results: Results) -> str:
-    """All level means as one sentence a policy."""
-    means = [mean for mean in results.level_means() if not mean.ablation]
-    sentences = []
-    for policy in results.policy_names():
-        rates = [f"{percent(mean.mean)} on {mean.level}" for mean in means if mean.policy == policy]
-        sentences.append(f"{policy}: {', '.join(rates)}")
-    return "; ".join(sentences) + "."
 
 
 def measured(results: Results) -> str:
@@ -246,34 +231,19 @@ class Confirmation:
     Args:
         folder: Name of its folder, for the command that confirms it.
         confirmed: Whether the folder holds the mark of `verify_results` for just these results.
-        replayable: Whether the actions were recorded.
     """
 
     folder: str
     confirmed: bool
-    replayable: bool = True
-
-    @staticmethod
-    def of(results: Results, folder: str, *, confirmed: bool) -> "Confirmation":
-        """Describe the confirmation of some results."""
-        return Confirmation(folder, confirmed, bool(results.actions_sha256))
 
     @property
     def text(self) -> str:
         """What is known, and how to check it, in two or three sentences."""
+        command = f"openvima verify-results {shlex.quote(self.folder)}"
         if self.confirmed:
             return (
                 "Confirmed by replay: with the recorded actions, every episode ends as stated. Declared, not "
                 f"proven: {DECLARED}. The mark is a file of the folder; if that came from elsewhere, it is a "
-                f"claim until {self.command} confirms it again."
+                f"claim until {command} confirms it again."
             )
-        if not self.replayable:
-            return "Not confirmed by replay: the actions were not recorded."
-        return (
-            f"Not confirmed by replay. {self.command} plays the recorded actions again, without the policy."
-        )
-
-    @property
-    def command(self) -> str:
-        """The command that confirms the evaluation."""
-        return f"openvima verify-results {shlex.quote(self.folder)}"
+        return f"Not confirmed by replay. {command} plays the recorded actions again, without the policy."

@@ -104,7 +104,7 @@ def evaluate_and_report(
                 runs=find_metrics(served.sources),
                 clips=_recorded(recording_jobs(served, videos, results), served, note),
                 confirmations=[
-                    Confirmation.of(results, "DIR", confirmed=is_marked_verified(config.out)),
+                    Confirmation("DIR", is_marked_verified(config.out)),
                 ],
             )
     return path

@@ -9,9 +9,10 @@ STUDY/evaluations/LABEL/seed-0             evaluations
 STUDY/study.json, report.html              results
 """
 
+import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -209,26 +210,23 @@ def _folder_name(label: str) -> str:
 
 
 def record_of(study: Study, inputs: StudyInputs, device: str | None) -> dict[str, Any]:
-    """Return what identifies the content of a study's folder, the number of seeds apart."""
-    return {
+    """Return what identifies the content of a study's folder, the number of seeds apart, as JSON values."""
+    record = {
         "study": study.name,
         "scale": inputs.scale.name,
         "assets": inputs.assets,
         "device": device,
         "recipe": inputs.scale.recipe,
-        "settings": _plain({**inputs.scale.settings, **study.settings}),
-        "data": _plain(study.data),
-        "evaluation": _plain(study.evaluation),
-        "runs": {run.label: _plain(run) for run in study.runs},
+        "settings": {**inputs.scale.settings, **study.settings},
+        "data": study.data,
+        "evaluation": study.evaluation,
+        "runs": {run.label: run for run in study.runs},
     }
+    return json.loads(json.dumps(record, default=_plain))
 
 
-def _plain(value: Any) -> Any:
-    """Return plain JSON values."""
-    if hasattr(value, "__dataclass_fields__"):
-        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
-    if isinstance(value, Mapping):
-        return {str(name): _plain(item) for name, item in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(item) for item in value]
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
+def _plain(value: Any) -> object:
+    """Return a value as those that JSON has, or as text."""
+    if is_dataclass(value):
+        return {each.name: getattr(value, each.name) for each in fields(value)}
+    return dict(value) if isinstance(value, Mapping) else str(value)

@@ -5,7 +5,7 @@ Orange stands for the pick, blue for the place. The prompt's shading is drawn by
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -69,17 +69,28 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
     whose = "the decoder's last layer" if explanation.bins else "pick (upper row) and place"
     legend = f"below the prompt: attention of {whose}"
     draw.text((12, HEIGHT - 16), legend, font=font(13), fill=MUTED, anchor="lm")
-    top = TOP.height * ENLARGE
-    if not explanation.bins:
-        names = {placement.id: f"{placement.object}, {placement.texture}" for placement in scene.placements}
-        picks = sorted(explanation.objects, key=lambda each: -each.probability)[:3]
-        rows = [(each.probability, names.get(each.object_id, "object")) for each in picks]
-        _draw_choices(draw, (12, top), "pick", rows)
-        rows = [(each.probability, _name_of(each, explanation.objects, names)) for each in places[:3]]
-        _draw_choices(draw, (WIDTH // 2 + 12, top), "place", rows)
-        if len(explanation.yaw_rad):
-            _draw_rotation(draw, explanation, top + 104)
+    for number, (text, colour) in enumerate(_choices(explanation, places, scene)):
+        at = (12, TOP.height * ENLARGE + 20 + 26 * number)
+        draw.text(at, text, font=font(15, bold=True), fill=colour, anchor="lm")
     return np.asarray(canvas)
+
+
+def _choices(
+    explanation: Explanation, places: Sequence[PlaceProbability], scene: Scene
+) -> Iterator[tuple[str, Colour]]:
+    """Say what is most probable, each in its colour."""
+    names = {placement.id: f"{placement.object}, {placement.texture}" for placement in scene.placements}
+    if explanation.objects:
+        best = max(explanation.objects, key=lambda each: each.probability)
+        yield f"pick {percent(best.probability)}: {names.get(best.object_id, 'object')}", PICK
+    if places:
+        name = _name_of(places[0], explanation.objects, names)
+        yield f"place {percent(places[0].probability)}: {name}", PLACE
+    if len(explanation.yaw_rad):
+        share, yaw_rad = max(zip(explanation.yaw_probabilities, explanation.yaw_rad, strict=True))
+        angle = round(math.degrees(yaw_rad))
+        direction = " clockwise" if angle < 0 else " counter-clockwise" if angle > 0 else ""
+        yield f"rotation {percent(share)}: {abs(angle)}°{direction}", PLACE
 
 
 def _draw_words(draw: ImageDraw.ImageDraw, explanation: Explanation) -> None:
@@ -229,30 +240,3 @@ def _name_of(place: PlaceProbability, objects: Sequence[ObjectProbability], name
         return "object in view"
     nearest = min(near, key=lambda each: math.dist((x / ENLARGE, y / ENLARGE), each.boxes["top"][:2]))
     return names.get(nearest.object_id, "object in view")
-
-
-def _draw_choices(
-    draw: ImageDraw.ImageDraw, corner: tuple[int, int], kind: str, rows: Sequence[tuple[float, str]]
-) -> None:
-    left, top = corner
-    draw.text((left, top + 14), kind, font=font(15, bold=True), fill=COLOURS[kind], anchor="lm")
-    for number, (probability, name) in enumerate(rows):
-        y = top + 34 + 19 * number
-        draw.rectangle((left + 48, y - 6, left + 48 + 40 * probability, y + 6), fill=COLOURS[kind])
-        draw.text((left + 42, y), percent(probability), font=font(13), fill=INK, anchor="rm")
-        draw.text((left + 94, y), _shortened(name, WIDTH // 2 - 112), font=font(13), fill=INK, anchor="lm")
-
-
-def _shortened(text: str, width: int) -> str:
-    while font(13).getlength(text) > width:
-        text = text.removesuffix("…")[:-1] + "…"
-    return text
-
-
-def _draw_rotation(draw: ImageDraw.ImageDraw, explanation: Explanation, top: int) -> None:
-    """Write the most probable rotation."""
-    best = int(explanation.yaw_probabilities.argmax())
-    angle, probability = round(math.degrees(explanation.yaw_rad[best])), explanation.yaw_probabilities[best]
-    direction = " clockwise" if angle < 0 else " counter-clockwise" if angle > 0 else ""
-    text = f"rotation {abs(angle)}°{direction}: {percent(probability)}"
-    draw.text((12, top), text, font=font(13, bold=True), fill=PLACE, anchor="lm")

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from openvima.env.tabletop import TabletopEnv, VideoFrame
+from openvima.render import channels_last
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene
 from openvima.scene.explanation import Explanation
@@ -50,7 +51,7 @@ class SceneRenderer:
         """
         arm = () if joints is None else arm_drawables(joints, scene.end_effector)
         images = self._rasteriser.scene(scene, views=("front",), extra=arm, enlarge=self._enlarge)
-        return np.ascontiguousarray(np.moveaxis(images["front"].rgb, 0, -1))
+        return np.ascontiguousarray(channels_last(images["front"].rgb))
 
 
 class EpisodeRecorder:
@@ -61,9 +62,8 @@ class EpisodeRecorder:
         path: The MP4 file to write.
         title: Caption below the scene; no caption if empty.
         with_prompt: Whether to draw the prompt above the scene.
-        enlarge: Factor on the benchmark's images.
-        explain: How the policy explains its last action; its explanation is drawn beside the scene, which is
-            then 768 pixels wide, and attention below the prompt. None leaves both out.
+        explain: How the policy explains its last action; its explanation is drawn beside the scene, and
+            attention below the prompt. None leaves both out.
     """
 
     def __init__(
@@ -73,11 +73,9 @@ class EpisodeRecorder:
         *,
         title: str = "",
         with_prompt: bool = True,
-        enlarge: int = ENLARGE,
         explain: Callable[[], Explanation] | None = None,
     ) -> None:
-        enlarge = enlarge if explain is None else ENLARGE
-        self._renderer, self._title, self._width = SceneRenderer(env, enlarge), title, 256 * enlarge
+        self._renderer, self._title, self._width = SceneRenderer(env), title, 256 * ENLARGE
         self._path, self._explain = path, explain
         self._panel: np.ndarray | None = None
         self._strip: np.ndarray | None = None

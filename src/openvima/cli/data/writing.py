@@ -344,7 +344,6 @@ def push_to_hub(
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OWNER/NAME")],
     *,
     private: bool = False,
-    message: str = "",
     dry_run: bool = False,
 ) -> int:
     """Push demonstrations to the Hugging Face Hub, with a generated dataset card.
@@ -357,7 +356,6 @@ def push_to_hub(
         folder: Folder of demonstrations.
         name: The repository, as OWNER/NAME or OWNER/NAME@BRANCH; it is created if there is none.
         private: Make a new repository private.
-        message: Of the commit.
         dry_run: Print the card and list the files; nothing is sent.
 
     Returns:
@@ -368,5 +366,5 @@ def push_to_hub(
     if dry_run:
         print_files(demonstrations_files(folder, name))
     else:
-        print(f"hf://{push_demonstrations(folder, name, private=private, message=message)}")
+        print(f"hf://{push_demonstrations(folder, name, private=private)}")
     return 0
