@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.core import config as numba_config
 
 
 def njit(kernel: Callable[..., Any]) -> Callable[..., Any]:
@@ -14,9 +15,10 @@ def njit(kernel: Callable[..., Any]) -> Callable[..., Any]:
     It is kept in NUMBA_CACHE_DIR, else beside the code, else in the user's cache folder. Where none of them
     can be written, and for users without a home, each process compiles anew.
     """
-    compiled, config = numba.njit(kernel), numba.config  # its names are made from the environment
+    compiled = numba.njit(kernel)
+    config: Any = numba_config  # a module that makes its names from the environment
     has_home = os.path.expanduser("~") != "~"  # else Numba would make a folder of that name
-    if not config.DISABLE_JIT and (config.CACHE_DIR or has_home):  # type: ignore[attr-defined]
+    if not config.DISABLE_JIT and (config.CACHE_DIR or has_home):
         with contextlib.suppress(RuntimeError):  # no folder can be written
             compiled.enable_caching()
     return compiled

@@ -222,17 +222,13 @@ def main(
         workers=workers,
         out=out,
         env_config=EnvConfig(**asdict(environment)),
-        batch=network.batch,
         force=force,
-        device=network.device,
-        precision=network.precision,
         ablations=_with_boxes(ablations, ablation.boxes),
         boxes=ablation.boxes,
         engine=jobs.engine,
         address=jobs.address,
-        trust_code=network.trust_code,
-        python=network.python,
         vlm=VlmConfig(chat.base_url, chat.view, vlm),
+        **asdict(network),
     )
     if chat.dry_run:
         from openvima.evaluation.chat import write_preview

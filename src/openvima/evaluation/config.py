@@ -224,10 +224,25 @@ class EvaluationConfig:
                 policies.append(f"{source.name}={where}")
             yield replace(self, policies=tuple(policies), python=None)
 
-    @property
-    def kept_vlm(self) -> VlmConfig:
-        """How vision-language models are asked, with the folder in which their answers are kept."""
-        return replace(self.vlm, answers=self.out / "answers")
+    def batch_of(
+        self, source: PolicySource, ablation: str, task: str, level: str, first_seed: int, episodes: int
+    ) -> "Batch":
+        """Return some episodes of a policy; answers of vision-language models are kept in `out`."""
+        return Batch(
+            policy=source.name,
+            source=source.source,
+            task=task,
+            level=level,
+            first_seed=first_seed,
+            episodes=episodes,
+            env_config=ablated_environment(ablation, self.env_config),
+            device=self.device,
+            ablation=ablation,
+            precision=self.precision or "",
+            boxes=(self.boxes or "") if DETECTED_BOXES in names_in(ablation) else "",
+            trust_code=self.trust_code,
+            vlm=replace(self.vlm, answers=self.out / "answers"),
+        )
 
     @property
     def asked_ablations(self) -> tuple[str, ...]:
@@ -370,20 +385,8 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             "that reads prompts, or leave the ablation out."
         )
     return [
-        Batch(
-            policy=source.name,
-            source=source.source,
-            task=task,
-            level=level,
-            first_seed=config.seed + offset,
-            episodes=min(config.batch, config.episodes - offset),
-            env_config=ablated_environment(ablation, config.env_config),
-            device=config.device,
-            ablation=ablation,
-            precision=config.precision or "",
-            boxes=(config.boxes or "") if DETECTED_BOXES in names_in(ablation) else "",
-            trust_code=config.trust_code,
-            vlm=config.kept_vlm,
+        config.batch_of(
+            source, ablation, task, level, config.seed + offset, min(config.batch, config.episodes - offset)
         )
         for source, ablation in played
         for task, level in cells(config, ablation)

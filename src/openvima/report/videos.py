@@ -10,7 +10,7 @@ from pathlib import Path
 
 from openvima.atomic_io import folder_lock
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.evaluation.config import Batch, EvaluationConfig, cells
+from openvima.evaluation.config import EvaluationConfig, cells
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
@@ -229,17 +229,5 @@ def find_metrics(sources: Sequence[PolicySource]) -> list[Path]:
 
 
 def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int) -> Job:
-    batch = Batch(
-        row.policy,
-        source.source,
-        row.task,
-        row.level,
-        seed,
-        1,
-        config.env_config,
-        device=config.device,
-        precision=config.precision or "",
-        trust_code=config.trust_code,
-        vlm=config.kept_vlm,
-    )
+    batch = config.batch_of(source, "", row.task, row.level, seed, 1)
     return Job(batch, str(results.policies.get(source.name)))
