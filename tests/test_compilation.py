@@ -3,8 +3,8 @@
 import importlib.util
 import os
 
-import numba
 import pytest
+from numba.core import config
 
 KERNEL = "from openvima.compilation import njit\n\n@njit\ndef double(value):\n    return 2 * value\n"
 
@@ -21,7 +21,7 @@ def test_compiled_functions_are_kept_where_a_folder_can_be_written(place, tmp_pa
         (code / "__pycache__").touch()  # a file, where even root cannot make a folder
     monkeypatch.setenv("HOME", str(tmp_path / "file"))
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "named") if place == "named" else "")
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "named") if place == "named" else "")
     spec = importlib.util.spec_from_file_location("kernel", code / "kernel.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
