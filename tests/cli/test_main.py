@@ -192,9 +192,9 @@ def test_without_a_terminal_progress_is_a_line_at_each_stage_and_each_minute(
         report(step, 400, f"{stage}: loss {step}")
     lines = capsys.readouterr().err.splitlines()
     assert [int(line.split()[1]) for line in lines] == [0, 60, 120, 150, 210, 270, 330, 390, 400]
-    assert lines[1] == "training: 60 of 400; pretraining: loss 60"
+    assert lines[1] == "training: 60 of 400, 0:05:40 left; pretraining: loss 60"
     assert lines[3] == "training: 150 of 400; cloning: loss 150"
-    assert lines[-1] == "training: 400 of 400; cloning: loss 400"
+    assert lines[-1] == "training: 400 of 400, 0:00:00 left; cloning: loss 400"
 
 
 def fail_with(error: Exception) -> Callable[[Sequence[str]], int]:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -109,19 +110,23 @@ def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> R
     Returns:
         A callback `report(done, total, note)`.
     """
-    stage, stages_ended, shown_s = None, set[str](), 0.0
+    stage, stages_ended, shown_s, start = None, set[str](), 0.0, (0.0, 0)
 
     def report(done: int, total: int, note: str) -> None:
-        nonlocal stage, shown_s
+        nonlocal stage, shown_s, start
         now_s, before = clock(), stage
         word = note.partition(" ")[0].rstrip(":,")
         stage = word if any(map(str.isalpha, word)) else ""
+        if stage != before:
+            start = now_s, done
         is_end = done == total and stage not in stages_ended
         if stage != before or is_end or now_s - shown_s >= LINE_S:
             shown_s = now_s
             if done == total:
                 stages_ended.add(stage)
-            text = f"{label}: {done:,} of {total:,}{f'; {note}' if note else ''}"
+            seconds, new = now_s - start[0], done - start[1]
+            left = f", {timedelta(seconds=round(seconds / new * (total - done)))} left" if new > 0 else ""
+            text = f"{label}: {done:,} of {total:,}{left}{f'; {note}' if note else ''}"
             print(text, file=sys.stderr, flush=True)
 
     return report
