@@ -11,11 +11,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from rich.table import Table
 
 from openvima import __version__
 from openvima.cli.main import VERBS, main
 from openvima.cli.options import name_options
-from openvima.cli.terminal import plain_lines
+from openvima.cli.terminal import plain_lines, print_table
 from openvima.cli.train import COMMON
 from openvima.data import Dataset, Shard
 from openvima.errors import ConfigError, DatasetError
@@ -153,6 +154,26 @@ def test_every_help_and_list_can_be_written_in_ascii(
     assert "?" not in text
     assert words[-1] != "--help" or f"openvima {words[0]}" in text
     assert words != ["tasks"] or max(map(len, text.splitlines())) <= 60
+
+
+def test_a_table_that_is_too_wide_becomes_a_paragraph_for_each_row(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = Table("level", "task", title="rates")
+    for policy in ("first", "second"):
+        table.add_column(policy, no_wrap=True)
+    table.add_row("L1", "rotate", "100.0 (51–100)", "0.0 (0–49)")
+    monkeypatch.setenv("COLUMNS", "30")
+    print_table(table, num_heads=2)
+    assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
+        "rates",
+        "L1 rotate",
+        "  first: 100.0 (51–100)",
+        "  second: 0.0 (0–49)",
+    ]
+    monkeypatch.setenv("COLUMNS", "60")
+    print_table(table, num_heads=2)
+    assert "│ L1    │ rotate │ 100.0 (51–100) │" in capsys.readouterr().out
 
 
 WORDS = ["generate", "--tasks", "rotate", "--episodes", "5"]

@@ -13,6 +13,7 @@ from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Prompt, Scene
 from openvima.tasks.novel_words import gray_image
 from openvima.training.augmentation.scenes import with_random_appearance
+from openvima.training.config import PretrainingConfig
 from openvima.training.pretraining import losses
 from openvima.training.pretraining.losses import find_matches, info_nce, retrieval_accuracy
 from openvima.training.pretraining.pairs import (
@@ -122,7 +123,11 @@ def containers_of(seed: int, prob: float = 1.0) -> list[str]:
         )
     )
     changed = with_random_appearance(
-        scene, prob, RandomAppearanceAssets(load_assets("procedural")), np.random.default_rng(seed)
+        scene,
+        prob,
+        RandomAppearanceAssets(load_assets("procedural")),
+        np.random.default_rng(seed),
+        PretrainingConfig(),
     )
     return [placement.object for placement in changed.placements]
 

@@ -114,7 +114,7 @@ def test_random_containers_are_gratings_as_often_as_asked():
 
 @pytest.fixture(scope="module")
 def pairs():
-    return rendered(12, augmentation=HARD)
+    return rendered(12, augmentation=HARD, second_view=True)
 
 
 def test_bars_have_the_colour_of_the_background_and_the_rest_stays(pairs):

@@ -322,7 +322,8 @@ def print_results(results: "Results") -> None:
     """Print success rates as a table, a row a task and level, a column a policy; then the ablations."""
     from openvima.report.tables import ablation_tables, result_table
 
-    for table in (result_table(results), *ablation_tables(results)):
+    print_table(rich_table(result_table(results)), num_heads=2)
+    for table in ablation_tables(results):
         print_table(rich_table(table))
 
 

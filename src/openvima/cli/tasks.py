@@ -35,11 +35,10 @@ def main(
     if name is not None:
         return _describe(task_spec(name))
     specs = [task_spec(name) for name in tasks_of(level)]
-    from rich.table import Column, Table
+    from rich.table import Table
     from rich.text import Text
 
-    names = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
-    columns = [Column(name, overflow="fold") for name in names]
+    columns = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
     table = Table(*columns, title=f"{len(specs)} tasks", show_lines=True)
     for spec in specs:
         table.add_row(

@@ -167,13 +167,35 @@ def print_left_out(tasks: Sequence[str], prompts: str, levels: Sequence[str]) ->
         print(f"Left out, since their prompts have no text form: {', '.join(left_out)}.", file=sys.stderr)
 
 
-def print_table(table: "Table") -> None:
-    """Print a table as wide as the terminal; a file or a pipe takes long lines."""
+def print_table(table: "Table", *, num_heads: int = 1) -> None:
+    """Print a table, or a short paragraph for each row where the terminal is too narrow for it.
+
+    A file or a pipe takes long lines.
+
+    Args:
+        table: The table; columns that must not be cut are `no_wrap`.
+        num_heads: Columns that name a row.
+    """
     from rich.console import Console
+    from rich.measure import Measurement
+    from rich.padding import Padding
+    from rich.text import Text
 
     console = Console(highlight=False)
-    is_wide = console.is_terminal or "COLUMNS" in os.environ
-    (console if is_wide else Console(width=PIPE_WIDTH)).print(table)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console = Console(width=PIPE_WIDTH)
+    if Measurement.get(console, console.options.update(max_width=10_000), table).minimum <= console.width:
+        console.print(table)
+        return
+    names = [str(column.header) for column in table.columns]
+    if table.title:
+        console.print(Text(str(table.title), style="bold"))
+    for cells in zip(*(column.cells for column in table.columns), strict=True):
+        texts = [cell.plain if isinstance(cell, Text) else str(cell) for cell in cells]
+        if any(texts):
+            console.print(Text(" ".join(texts[:num_heads]), style="bold"))
+            for name, text in zip(names[num_heads:], texts[num_heads:], strict=True):
+                console.print(Padding(Text(f"{name}: {text}"), (0, 0, 0, 2)))
 
 
 def print_files(files: Mapping[str, Path | bytes]) -> None:
