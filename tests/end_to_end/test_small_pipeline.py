@@ -139,7 +139,8 @@ def folder() -> Iterator[Path]:
 @pytest.mark.slow
 @pytest.mark.parametrize("user", [None, NAMELESS])
 def test_a_user_without_name_and_home_gets_from_assets_to_a_training(user: int | None, folder: Path) -> None:
-    code = Path(sys.modules["torch"].__file__ or "").parent, Path(__file__).parents[2] / "src"
+    torch, python = Path(sys.modules["torch"].__file__ or "").parent, Path(sys.executable).resolve().parent
+    code = torch, python, Path(__file__).parents[2] / "src"
     if user is not None and not (os.getuid() == 0 and all(map(may_be_read_by_all, code))):
         pytest.skip("takes root, and an environment that others may read")
     kept = {
