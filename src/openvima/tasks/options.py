@@ -36,8 +36,18 @@ def check_num_distractors(count: object, *, high: int = MAX_DISTRACTORS) -> None
     Raises:
         ConfigError: It is not in 0 … `high`.
     """
-    if not isinstance(count, int) or not 0 <= count <= high:
+    if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= high:
         raise ConfigError(f"num_distractors is {count!r}; give an integer from 0 to {high}.")
+
+
+def check_switch(name: str, value: object) -> None:
+    """Check that an option is true or false.
+
+    Raises:
+        ConfigError: It is neither.
+    """
+    if not isinstance(value, bool):
+        raise ConfigError(f"{name} is {value!r}; give true or false.")
 
 
 def textures_by_difficulty(table: TableSampler, difficulty: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -158,5 +168,5 @@ def _convert(spec: TaskSpec, name: str, value: str) -> Any:
 def _literal(text: str) -> Any:
     try:
         return json.loads(text)
-    except (ValueError, RecursionError):  # of texts of a stranger
+    except (ValueError, RecursionError):  # a word, or brackets nested too deeply
         return text

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_difficulty, check_num_distractors
+from openvima.tasks.options import check_difficulty, check_num_distractors, check_switch
 from openvima.tasks.table import TableSampler, is_in_the_way
 
 TOLERANCE = Tolerance(position_m=0.1)
@@ -125,9 +125,13 @@ def gathering_problem(
 
     Returns:
         The problem; without `compat`, it is undecided at the start.
+
+    Raises:
+        ConfigError: `after_bowl` is neither true nor false.
     """
     if after_bowl is None:
         after_bowl = table.compat and "bowl" in table.pool.base_objects
+    check_switch("after_bowl", after_bowl)
     tolerance = Tolerance(BOWL_TOLERANCE_M if after_bowl or base.object == "bowl" else TOLERANCE_M)
     num_dragged, _ = counts
     dragged: list[Placement] = []
@@ -187,7 +191,11 @@ def check_angles(angles_deg: Sequence[float]) -> None:
     Raises:
         ConfigError: There are none, or one is within 15 degrees of 0.
     """
-    if not angles_deg or not all(abs(math.remainder(angle, 360)) > TOLERANCE_DEG for angle in angles_deg):
+    try:
+        are_right = all(abs(math.remainder(angle, 360)) > TOLERANCE_DEG for angle in angles_deg)
+    except (TypeError, ValueError):  # no numbers, or infinite
+        are_right = False
+    if not are_right or not angles_deg:
         raise ConfigError(
             f"angles_deg is {angles_deg!r}; give angles of more than {TOLERANCE_DEG} degrees, such as "
             f"{list(ANGLES_DEG)}."

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from openvima.scene import AtPose, DistractorsApart, Problem, Prompt
 from openvima.tasks import rearrange
+from openvima.tasks.options import check_switch
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -43,6 +44,7 @@ def sample(
             way must not come back.
         difficulty: "easy", "medium" or "hard"; without effect, as in the benchmark.
     """
+    check_switch("restore_distractor", restore_distractor)
     problem = rearrange.sample(
         table,
         num_distractors=num_distractors,
