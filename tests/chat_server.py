@@ -28,9 +28,7 @@ class ChatServer:
     url: str = ""
     bodies: list[dict[str, Any]] = field(default_factory=list)
     answered: list[str] = field(default_factory=list)  # requests that got an answer
-    most_at_once: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
-    at_once: int = 0
 
 
 def text_of(body: dict[str, Any]) -> str:
@@ -72,12 +70,9 @@ def chat_server(
                 return self._send(*_DENIED)
             with state.lock:
                 state.bodies.append(body)
-                state.at_once += 1
-                state.most_at_once = max(state.most_at_once, state.at_once)
             said = state.reply(body)
-            with state.lock:
-                state.at_once -= 1
-                if isinstance(said, str):
+            if isinstance(said, str):
+                with state.lock:
                     state.answered.append(json.dumps(body, sort_keys=True))
             return self._send(*(said if isinstance(said, tuple) else (200, {}, completion(said))))
 

@@ -13,7 +13,9 @@ from PIL import Image
 
 from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter
 from openvima.data.encoding import ShardInfo
+from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.manifest import MANIFEST_NAME, finish_folder, manifest_checksum
+from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.errors import DatasetError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.perception.preprocessing import ObjectTable
@@ -61,6 +63,16 @@ def finish(folder: Path, info: ShardInfo, *, command: str = MERGE, licence: str 
     """Write index and manifest of the shards that are in a folder."""
     shards = sorted(folder.glob("*.arrow"))
     finish_folder(folder, shards, command=command, config={}, versions=info.versions, licence=licence)
+
+
+def folder_writers(source: Path, out: Path) -> tuple[Callable[[], object], ...]:
+    """All commands that write a folder as a whole from another one."""
+    return (
+        lambda: merge(MergeConfig((source,), out)),
+        lambda: sample(SubsetConfig(source, out), 1.0),
+        lambda: split(SubsetConfig(source, out), Splits({"a": 0.5, "b": 0.5})),
+        lambda: export_lerobot(LerobotConfig(source, out)),
+    )
 
 
 def edit_manifest(folder: Path, edit: Callable[[dict], None]) -> None:

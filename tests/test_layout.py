@@ -109,9 +109,10 @@ def test_data_imports_torch_in_its_adapter_only() -> None:
         assert file.name == "torch_dataset.py" or "torch" not in imported_modules(file)
 
 
-def test_import_openvima_loads_nothing_heavy() -> None:
+def test_openvima_and_its_list_of_tasks_load_nothing_heavy() -> None:
     code = (
-        "import openvima, sys; heavy = {'torch', 'mujoco', 'numba', 'matplotlib', 'av', 'pyarrow'}; "
+        "import openvima, sys; openvima.list_tasks(); "
+        "heavy = {'torch', 'mujoco', 'numba', 'matplotlib', 'av', 'pyarrow'}; "
         "print(sorted(heavy & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,7 +1,6 @@
 """Importing the original asset pack: what is taken, what is reported, and what replaces what."""
 
 import hashlib
-import io
 import os
 import shutil
 from pathlib import Path
@@ -13,6 +12,7 @@ from PIL import Image
 from openvima.catalog import OBJECTS, TEXTURES, load_assets, original
 from openvima.catalog.original import OriginalAssets, import_pack, imported_folder
 from openvima.errors import AssetError
+from openvima.video.encoder import png
 from task_cases import frozen
 
 REFERENCE = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
@@ -29,18 +29,16 @@ f 1 3 4
 """
 
 
-def png(value: int) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(np.full((4, 6, 3), value, np.uint8)).save(stream, "PNG")
-    return stream.getvalue()
+def png_of(value: int) -> bytes:
+    return png(Image.new("RGB", (6, 4), (value,) * 3))
 
 
 FILES = {
     "kitting/cross.obj": TRIANGLES,
     "kitting/heart.obj": TRIANGLES.replace(b"20", b"10"),
     "kitting/object-template.urdf": b"<robot/>\n",
-    "textures/granite.png": png(100),
-    "textures/wood_light.png": png(150),
+    "textures/granite.png": png_of(100),
+    "textures/wood_light.png": png_of(150),
 }
 
 
@@ -76,7 +74,7 @@ def test_an_import_holds_every_file_and_needs_the_checkout_no_more(checkout):
 
 def test_missing_and_damaged_files_are_named_and_the_rest_is_imported(checkout):
     in_pack(checkout, "kitting/cross.obj").unlink()
-    in_pack(checkout, "textures/granite.png").write_bytes(png(100)[:-20])
+    in_pack(checkout, "textures/granite.png").write_bytes(png_of(100)[:-20])
     missing, damaged = import_pack(checkout)
     assert "kitting/cross.obj is missing" in missing and "textures/granite.png differs" in damaged
     assets = load_assets("original")
@@ -103,7 +101,7 @@ def test_importing_again_replaces_the_import_and_what_was_loaded_of_it(checkout)
     assert load_assets("original").geometry("cross", SIZE).visual.vertices.shape == (4, 3, 3)
 
 
-def test_an_import_that_fails_leaves_the_last_one(checkout, tmp_path, monkeypatch):
+def test_an_import_that_fails_leaves_the_last_one(checkout, tmp_path):
     import_pack(checkout)
     with pytest.raises(AssetError, match="no original asset pack"):
         import_pack(tmp_path)

@@ -1,6 +1,5 @@
 """Objects and textures of users: what is taken, what is refused, and that nothing built-in changes."""
 
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from openvima.catalog import (
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.original import OriginalAssets
 from openvima.errors import AssetError
+from openvima.video.encoder import png
 from user_shapes import CORNERS, TRIANGLES, boxes, restored_assets
 
 SIZE = (0.06, 0.04, 0.02)
@@ -51,7 +51,7 @@ def test_an_object_has_the_sampled_size_and_rests_on_the_table() -> None:
     assert (geometry.visual.uvs >= 0).all() and (geometry.visual.uvs <= 1).all()
 
 
-def test_every_pack_has_the_registered_assets(tmp_path: Path) -> None:
+def test_every_pack_has_the_registered_assets() -> None:
     register_brick()
     register_texture("news", np.full((2, 3, 3), 7, np.uint8))
     original = OriginalAssets.__new__(OriginalAssets)
@@ -177,15 +177,9 @@ def test_numbers_out_of_bounds_are_refused(changes: dict[str, Any], message: str
         register_brick(**changes)
 
 
-def png(mode: str, size: tuple[int, int]) -> bytes:
-    stream = io.BytesIO()
-    Image.new(mode, size, 200 if mode == "L" else (200,) * len(mode)).save(stream, "PNG")
-    return stream.getvalue()
-
-
 def test_a_texture_is_read_from_a_png_file(tmp_path: Path) -> None:
     file = tmp_path / "news.png"
-    file.write_bytes(png("L", (3, 2)))
+    file.write_bytes(png(Image.new("L", (3, 2), 200)))
     register_texture("news", file)
     assert load_assets().texture("news").shape == (2, 3, 3)
 
@@ -194,9 +188,9 @@ def test_a_texture_is_read_from_a_png_file(tmp_path: Path) -> None:
     ("content", "message"),
     [
         (b"", "no readable PNG"),
-        (png("RGB", (8, 8))[:50], "no readable PNG"),
-        (png("RGBA", (8, 8)), "partly transparent"),
-        (png("RGB", (2000, 1)), "2000 × 1 pixels"),
+        (png(Image.new("RGB", (8, 8)))[:40], "no readable PNG"),
+        (png(Image.new("RGBA", (8, 8))), "partly transparent"),
+        (png(Image.new("RGB", (2000, 1))), "2000 × 1 pixels"),
     ],
     ids=("empty", "truncated", "transparent", "too large"),
 )

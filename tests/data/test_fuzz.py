@@ -13,11 +13,17 @@ import pytest
 
 from openvima.data import Dataset, Demonstration, Shard, ShardWriter, VerifyConfig, verify
 from openvima.data.encoding import ShardInfo
-from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.object_cache import open_object_cache
-from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.errors import DatasetError, OpenVimaError
-from small_data_sets import contents, edit_manifest, flip_bit, read_all, with_plain_images, write_folder
+from small_data_sets import (
+    contents,
+    edit_manifest,
+    flip_bit,
+    folder_writers,
+    read_all,
+    with_plain_images,
+    write_folder,
+)
 
 MadeUp = Callable[..., Demonstration]
 NO_REPLAY = VerifyConfig(replay=0)
@@ -152,26 +158,14 @@ def forge(folder: Path, name: str) -> None:
     edit_manifest(folder, edit)
 
 
-def commands(folder: Path) -> dict[str, Callable[[], object]]:
-    """All that follows the names in a data folder."""
-    out = folder.parent / "out"
-    return {
-        "read": lambda: list(Dataset(folder)),
-        "preprocess": lambda: open_object_cache(Dataset(folder)),
-        "merge": lambda: merge(MergeConfig((folder,), out)),
-        "sample": lambda: sample(SubsetConfig(folder, out), 1.0),
-        "split": lambda: split(SubsetConfig(folder, out), Splits({"a": 0.5, "b": 0.5})),
-        "export": lambda: export_lerobot(LerobotConfig(folder, out)),
-    }
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_that_is_none_of_a_file_in_the_folder_is_refused(folder: Path, name: str) -> None:
     (folder.parent / "outside").mkdir()
     (folder.parent / "outside" / "a.arrow").write_text("precious")
     forge(folder, name.format(outside=folder.parent / "outside"))
     before = contents(folder.parent)
-    for command in commands(folder).values():
+    readers = (lambda: list(Dataset(folder)), lambda: open_object_cache(Dataset(folder)))
+    for command in (*readers, *folder_writers(folder, folder.parent / "out")):
         with pytest.raises(DatasetError, match=r"dataset\.json: it names the shard .*, which is no plain"):
             command()
     assert contents(folder.parent) == before

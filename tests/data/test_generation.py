@@ -273,15 +273,6 @@ def test_episodes_that_two_forms_leave_equal_are_merged_once(tmp_path: Path) -> 
     assert len(Dataset(merged)) == 2
 
 
-def test_all_means_the_tasks_with_a_text_form(tmp_path: Path) -> None:
-    every = GenerateConfig(out=tmp_path, env_config=TEXT).resolved_tasks()
-    assert "rotate" in every and "rearrange" not in every
-    with pytest.raises(ConfigError, match="'rearrange' has no text form"):
-        GenerateConfig(out=tmp_path, tasks=("rearrange",), env_config=TEXT).resolved_tasks()
-    mixed = EnvConfig(prompts="mixed")
-    assert "rearrange" in GenerateConfig(out=tmp_path, env_config=mixed).resolved_tasks()
-
-
 def test_shards_grow_with_their_number() -> None:
     sizes = [shard_episodes(number) for number in range(36)]
     assert sizes[:9] == [4, 4, 4, 4, 8, 8, 8, 8, 16]

@@ -17,12 +17,10 @@ import generation_server
 from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, generate
 from openvima.data.encoding import ShardInfo
-from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.object_cache import open_object_cache
-from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.data.verification import VerifyConfig, verify
 from openvima.errors import DatasetError, FolderLockedError, StorageError
-from small_data_sets import TASKS, config, contents, with_plain_images, write_folder
+from small_data_sets import TASKS, config, contents, folder_writers, with_plain_images, write_folder
 from worker_jobs import holding
 
 NUM_KILLS = 3  # for each of two beginnings
@@ -230,22 +228,11 @@ def source(tmp_path: Path, made_up: Callable[..., Demonstration], info: ShardInf
     return write_folder(tmp_path / "source", info, [[with_plain_images(made_up(seed)) for seed in range(3)]])
 
 
-def writers(source: Path, out: Path) -> dict[str, Callable[[], object]]:
-    """All commands that write a folder as a whole."""
-    return {
-        "generate": lambda: generate(config(out)),
-        "merge": lambda: merge(MergeConfig((source,), out)),
-        "sample": lambda: sample(SubsetConfig(source, out), 1.0),
-        "split": lambda: split(SubsetConfig(source, out), Splits({"a": 0.5, "b": 0.5})),
-        "export": lambda: export_lerobot(LerobotConfig(source, out)),
-    }
-
-
 def test_a_second_writer_is_refused_and_changes_nothing(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with holding(out) as process:
         before = contents(out)
-        for write in writers(source, out).values():
+        for write in (lambda: generate(config(out)), *folder_writers(source, out)):
             with pytest.raises(FolderLockedError, match=f"out is being written to by process {process.pid}"):
                 write()
         assert contents(out) == before

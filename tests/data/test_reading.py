@@ -20,6 +20,7 @@ from openvima.data.records import pixels, planes
 from openvima.data.schema import ARRAYS, COLUMNS, SCHEMA_VERSION
 from openvima.errors import DatasetError
 from small_data_sets import flip_bit
+from task_cases import frozen
 
 MadeUp = Callable[..., Demonstration]
 
@@ -42,23 +43,6 @@ def shard(tmp_path: Path, made_up: MadeUp, demo: Demonstration, info: ShardInfo)
     return write(tmp_path / "a.arrow", info, [made_up(1), demo])
 
 
-def assert_equal(a: Demonstration, b: Demonstration) -> None:
-    for field in dataclasses.fields(Demonstration):
-        ours, theirs = getattr(a, field.name), getattr(b, field.name)
-        if field.name in ("rgb", "segm"):
-            for view in ours:
-                assert ours[view].shape == theirs[view].shape
-                assert ours[view].dtype == theirs[view].dtype
-                assert np.array_equal(ours[view], theirs[view])
-        elif field.name == "joint_paths":
-            assert [path.tolist() for path in ours] == [path.tolist() for path in theirs]
-        elif field.name == "prompt":
-            assert ours.text == theirs.text
-            assert list(ours.images) == list(theirs.images)
-        else:
-            assert ours == theirs, field.name
-
-
 @pytest.mark.parametrize(("num_steps", "num_images"), [(0, 1), (1, 0), (4, 3)])
 def test_a_demonstration_comes_back_as_it_was_written(
     tmp_path: Path, made_up: MadeUp, info: ShardInfo, num_steps: int, num_images: int
@@ -67,14 +51,9 @@ def test_a_demonstration_comes_back_as_it_was_written(
     shard = write(tmp_path / "a.arrow", info, [demo])
     assert shard.info == info
     read = shard[0]
-    assert_equal(demo, read)
+    assert frozen(read) == frozen(demo)
+    assert list(read.prompt.images) == list(demo.prompt.images)
     assert read.content_hash() == demo.content_hash()
-    for name, image in demo.prompt.images.items():
-        assert read.prompt.images[name].objects == image.objects
-        assert read.prompt.images[name].kind == image.kind
-        for view in image.rgb:
-            assert np.array_equal(read.prompt.images[name].rgb[view], image.rgb[view])
-            assert np.array_equal(read.prompt.images[name].segm[view], image.segm[view])
 
 
 def test_the_content_hash_notices_any_change(made_up: MadeUp) -> None:

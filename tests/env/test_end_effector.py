@@ -6,16 +6,13 @@ import itertools
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import openvima
 from openvima.env import EnvConfig
-from openvima.errors import ActionError, ConfigError, PolicyError
+from openvima.errors import ActionError, ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 from openvima.evaluation.comparison import merge
-from openvima.evaluation.runner import score
 from openvima.evaluation.verification import verify_results
-from openvima.policies import RandomPolicy
 from openvima.scene.action import COMMAND_HIGH, STEPS_PER_PRIMITIVE, ToolCommand
 
 STAY = np.zeros(5, np.float32)
@@ -55,10 +52,6 @@ def test_the_oracle_solves_an_episode_from_states_that_it_did_not_choose(task) -
         *_, terminated, truncated, _ = env.step(given.astype(np.float32))
         is_over = terminated or truncated
     assert env.outcome.success
-
-
-def test_the_environment_passes_the_checks_of_gymnasium() -> None:
-    check_env(make("rotate", modalities=("rgb", "segm", "joints")), skip_render_check=True)
 
 
 def test_images_follow_the_body_on_the_cup_while_it_moves() -> None:
@@ -147,28 +140,6 @@ def test_a_copy_of_the_environment_goes_on_equally() -> None:
     tools = [[each.step(each.oracle_command())[0]["tool"].tobytes() for _ in range(5)] for each in pair]
     assert tools[0] == tools[1]
     assert pair[0].scene == pair[1].scene
-
-
-class Stays:
-    """Keeps the tool where it is."""
-
-    control = "end_effector"
-    modalities = ("joints",)
-
-    def reset(self, prompts):
-        pass
-
-    def act(self, observations):
-        return [None if seen is None else STAY for seen in observations]
-
-
-def test_policies_of_the_other_control_are_refused() -> None:
-    with pytest.raises(PolicyError, match="control 'end_effector', but the environments have control 'prim"):
-        score({"mine": Stays()}, tasks=("rotate",), levels=("L1",), episodes=1)
-    with pytest.raises(PolicyError, match="random is a policy of control 'primitives'"):
-        score(
-            {"random": RandomPolicy()}, tasks=("rotate",), levels=("L1",), episodes=1, control="end_effector"
-        )
 
 
 def test_results_record_the_control_are_verified_and_joined_with_no_other(tmp_path) -> None:

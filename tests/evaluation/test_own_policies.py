@@ -32,6 +32,7 @@ class Mine(RandomPolicy):
 def make():
     return Mine(seed=3)
 """
+WORDS = ["--tasks", "rotate", "--levels", "L1", "--no-report", "--episodes"]
 CELLS = {"tasks": ("rotate",), "levels": ("L1",), "episodes": 2}
 
 
@@ -53,7 +54,7 @@ def edited(body: str) -> str:
 
 
 def test_a_function_of_a_file_is_scored_from_the_command_line(file, capsys):
-    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "2", "--no-report", "--out", "results"]
+    words = [*WORDS, "2", "--out", "results"]
     assert main(["evaluate", "--policy", "my policies.py:make,other=./my policies.py:Mine", *words]) == 0
     results = Results.read(Path("results"))
     record = results.policies["my-policies"]
@@ -88,8 +89,8 @@ def test_invalid_actions_are_counted_and_the_first_is_shown(file, capsys):
     file.write_text(
         edited("return [a and {**a, 'pose0_position': a['pose0_position'] + 9} for a in actions]")
     )
-    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "2", "--ablations", "no_prompt"]
-    assert main(["evaluate", "--policy", "bad=my policies.py:make,random", *words, "--no-report"]) == 0
+    policies = ["--policy", "bad=my policies.py:make,random", "--ablations", "no_prompt"]
+    assert main(["evaluate", *policies, *WORDS, "2"]) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "4 of 4 episodes of bad ended by an invalid action; first in rotate, L1, seed 0: pose0_pos" in said
     assert "episodes of random" not in said
@@ -121,8 +122,7 @@ def test_what_a_policy_does_wrong_is_named_with_task_and_seeds(body, message, fi
 def test_exceptions_in_some_episodes_are_counted_kept_and_verified(file, capsys):
     body = "self.n = getattr(self, 'n', 0) + 1; return actions if len(actions) == 1 and self.n < 4 else 1 / 0"
     file.write_text(edited(body))
-    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "3", "--workers", "1", "--no-report"]
-    assert main(["evaluate", "--policy", f"bad={file}:make", *words]) == 0
+    assert main(["evaluate", "--policy", f"bad={file}:make", "--workers", "1", *WORDS, "3"]) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "episodes of bad ended by an error of the policy; first in rotate, L1, seed" in said
     assert "bad raised ZeroDivisionError" in said
@@ -134,8 +134,7 @@ def test_exceptions_in_some_episodes_are_counted_kept_and_verified(file, capsys)
 
 def test_exhausted_memory_is_no_error_of_the_policy(file, capsys):
     file.write_text(edited("raise RuntimeError('cannot allocate memory')"))
-    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "1", "--no-report"]
-    assert main(["evaluate", "--policy", f"{file}:make", *words]) == 1
+    assert main(["evaluate", "--policy", f"{file}:make", *WORDS, "1"]) == 1
     assert "out of memory; lower" in capsys.readouterr().err
 
 

@@ -37,10 +37,17 @@ def test_the_oracle_solves_its_episodes(first):
     assert log["seconds"] > 0 and log["engine"] == "processes"
 
 
-def test_jobs_that_share_a_folder_give_the_same_bytes(first, tmp_path):
+def test_jobs_that_share_a_folder_play_their_own_batches_and_give_the_same_bytes(
+    first, tmp_path, monkeypatch
+):
+    played, play_batch = [], runner.play_batch
+    monkeypatch.setattr(
+        runner, "play_batch", lambda job, count: played.append(job.batch) or play_batch(job, count)
+    )
     config = replace(ORACLE, out=tmp_path)
     assert len(plan(config)) == 4
     assert not runner.evaluate_range(config, (2, 9))
+    assert sorted(map(str, played)) == sorted(map(str, plan(config)[2:]))
     assert not (tmp_path / "results.json").exists()
     with (
         holding(tmp_path, 1, 2),
@@ -50,29 +57,13 @@ def test_jobs_that_share_a_folder_give_the_same_bytes(first, tmp_path):
     assert runner.evaluate_range(config, (0, 2))
     assert (tmp_path / "results.json").read_bytes() == first.read_bytes()
     assert not runner.evaluate_range(config, (1, 3))  # all is there
+    assert len(played) == 4
     with pytest.raises(ConfigError, match="4:5, but shards are numbered from 0 to 3"):
         runner.evaluate_range(config, (4, 5))
     with pytest.raises(ConfigError, match="force and shard_range exclude"):
         runner.evaluate_range(replace(config, force=True), (0, 1))
     with pytest.raises(ConfigError, match=r"holds another evaluation: seed is .* there and 41 here"):
         runner.evaluate_range(replace(config, seed=41), (0, 1))
-
-
-def test_a_job_plays_its_own_batches_only(tmp_path, monkeypatch):
-    played = []
-    play_batch = runner.play_batch
-
-    def noted(job, count):
-        played.append((job.batch.task, job.batch.first_seed))
-        return play_batch(job, count)
-
-    monkeypatch.setattr(runner, "play_batch", noted)
-    config = replace(ORACLE, out=tmp_path)
-    runner.evaluate_range(config, (0, 1))
-    runner.evaluate_range(config, (0, 2))
-    assert played == [("rotate", 40), ("rotate", 42)]
-    evaluate(config)
-    assert len(played) == 4
 
 
 def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, monkeypatch):

@@ -148,16 +148,13 @@ def test_exchanged_actions_are_found(copy):
     assert is_found(copy)
 
 
-def test_without_actions_nothing_is_confirmed(copy):
-    (copy / ACTIONS_NAME).unlink()
-    with pytest.raises(DatasetError, match=r"there is no .*actions\.arrow"):
-        verify_results(copy)
-
-
-def test_damaged_actions_are_refused(copy):
+def test_damaged_actions_are_refused_and_without_any_nothing_is_confirmed(copy):
     path = copy / ACTIONS_NAME
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(DatasetError, match="damaged"):
+        verify_results(copy)
+    path.unlink()
+    with pytest.raises(DatasetError, match=r"there is no .*actions\.arrow"):
         verify_results(copy)
 
 

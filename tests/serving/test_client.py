@@ -38,13 +38,6 @@ def test_what_is_no_address_is_named(url: str) -> None:
         RemotePolicy(url)
 
 
-def test_a_server_that_is_not_there_is_named_with_what_starts_one() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    with pytest.raises(ServerError, match=f"127.0.0.1:{port}.*openvima serve"):
-        RemotePolicy(f"ws://127.0.0.1:{port}")
-
-
 def test_the_token_comes_from_the_variable_or_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     with serve_in_thread(ForMany(), token="secret") as url:
@@ -115,21 +108,17 @@ def test_a_connection_lost_within_an_episode_is_an_error_and_the_next_reset_make
         policy.close()
 
 
-def test_another_policy_at_the_same_address_is_refused() -> None:
-    with serve_in_thread(ForMany(), about={"policy": {"sha256": "one"}}) as url:
+def test_at_the_same_address_other_limits_hold_and_another_policy_is_refused() -> None:
+    about = {"policy": {"sha256": "one"}}
+    with serve_in_thread(ForMany(), max_episodes=1, about=about) as url:
         policy = RemotePolicy(url)
-    port = port_of(url)
-    with serve_in_thread(ForMany(), port=port, about={"policy": {"sha256": "two"}}):
+    with serve_in_thread(ForMany(), port=port_of(url), max_episodes=2, about=about):
+        policy.reset([made_up_prompt(1)] * 2)
+    with serve_in_thread(ForMany(), port=port_of(url), about={"policy": {"sha256": "two"}}):
+        with pytest.raises(ServerError, match="has ended the connection"):
+            policy.act([made_up_observation(1)] * 2)
         with pytest.raises(ServerError, match="another policy than before"):
             policy.reset([made_up_prompt(1)])
-        policy.close()
-
-
-def test_the_same_policy_with_other_limits_goes_on_under_those() -> None:
-    with serve_in_thread(ForMany(), max_episodes=1) as url:
-        policy = RemotePolicy(url)
-    with serve_in_thread(ForMany(), port=port_of(url), max_episodes=2):
-        policy.reset([made_up_prompt(1)] * 2)
         policy.close()
 
 

@@ -106,15 +106,6 @@ def test_a_slow_client_is_dropped_with_a_reason_and_holds_up_nobody(impatient_ur
             slow.recv()
 
 
-def test_a_slow_sender_within_the_time_is_served(url: str) -> None:
-    frame = Frame(Opcode.BINARY, good_messages()[0]).serialize(mask=True)
-    with connect(url, compression=None, proxy=None) as slow:
-        slow.recv()
-        for start in range(0, len(frame), 50):
-            slow.socket.sendall(frame[start : start + 50])
-        assert unpack(slow.recv()) == {"type": "reset"}  # type: ignore[arg-type]
-
-
 def test_a_client_that_goes_while_the_policy_thinks_is_forgotten() -> None:
     thinking, answered = threading.Event(), threading.Event()
 

@@ -138,13 +138,6 @@ def single(task: str, *, conflict: bool, **options: Any) -> tuple[Problem, Place
     return problem, own, target, other, 1.0 if target.y < 0 else -1.0
 
 
-@pytest.mark.parametrize(("distance", "success"), [(0.099, True), (0.101, False)])
-def test_an_object_has_to_be_near_its_target_at_any_heading(distance: float, success: bool) -> None:
-    problem, own, target, *_ = single(TASK, conflict=False)
-    outcome = judged(problem, {own.id: target.moved(dx=distance).rotated(2.0)})[1]
-    assert (outcome.success, outcome.failure) == (success, False)
-
-
 @pytest.mark.parametrize(("distance", "success"), [(0.099, False), (0.101, True)])
 def test_at_the_end_the_distractor_must_be_away_from_target_and_object(
     distance: float, success: bool
@@ -207,7 +200,12 @@ def test_going_back_counts_from_the_step_after_the_last_arrangement_on() -> None
 
 
 @pytest.mark.parametrize(("distance", "is_near"), [(0.099, True), (0.101, False)])
-def test_the_end_is_judged_at_the_start_of_the_object(distance: float, is_near: bool) -> None:
+def test_ends_are_judged_at_the_target_and_where_it_was_at_any_heading(
+    distance: float, is_near: bool
+) -> None:
+    problem, own, target, *_ = single(TASK, conflict=False)
+    outcome = judged(problem, {own.id: target.moved(dx=distance).rotated(2.0)})[1]
+    assert (outcome.success, outcome.failure) == (is_near, False)
     problem, own, target, distractor, _ = single(RESTORE, conflict=False)
     inward = 1.0 if own.pose.y < target.y else -1.0
     outcome = judged(problem, {own.id: target}, {own.id: own.pose.moved(dy=inward * distance).rotated(1)})[1]
@@ -232,7 +230,7 @@ def test_a_distractor_that_was_in_the_way_is_left_where_it_is_parked() -> None:
 
 
 def test_distractors_start_and_park_away_from_targets_and_starts() -> None:
-    for episode in episodes(RESTORE, 1, 150):
+    for episode in episodes(RESTORE, 1, 60):
         problem = episode.problem
         (arrange,), (restore,) = goals_of(problem)
         (other,) = (p for p in problem.scene.placements if p.id != arrange.object_id)

@@ -35,7 +35,7 @@ def seeds_by_template(kind: str) -> dict[int, list[int]]:
     """Return seeds by the number of their template: of those that fit, the one with most words of its own."""
     found: dict[int, list[int]] = {}
     texts = [sentence(*template) for template in templates(kind)]
-    for seed in range(12 * len(texts)):
+    for seed in range(7 * len(texts)):
         text = sampled(kind, seed).prompt.text
         fitting = [number for number, template in enumerate(texts) if follows(text, template)]
         number = max(fitting, key=lambda n: len(re.sub(r"{\w+}", "", texts[n])))
@@ -56,11 +56,11 @@ def test_there_are_many_templates_and_the_tasks_are_held_out() -> None:
 
 @pytest.mark.parametrize(("kind", "number"), TEMPLATES)
 def test_every_template_is_reached_and_its_sentence_read_as_meant(kind: str, number: int) -> None:
-    for seed in seeds_by_template(kind)[number][:3]:
-        episode = sample_episode(f"refer_by_{kind}", seed=seed, prompts="text")
-        assert disagreement(episode) == "", episode.problem.prompt.text
-        assert "{" not in episode.problem.prompt.text
-        assert episode.max_steps <= 7
+    seed = seeds_by_template(kind)[number][0]
+    episode = sample_episode(f"refer_by_{kind}", seed=seed, prompts="text")
+    assert disagreement(episode) == "", episode.problem.prompt.text
+    assert "{" not in episode.problem.prompt.text
+    assert episode.max_steps <= 7
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.pushes import Rectangle
 from task_cases import assert_frequencies, assert_uniform
 
-NUM_EPISODES = 500
+NUM_EPISODES = 320
 EXCEEDING, TOUCHING = "sweep_without_exceeding", "sweep_without_touching"
 TASKS = pytest.mark.parametrize("task", [EXCEEDING, TOUCHING])
 LEVELS = [(EXCEEDING, "train"), (EXCEEDING, "L1"), (EXCEEDING, "L2"), (TOUCHING, "L4")]

@@ -1,6 +1,5 @@
 """The export as a whole, field by field as the format's documentation and LeRobot's own writer have it."""
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +20,7 @@ from openvima.data.records import rollout_oracle
 from openvima.data.verification import find_difference
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import DatasetError
-from small_data_sets import frames_of
+from small_data_sets import contents, frames_of
 
 VIDEO_KEYS = [
     f"observation.images.{name}"
@@ -29,11 +28,6 @@ VIDEO_KEYS = [
 ]
 STATISTICS = ["min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"]
 INT64, DOUBLE = pa.int64(), pa.float64()
-
-
-def digests(folder: Path) -> dict[str, str]:
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
-    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
 def table(export: Path, name: str) -> pa.Table:
@@ -283,13 +277,13 @@ def test_a_second_export_has_the_same_bytes_and_is_replaced_only_by_force(
     tmp_path: Path, source: Path, export: Path
 ) -> None:
     again = export_lerobot(LerobotConfig(source, tmp_path / "again"))
-    assert digests(again) == digests(export)
+    assert contents(again) == contents(export)
     config = LerobotConfig(source, again, pixels="yuv420p")
     with pytest.raises(DatasetError, match="is not empty"):
         export_lerobot(config)
-    assert digests(again) == digests(export)
+    assert contents(again) == contents(export)
     export_lerobot(replace(config, force=True))
-    assert digests(again) != digests(export)
+    assert contents(again) != contents(export)
 
 
 def test_the_command_exports_and_names_the_folder(
@@ -298,7 +292,7 @@ def test_the_command_exports_and_names_the_folder(
     out = tmp_path / "by command"
     assert main(["data", "export-lerobot", str(source), str(out), "--tasks", "stack"]) == 0
     assert capsys.readouterr().out.strip() == str(out)
-    differing = {name for name, digest in digests(out).items() if digests(export)[name] != digest}
+    differing = {name for name, content in contents(out).items() if (export / name).read_bytes() != content}
     assert differing == {"meta/openvima.json"}  # which names the tasks that were asked for
 
 

@@ -11,7 +11,7 @@ from openvima.data import Dataset
 from openvima.data.published import ImportConfig, PublishedData, import_published
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError
-from published_data import PUBLISHED, MadeEpisode, write_folder, write_zip
+from published_data import PUBLISHED, MadeEpisode, write_zip
 from small_data_sets import contents
 
 Files = dict[str, bytes]
@@ -99,12 +99,6 @@ def test_an_import_can_be_extended_but_not_cut(source: Path, imported: Path, tmp
     with pytest.raises(DatasetError, match=r"00001\.arrow holds episodes that were not asked for"):
         import_published(config(source, tmp_path, episodes=4))
     assert contents(tmp_path).keys() >= {"dataset.json"}
-
-
-def test_unpacked_folders_give_the_same_content(source: Path, imported: Path, tmp_path: Path) -> None:
-    write_folder(tmp_path / "unpacked", episodes())
-    import_published(config(tmp_path / "unpacked", tmp_path / "out"))
-    assert Dataset(tmp_path / "out").manifest["content_hash"] == Dataset(imported).manifest["content_hash"]
 
 
 def test_an_import_of_another_source_needs_force(source: Path, imported: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import published_data
@@ -29,6 +29,7 @@ VALUES = st.recursive(
 )
 
 
+@settings(max_examples=50, deadline=None)
 @given(VALUES, st.integers(3, 5))
 def test_plain_values_come_back(value: object, protocol: int) -> None:
     assert read_pickle(pickle.dumps(value, protocol)) == value
