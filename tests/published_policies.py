@@ -1,6 +1,7 @@
 """Small policies as others publish theirs: a `.ckpt` file, and the files of a tokenizer of T5."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -79,15 +80,24 @@ def with_unused_entries(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     return {**to_published(network), **entries}
 
 
-def write_tokenizer(folder: Path) -> Path:
-    """Write the files of a T5 tokenizer with a few words of its own; all else it spells."""
-    from tokenizers import Tokenizer, models, pre_tokenizers
+_LETTERS = [(letter, -9.0) for letter in "▁abcdefghijklmnopqrstuvwxyzPRST.,0123456789:"]
+_WORDS = [(f"▁{word}", -2.0) for word in ("Put", "the", "into", "Rotate", "degrees")]
 
-    special = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0)]
-    letters = [(letter, -9.0) for letter in "▁abcdefghijklmnopqrstuvwxyzPRST.,0123456789:"]
-    words = [(f"▁{word}", -2.0) for word in ("Put", "the", "into", "Rotate", "degrees")]
-    tokenizer = Tokenizer(models.Unigram(special + letters + words, unk_id=2))
-    tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
+
+def write_tokenizer(folder: Path, scored: Sequence[tuple[str, float]] = (*_LETTERS, *_WORDS)) -> Path:
+    """Write a tokenizer in the format of t5-base; unless given, it knows a few words, and spells all else."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
+
+    special = ["<pad>", "</s>", "<unk>"]
+    extra = [f"<extra_id_{number}>" for number in reversed(range(100))]
+    vocabulary = [*((name, 0.0) for name in special), *scored, *((name, 0.0) for name in extra)]
+    tokenizer = Tokenizer(models.Unigram(vocabulary, unk_id=2))
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+        [pre_tokenizers.WhitespaceSplit(), pre_tokenizers.Metaspace()]
+    )
+    tokenizer.decoder = decoders.Metaspace()
+    tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
+    tokenizer.add_special_tokens(special + extra)
     folder.mkdir(parents=True)
     tokenizer.save(str(folder / "tokenizer.json"))
     return folder

@@ -1,7 +1,7 @@
 """Small networks and inputs for tests of policies and training."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ import torch
 
 from openvima.data import Demonstration
 from openvima.data.preprocessed import PreprocessedEpisode, number_images, preprocess
-from openvima.detector.config import BackboneConfig, DetectorConfig
 from openvima.env import TabletopEnv
 from openvima.policies import load_policy, preset
 from openvima.policies.batch import Batch
@@ -75,16 +74,13 @@ def perturbed(config: str | PolicyConfig, std: float = 0.05, *, seed: int = 3) -
     return network
 
 
-def one_level_detector() -> DetectorConfig:
-    """Sizes of a detector that trains in moments."""
-    return DetectorConfig(
-        BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8),
-        (32.0,),
-        box_head_widths=(8,),
-        mask_head_widths=(8,),
-        rpn_post_nms_top_n=4,
-        rpn_pre_nms_top_n=8,
-    )
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Sums then do not depend on the number of cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def object_set(

@@ -14,9 +14,8 @@ from openvima.cli.main import main  # noqa: E402
 from openvima.data import GenerateConfig, generate  # noqa: E402
 from openvima.detector import config as sizes  # noqa: E402
 from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
-from openvima.detector.config import DetectorConfig  # noqa: E402
+from openvima.detector.config import BackboneConfig, DetectorConfig  # noqa: E402
 from openvima.detector.network import MaskRCNN  # noqa: E402
-from small_networks import one_level_detector  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +26,10 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def tiny() -> DetectorConfig:
-    return one_level_detector()
+    """Sizes of a detector that trains in moments."""
+    backbone = BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8)
+    heads = {"box_head_widths": (8,), "mask_head_widths": (8,)}
+    return DetectorConfig(backbone, (32.0,), **heads, rpn_post_nms_top_n=4, rpn_pre_nms_top_n=8)
 
 
 @pytest.fixture
@@ -41,9 +43,9 @@ def detector(tiny, tmp_path) -> Path:
 def test_evaluate_and_show_accept_a_training_run(data, tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
     run = tmp_path / "run"
-    words = ["--data", str(data), "--out", str(run), "--schedule.steps", "1", "--loader.batch-size", "2"]
-    more = "--loader.validation-fraction 0.4 --loader.validation-frames 2 --runtime.device"
-    assert main(["detector", "train", *words, *more.split(), "cpu"]) == 0
+    words = f"--data {data} --out {run} --schedule.steps 1 --loader.batch-size 2 --runtime.device cpu"
+    words += " --loader.validation-fraction 0.4 --loader.validation-frames 2"
+    assert main(["detector", "train", *words.split()]) == 0
     assert capsys.readouterr().out == f"{run}\n"
     assert load_network(run).config == tiny
     words = [str(run), "--data", str(data), "--frames", "4", "--held-out", "0.4", "--json"]

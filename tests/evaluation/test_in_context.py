@@ -104,14 +104,6 @@ class FirstIntoSecond:
         return [Action.planar((0.5, -0.2), (0.5, 0.2), 0.0).to_arrays() for _ in observations]
 
 
-class NoAction(FirstIntoSecond):
-    """Gives an action outside the workspace."""
-
-    def act(self, observations):
-        (action,) = super().act(observations)
-        return [action | {"pose0_position": np.float32([9, 9])}]
-
-
 def test_an_object_and_the_oracle_solve_a_composed_episode() -> None:
     episode = compose(OBJECTS, PROMPT, goals=[("in", "a", "b")])
     for policy in (FirstIntoSecond(), "oracle"):
@@ -127,11 +119,6 @@ def test_without_goals_the_step_limit_ends_the_episode() -> None:
     assert result.outcome.reason == "the step limit is reached; the episode has no goals"
     with pytest.raises(OracleError, match="no goals"):
         play(compose(OBJECTS, PROMPT), "oracle", video="never_written.mp4")
-
-
-def test_an_invalid_action_ends_the_episode_with_its_message() -> None:
-    result = play(compose(OBJECTS, PROMPT), NoAction())
-    assert result.steps == 0 and "pose0_position is (9" in result.outcome.reason
 
 
 def test_policies_by_name_and_what_is_none() -> None:

@@ -117,28 +117,25 @@ def test_the_readme_has_the_scores_of_the_record_and_of_the_guide() -> None:
     assert readme_scores("openvima-vima") == row.strip(" |").split(" | ")[1:5]
 
 
-def test_the_figure_of_the_policies_shows_every_crop_and_patch(monkeypatch: pytest.MonkeyPatch) -> None:
-    (axes,) = draw("policy", monkeypatch).axes
-    # VIMA: 4 crops of the prompt, 4 views, 12 crops; Gato: 64 patches; the others: 4 pairs of frames each
-    assert len(axes.images) == (4 + 4 + 12) + 64 + 2 * 4
+@pytest.mark.parametrize(
+    ("name", "num_images", "counts"),
+    [
+        # VIMA: 4 crops of the prompt, 4 views, 12 crops; Gato: 64 patches; the others: 4 pairs of frames each
+        ("policy", (4 + 4 + 12) + 64 + 2 * 4, {"put": 4, "output: 12 action bins": 2}),
+        # 4 crops of the prompt and 6 of the step; 3 frames, and the 6 objects of each in both views; those of
+        # two prompts in context, with an observation of each
+        ("midas", 4 + 6 + 3 + 3 * 12 + 7, {"qw₁": 2, "motion": 1}),
+        # one object in the prompt and two in view, two crops each; its scene, two views, two top views
+        ("openvima_small_network", 2 + 4 + 1 + 2 + 2, {"query": 1, "restore": 1}),
+    ],
+)
+def test_the_figures_of_networks_show_every_crop_patch_and_component(
+    name: str, num_images: int, counts: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (axes,) = draw(name, monkeypatch).axes
+    assert len(axes.images) == num_images
     texts = [text.get_text() for text in axes.texts]
-    assert texts.count("put") == 4 and texts.count("output: 12 action bins") == 2
-
-
-def test_the_figure_of_midas_shows_every_crop_and_component(monkeypatch: pytest.MonkeyPatch) -> None:
-    (axes,) = draw("midas", monkeypatch).axes
-    # 4 crops of the prompt and 6 of the step; 3 frames, and the 6 objects of each in both views; those of
-    # two prompts in context, with an observation of each
-    assert len(axes.images) == 4 + 6 + 3 + 3 * 12 + 7
-    texts = [text.get_text() for text in axes.texts]
-    assert texts.count("qw₁") == 2 and texts.count("motion") == 1
-
-
-def test_the_figure_of_openvima_small_shows_every_crop_and_view(monkeypatch: pytest.MonkeyPatch) -> None:
-    (axes,) = draw("openvima_small_network", monkeypatch).axes
-    # one object in the prompt and two in view, two crops each; the prompt's scene, two views, two top views
-    assert len(axes.images) == 2 + 4 + 1 + 2 + 2
-    assert {"query", "restore"} <= {text.get_text() for text in axes.texts}
+    assert {text: texts.count(text) for text in counts} == counts
 
 
 def test_the_figure_of_the_detector_shows_anchors_grids_and_masks() -> None:

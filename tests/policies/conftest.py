@@ -1,25 +1,16 @@
 """Short demonstrations by the oracle and small networks, on one thread."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
-import torch
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
-from small_networks import narrow
+from small_networks import narrow, one_thread
+
+__all__ = ["one_thread"]
 
 TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums then do not depend on the number of cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from openvima.policies.t5 import T5Tokenizer, load_t5, tokenizer_for
 from openvima.policies.tokenizer import benchmark_vocabulary
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
-from published_policies import write_t5
+from published_policies import write_t5, write_tokenizer
 
 MARKER, STOP = 3, 5  # "▁" and ".", as in t5-base
 PIECES = ("▁", "X", ".", "▁the", "▁Put", "▁into", "in", "to", "▁Rot", "ate", "s", "3", "0", "▁degree", ",")
@@ -30,29 +30,10 @@ IDS = {piece: number for number, piece in enumerate(PIECES, start=3)}
 TEXT = TextEncoderConfig(width=24, num_layers=3, num_heads=2, head_width=4, hidden_width=32)
 
 
-def write_tokenizer(folder: Path) -> Path:
-    """A small tokenizer in the format of t5-base."""
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
-
-    special = ["<pad>", "</s>", "<unk>"]
-    extra = [f"<extra_id_{number}>" for number in reversed(range(100))]
-    scored = [(piece, -2.0 - 0.1 * number) for number, piece in enumerate(PIECES)]
-    vocabulary = [(name, 0.0) for name in special] + scored + [(name, 0.0) for name in extra]
-    tokenizer = Tokenizer(models.Unigram(vocabulary, unk_id=2))
-    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
-        [pre_tokenizers.WhitespaceSplit(), pre_tokenizers.Metaspace()]
-    )
-    tokenizer.decoder = decoders.Metaspace()
-    tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
-    tokenizer.add_special_tokens(special + extra)
-    folder.mkdir(parents=True, exist_ok=True)
-    tokenizer.save(str(folder / "tokenizer.json"))
-    return folder
-
-
 @pytest.fixture(scope="module")
 def tokenizer_folder(tmp_path_factory) -> Path:
-    return write_tokenizer(tmp_path_factory.mktemp("tokenizer"))
+    scored = [(piece, -2.0 - 0.1 * number) for number, piece in enumerate(PIECES)]
+    return write_tokenizer(tmp_path_factory.mktemp("tokenizer") / "t5", scored)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from openvima.data.verification import VerifyConfig, verify
 from openvima.errors import DatasetError, ServerError
 from openvima.hub import HubName, dataset_name, hub_name
 from openvima.publishing import push_demonstrations
-from small_data_sets import edit_manifest
+from small_data_sets import contents, edit_manifest, flip_bit
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Use 'content=<...>':DeprecationWarning"
@@ -103,10 +103,7 @@ def test_what_was_fetched_is_read_without_a_connection(hub: LocalHub, demos: Pat
 
 
 def test_a_shard_that_changed_since_is_not_pushed(hub: LocalHub, demos: Path) -> None:
-    (shard,) = demos.glob("*.arrow")
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 1
-    shard.write_bytes(content)
+    flip_bit(*demos.glob("*.arrow"))
     with pytest.raises(DatasetError, match="checksum is not that of the manifest"):
         push_demonstrations(demos, "owner/demos")
     assert not hub.requests
@@ -117,8 +114,7 @@ def test_a_manifest_of_others_names_no_file_outside(hub: LocalHub, demos: Path) 
         manifest["shards"]["../../secret.arrow"] = next(iter(manifest["shards"].values()))
 
     edit_manifest(demos, leave)
-    files = {path.name: path.read_bytes() for path in demos.iterdir() if path.is_file()}
-    hub.repository("evil/demos", "datasets").commit(files)
+    hub.repository("evil/demos", "datasets").commit(contents(demos))
     with pytest.raises(DatasetError, match="which is no plain file name"):
         Dataset("hf://evil/demos")
     with pytest.raises(DatasetError, match="which is no plain file name"):

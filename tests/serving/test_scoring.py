@@ -1,7 +1,6 @@
 """Policies are scored through a server as they are without one."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,43 +9,29 @@ import pytest
 
 from served_policies import Telltale
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-from openvima.env import TabletopEnv  # noqa: E402
-from openvima.errors import ConfigError, PolicyRaisedError, PromptError, ServerError  # noqa: E402
-from openvima.evaluation import EvaluationConfig, Results, evaluate  # noqa: E402
-from openvima.evaluation.config import Batch  # noqa: E402
-from openvima.evaluation.results import POLICY_ERROR  # noqa: E402
-from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy  # noqa: E402
-from openvima.policies import RandomPolicy, load_policy  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.presets import preset  # noqa: E402
-from openvima.serving import RemotePolicy, serve_in_thread  # noqa: E402
+from openvima.env import TabletopEnv
+from openvima.errors import ConfigError, PolicyRaisedError, PromptError, ServerError
+from openvima.evaluation import EvaluationConfig, Results, evaluate
+from openvima.evaluation.config import Batch
+from openvima.evaluation.results import POLICY_ERROR
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy
+from openvima.policies import RandomPolicy, load_policy
+from openvima.policies.inference import NetworkPolicy
+from openvima.serving import RemotePolicy, serve_in_thread
+from small_networks import one_thread, perturbed
+
+__all__ = ["one_thread"]  # as servers compute by default
 
 TASKS = ("rotate", "sweep_without_exceeding")
 TINY = EvaluationConfig(("random",), TASKS, ("L1",), episodes=3, batch=2)
 ABOUT = {"policy": {"name": "tiny", "sha256": "ab12"}}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """As servers compute by default."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def network_policy() -> NetworkPolicy:
-    """A network whose outputs depend visibly on everything; fresh heads start near zero."""
-    network = build_network(preset("nano"), seed=3)
-    generator = torch.Generator().manual_seed(4)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
-    return NetworkPolicy(network)
+    return NetworkPolicy(perturbed("nano"))
 
 
 def test_a_network_acts_through_a_server_as_here_bit_for_bit(network_policy: NetworkPolicy) -> None:

@@ -101,7 +101,7 @@ def test_an_example_names_its_images_in_the_stack_of_both(sources) -> None:
 
 
 @pytest.mark.slow
-def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(settings, data, tmp_path) -> None:
+def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(settings, tmp_path) -> None:
     short = {**settings, "pretraining.steps": 0, "schedule.steps": 2, "object_cache": tmp_path / "tokens"}
     detected = train(TrainingConfig.of({**short, "loader.boxes": HOOK, "loader.detected_prob": 1.0}))
     (folder,) = (tmp_path / "tokens").iterdir()

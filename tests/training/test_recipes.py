@@ -87,18 +87,8 @@ def test_a_recipe_leaves_out_what_other_parts_of_the_network_cannot_have(
 def test_options_take_precedence_over_the_file_and_the_file_over_the_recipe(trained, tmp_path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("{optimizer: {learning_rate: 0.5}, loader: {batch_size: 7}, data: demos}")
-    words = [
-        "train",
-        "--config",
-        str(file),
-        "--recipe",
-        "paper",
-        "--preset",
-        "nano",
-        "--loader.batch-size",
-        "9",
-    ]
-    assert main([*words, "--out", "run"]) == 0
+    words = f"train --config {file} --recipe paper --preset nano --loader.batch-size 9 --out run"
+    assert main(words.split()) == 0
     (config,) = trained
     assert (config.loader.batch_size, config.optimizer.learning_rate) == (9, 0.5)
     assert config.schedule.warmup_steps == 7000
@@ -202,23 +192,11 @@ def test_code_that_a_file_names_runs_only_with_trust_code(text: str, tmp_path, m
 STEPS = 2
 
 
-def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
-    words = [
-        "train",
-        "--data",
-        data,
-        "--out",
-        out,
-        "--preset",
-        preset,
-        "--recipe",
-        "nano",  # that of the preset begins with 1,600 steps of pretraining
-        "--schedule.steps",
-        STEPS,
-        "--loader.batch-size",
-        3,
-    ]
-    return main([str(word) for word in (*words, "--schedule.checkpoint-every", STEPS, *options)])
+def run_train(data: Path, out: Path, preset: str, *options: str) -> int:
+    # The recipe of the preset begins with 1,600 steps of pretraining.
+    words = f"train --data {data} --out {out} --preset {preset} --recipe nano --loader.batch-size 3"
+    words += f" --schedule.steps {STEPS} --schedule.checkpoint-every {STEPS}"
+    return main([*words.split(), *options])
 
 
 @pytest.mark.slow
@@ -228,7 +206,7 @@ def test_a_run_makes_a_working_policy(architecture, data, tmp_path) -> None:
     assert_it_acts(tmp_path)
 
 
-@pytest.mark.parametrize("finetune", ["False", "True"])
+@pytest.mark.parametrize("finetune", ["False", pytest.param("True", marks=pytest.mark.slow)])
 def test_crops_of_initial_weights_are_frozen_where_it_is_asked_for(finetune, data, tmp_path):
     option = ("--pretraining.finetune-crop-encoder", finetune)
     assert run_train(data, tmp_path / "on", "vima-nano", "--init-from", "openvima-vima", *option) == 0
