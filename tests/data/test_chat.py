@@ -225,7 +225,7 @@ def test_what_is_trained_is_what_is_asked(conversed: Path, chats: Path) -> None:
     assert np.array_equal(view[::2, ::2], np.moveaxis(Dataset(conversed)[0].rgb["top"][0], 0, -1))
 
 
-def test_questions_are_on_the_scene(conversed: Path, chats: Path) -> None:
+def test_questions_are_on_the_scene(chats: Path) -> None:
     asked = [each for each in examples(chats) if "question" in each["id"]]
     texts = [each["messages"][0]["content"][-1]["text"] for each in asked]
     assert len(asked) > 6 and len({text.split()[0] for text in texts}) >= 2

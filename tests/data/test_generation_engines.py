@@ -60,6 +60,7 @@ def test_ray_stopped_by_hand_leaves_whole_files_and_is_continued(
     assert ray.is_initialized()  # as it was found
 
 
+@pytest.mark.slow
 def test_a_job_of_ray_whose_worker_was_killed_runs_again(ray: ModuleType, tmp_path: Path) -> None:
     paths = [tmp_path / str(k) for k in range(3)]
     done = list(ray_imap_unordered(worker_jobs.die_at_first, paths, 2))

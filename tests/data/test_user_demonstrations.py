@@ -62,7 +62,7 @@ def test_sampled_and_composed_successes_make_one_data_set(tmp_path: Path) -> Non
     assert found.is_clean and found.num_replayed == 3 and not found.notes, (found.problems, found.notes)
 
 
-def test_a_changed_pose_of_a_composed_demonstration_does_not_replay(tmp_path: Path) -> None:
+def test_a_changed_pose_of_a_composed_demonstration_does_not_replay() -> None:
     from openvima.data.verification import find_difference
     from openvima.env import TabletopEnv
 
@@ -109,7 +109,7 @@ def test_the_same_demonstration_is_recorded_once_but_finished_where_it_was_kille
     assert contents(tmp_path) == before
 
 
-def test_sweeps_name_the_block_and_its_zone(tmp_path: Path) -> None:
+def test_sweeps_name_the_block_and_its_zone() -> None:
     objects = [("small block", "red", (0.5, 0.1)), ("three-sided rectangle", "blue", (0.5, -0.2))]
     episode = compose(objects, "Sweep {a}.", goals=[("swept_into", "a", "b")], end_effector="spatula")
     demo = demonstrate(episode, [Action.planar((0.5, 0.106), (0.5, -0.2325))])
