@@ -138,10 +138,15 @@ def assert_same_actions(some: dict, others: dict) -> None:
         np.testing.assert_array_equal(action, others[key][0], err_msg=f"episode and step {key}")
 
 
-def test_caches_change_nothing_in_a_ragged_batch(policy, prompts, pool) -> None:
-    steps = played(policy, prompts, pool)
+@pytest.fixture(scope="module")
+def together(policy, prompts, pool) -> dict:
+    """What the policy does in all episodes at once."""
+    return played(policy, prompts, pool)
+
+
+def test_caches_change_nothing_in_a_ragged_batch(policy, prompts, pool, together) -> None:
     assert len(set(policy.processor.encode_prompts(prompts)[0].mask_BL.sum(1).tolist())) > 2
-    assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-9
+    assert largest_difference(together, recomputed(policy, prompts, pool, together)) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["nano-bins", "small", "flamingo-nano", "gpt-nano"])  # others: see above
@@ -152,8 +157,7 @@ def test_in_single_precision_it_agrees_to_a_ten_thousandth(name, prompts, pool) 
     assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-4
 
 
-def test_neither_company_nor_order_changes_an_action(policy, prompts, pool) -> None:
-    together = played(policy, prompts, pool)
+def test_neither_company_nor_order_changes_an_action(policy, prompts, pool, together) -> None:
     for rows in ((3, 2, 1, 0), (1, 3)):
         assert_same_actions(played(policy, prompts, pool, rows), together)
 
@@ -195,9 +199,8 @@ def broken(observation: dict) -> dict:
     return {**observation, "rgb": {view: rgb.astype(np.float32) for view, rgb in observation["rgb"].items()}}
 
 
-def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
+def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool, together) -> None:
     """Each call below fails in a different place; then the episodes go on as if it had not been made."""
-    expected = played(policy, prompts, pool)
     crowded = max(pool, key=lambda observation: len(observe(observation)))
     policy.reset(prompts)
     for step in range(max(LENGTHS)):
@@ -217,7 +220,7 @@ def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
             policy.act([None, None, None, pool[2]] if seen[3] is not None else [None] * 4)
         for row, action in enumerate(policy.act(seen)):
             if action is not None:
-                np.testing.assert_array_equal(vector(action), expected[row, step][0])
+                np.testing.assert_array_equal(vector(action), together[row, step][0])
 
 
 def test_half_precision_does_not_blur_the_places_that_it_points_at(prompts, pool) -> None:
@@ -246,17 +249,17 @@ def test_draws_follow_from_the_generator_alone_and_leave_it_alone(policy, prompt
     generator = torch.Generator().manual_seed(11)
     state = generator.get_state()
     drawn = NetworkPolicy(policy.network, temperature=2.0, generator=generator)
-    together = played(drawn, prompts, pool)
-    assert_same_actions(played(drawn, prompts, pool, (3, 1)), together)
+    first = played(drawn, prompts, pool)
+    assert_same_actions(played(drawn, prompts, pool, (3, 1)), first)
     assert torch.equal(generator.get_state(), state)
     other = NetworkPolicy(policy.network, temperature=2.0, generator=torch.Generator().manual_seed(12))
     others = played(other, prompts, pool)
-    assert any(not np.array_equal(others[key][0], together[key][0]) for key in together)
+    assert any(not np.array_equal(others[key][0], first[key][0]) for key in first)
 
 
-def test_a_low_temperature_gives_the_greedy_actions(policy, prompts, pool) -> None:
+def test_a_low_temperature_gives_the_greedy_actions(policy, prompts, pool, together) -> None:
     cold = NetworkPolicy(policy.network, temperature=1e-9, generator=torch.Generator().manual_seed(1))
-    assert_same_actions(played(cold, prompts, pool), played(policy, prompts, pool))
+    assert_same_actions(played(cold, prompts, pool), together)
 
 
 def test_samples_have_the_distribution_of_the_logits() -> None:
@@ -281,12 +284,6 @@ def test_a_temperature_that_makes_no_sense_is_refused(small_sizes, temperature, 
         PolicyError, match=f"temperature is {temperature:g}; it must be 0, or a finite number above 0"
     ):
         NetworkPolicy(build_network(small_sizes, seed=0), temperature=temperature, generator=generator)
-
-
-def test_acting_before_a_reset_is_refused(small_sizes, pool) -> None:
-    policy = NetworkPolicy(build_network(small_sizes, seed=0))
-    with pytest.raises(PolicyError, match="no prompts yet; call reset"):
-        policy.act([pool[0]])
 
 
 @for_one_network

@@ -1,7 +1,9 @@
 """Published weights: names both ways, sizes from shapes, and files that are read without executing them."""
 
 import pickle
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -63,8 +65,8 @@ def architecture(request) -> str:
     return request.param
 
 
-@pytest.fixture
-def network(architecture) -> PolicyNetwork:
+@cache
+def drawn(architecture: str) -> PolicyNetwork:
     """A network of random numbers, so that no weight is like another; fresh norms and biases all are."""
     network = build_network(small(architecture), seed=5)
     generator = torch.Generator().manual_seed(1)
@@ -72,6 +74,11 @@ def network(architecture) -> PolicyNetwork:
         for parameter in network.parameters():
             parameter.copy_(torch.randn(parameter.shape, generator=generator))
     return network
+
+
+@pytest.fixture
+def network(architecture) -> PolicyNetwork:
+    return drawn(architecture)
 
 
 def contents(network: PolicyNetwork, architecture: str, *, unused_entries: bool = True) -> dict:
@@ -164,7 +171,7 @@ def test_matrices_of_the_decoder_are_published_transposed(network, architecture)
 
 
 def test_weights_are_published_and_read_in_float32(network) -> None:
-    assert {tensor.dtype for tensor in to_published(network.bfloat16()).values()} == {torch.float32}
+    assert {tensor.dtype for tensor in to_published(deepcopy(network).bfloat16()).values()} == {torch.float32}
     halves = {name: tensor.half() for name, tensor in to_published(network).items()}
     assert {tensor.dtype for tensor in from_published(halves).values()} == {torch.float32}
 
