@@ -20,7 +20,14 @@ from openvima.errors import ConfigError
 from openvima.perception.objects import TOP
 from openvima.policies.batch import HistoryBatch, InputLayout, PromptBatch
 from openvima.policies.nn.action_head import BinsConfig, BinsHead, ObservationTokens
-from openvima.policies.nn.decoder import AnyDecoderConfig, Decoder, DecoderConfig, build_decoder
+from openvima.policies.nn.decoder import (
+    OBSERVATION_MARK,
+    AnyDecoderConfig,
+    Decoder,
+    DecoderConfig,
+    PrefixDecoder,
+    build_decoder,
+)
 from openvima.policies.nn.heads import (
     AutoregressiveConfig,
     AutoregressiveHead,
@@ -305,6 +312,9 @@ class TokenPolicy(PolicyNetwork):
         layers[0].bias.fill_(_LINEAR_RANGE)
         layers[-1].bias.fill_(-_LINEAR_RANGE)
         self.decoder.align()
+        if isinstance(self.decoder, PrefixDecoder):  # it tells images of the prompt from observations
+            for layer, mark in ((layers[-1], 0.0), (self.observation_out, OBSERVATION_MARK)):
+                layer.weight[0], layer.bias[0] = 0, mark
 
     def _frame_tokens(self, features: torch.Tensor) -> torch.Tensor:
         """Make tokens of pairs of frames, (..., tokens · N, E): the first token of all pairs first.
