@@ -92,7 +92,7 @@ def test_each_architecture_overfits_32_demonstrations_and_repeats_them(
             group["lr"] = group["rate"] * min(1.0, (step + 1) / warmup, (MAX_STEPS - step) / DECAY_STEPS)
         optimizer.zero_grad()
         metrics = stage.backward(step)
-        if metrics["accuracy"] == 1 and metrics["loss"] < 0.03:  # then all bins are right, too
+        if metrics["accuracy"] == 1 and metrics["loss"] < 0.01:  # then no decision is a near tie
             break
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
