@@ -32,6 +32,7 @@ from openvima.training.source import (
     make_order,
     open_demonstrations,
     repeat_tasks,
+    show_first,
     split_examples,
 )
 from small_networks import collate_examples, examples_of, rngs_of
@@ -140,6 +141,20 @@ def test_demonstrations_of_repeated_tasks_are_shown_as_often_as_asked_in_an_epoc
         repeat_tasks(training, {"rotat": 2})
     with pytest.raises(ConfigError, match="repeat_tasks has 'rotate=0'"):
         resolve(TrainingConfig.of({**settings, "loader.repeat_tasks": "rotate=0"}))
+
+
+def test_the_first_steps_show_some_tasks_alone_and_all_of_their_demonstrations(data):
+    cache = open_object_cache(Dataset(data))
+    training, _ = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
+    source = repeat_tasks(training, {"rotate": 3})
+    plain = make_order(source, batch_size=2, seed=0, bucket=0, rank=0, num_ranks=1)
+    order = show_first(plain, source, ["rotate"], steps=plain.batches_per_epoch)
+    shown = {source[row].row for n in range(order.first_batches) for row in order.rows(n)}
+    assert shown == {example.row for example in training if example.episode.task == "rotate"}
+    assert all((order.rows(n) == plain.rows(n)).all() for n in range(order.first_batches, 60))
+    assert show_first(plain, source, ["twist"], steps=5) is plain  # there are none of these
+    with pytest.raises(ConfigError, match=r"loader\.first_tasks: there is no task 'rotat'"):
+        show_first(plain, source, ["rotat"], steps=5)
 
 
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):

@@ -151,6 +151,8 @@ class BatchOrder:
             padding; the fewer, the more any episode can meet any other.
         rank: This process among those that divide the batches.
         num_ranks: Number of them.
+        first_batches: Number of batches, the first ones, that take `first_episodes` alone.
+        first_episodes: Some of the episodes.
 
     Raises:
         ConfigError: Numbers that cannot be, or that do not fit together.
@@ -168,6 +170,8 @@ class BatchOrder:
     bucket: int = 50
     rank: int = 0
     num_ranks: int = 1
+    first_batches: int = 0
+    first_episodes: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.batch_size % self.num_ranks:
@@ -198,7 +202,10 @@ class BatchOrder:
         epoch, place = divmod(number, self.batches_per_epoch)
         rows, order = _order_of_epoch(self, epoch)
         start = order[place] * self.batch_size
-        return rows[start : start + self.batch_size]
+        rows = rows[start : start + self.batch_size]
+        if self.first_episodes is not None and number < self.first_batches:
+            rows = self.first_episodes[rows % len(self.first_episodes)]
+        return rows
 
 
 @lru_cache(maxsize=2)

@@ -19,7 +19,7 @@ from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Metrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.stage import crop_parameters
-from openvima.training.source import make_order
+from openvima.training.source import make_order, show_first
 
 CHUNK = 64  # demonstrations per batch of precomputed features
 MAX_FEATURES = 4_000_000  # images, about 1 kB each; above, features are computed in every step
@@ -62,6 +62,8 @@ class BehaviourCloning:
             rank=parallel.rank,
             num_ranks=parallel.num_ranks,
         )
+        first_tasks = [name.strip() for name in config.loader.first_tasks.split(",") if name.strip()]
+        self._order = show_first(self._order, training, first_tasks, config.loader.first_steps)
         self._batches: Iterator[list[tuple[Any, int]]] = iter(())
         self._next_step = -1
 

@@ -52,6 +52,9 @@ class LoaderConfig:
             validation.
         repeat_tasks: Tasks whose demonstrations an epoch shows several times, such as
             "novel_adj=2,twist=3"; each of the others is shown once.
+        first_tasks: Tasks, comma-separated, that the first steps show alone: what is hard to learn among all
+            others stays once it is learned.
+        first_steps: Number of these steps.
     """
 
     batch_size: Count = 64
@@ -65,6 +68,8 @@ class LoaderConfig:
     rerendered_prob: Probability = 0.0
     exclude_tasks: str = ""
     repeat_tasks: str = ""
+    first_tasks: str = ""
+    first_steps: Steps = 0
 
     @property
     def excluded_tasks(self) -> tuple[str, ...]:

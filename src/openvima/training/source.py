@@ -1,6 +1,6 @@
 """The demonstrations of a run before its first step: opened, checked, and split for validation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,13 +114,31 @@ def repeat_tasks(source: ExampleSource, repeats: Mapping[str, int]) -> ExampleSo
     Raises:
         ConfigError: There is no such task.
     """
-    tasks = source.cache.dataset.index.column("task").to_numpy(zero_copy_only=False)[source.rows]
-    known = {*tasks, *list_tasks()}
-    for name in repeats.keys() - known:
-        raise ConfigError(f"loader.repeat_tasks: {unknown_name('task', name, known)}")
-    counts = [repeats.get(task, 1) for task in tasks]
+    counts = [repeats.get(task, 1) for task in _tasks_of(source, repeats, "repeat_tasks")]
     rows, lengths = np.repeat(source.rows, counts), np.repeat(source.lengths, counts, axis=0)
     return replace(source, rows=rows, lengths=lengths)
+
+
+def show_first(order: BatchOrder, source: ExampleSource, tasks: Sequence[str], steps: int) -> BatchOrder:
+    """Let the first batches show the demonstrations of some tasks alone, if there are any.
+
+    Raises:
+        ConfigError: There is no such task.
+    """
+    places = np.flatnonzero(np.isin(_tasks_of(source, tasks, "first_tasks"), tasks))
+    # Those that are repeated are taken once.
+    places = places[np.unique(source.rows[places], return_index=True)[1]]
+    return replace(order, first_batches=steps, first_episodes=places) if len(places) else order
+
+
+def _tasks_of(source: ExampleSource, named: Iterable[str], setting: str) -> np.ndarray:
+    """Return the task of each demonstration; a setting may name these and those of the benchmark."""
+    tasks = source.cache.dataset.index.column("task").to_numpy(zero_copy_only=False)[source.rows]
+    known = {*tasks, *list_tasks()}
+    for name in named:
+        if name not in known:
+            raise ConfigError(f"loader.{setting}: {unknown_name('task', name, known)}")
+    return tasks
 
 
 def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: int) -> ExampleSource:
