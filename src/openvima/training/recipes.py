@@ -105,8 +105,12 @@ _PAPERS: Mapping[str, Any] = {
 _PAPERS_MIDAS: Mapping[str, Any] = {
     **_PAPERS,
     "preset": "midas-nano",
-    "schedule.steps": 8000,  # each takes twice as long as one of VIMA
-    "augmentation.leftmost_first": False,
+    "schedule.steps": 9000,  # each takes twice as long as one of VIMA
+    # Otherwise it never learns which object an image of the prompt shows. See
+    # results/2026-11-29_midas_first_tasks.md.
+    "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
+    "loader.first_steps": 1000,
+    "loader.repeat_tasks": "novel_adj=6,pick_in_order_then_restore=2",
     "augmentation.inverse_dynamics_prob": 0.33,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
@@ -228,17 +232,15 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     """Override settings by others.
 
     Steps replace epochs. `init_from` comes with a trained crop encoder, so it resets pretraining to the
-    default of the preset, which is then none, unless the others set it as well. Settings of the recipe
-    `papers` that other image tokens or another head cannot have are dropped.
+    default of the preset, which is then none, and shows no tasks first, unless the others set it as well.
+    Settings of the recipe `papers` that other image tokens cannot have are dropped.
     """
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
-    pretraining = {"pretraining.steps": None} if others.get("init_from") else {}
+    trained = {"pretraining.steps": None, "loader.first_steps": 0} if others.get("init_from") else {}
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
-    if others.get("model.head") == "autoregressive":
-        unfit |= {"augmentation.leftmost_first"}
     if tokens != "objects":
         unfit |= {"model.points", "optimizer.pointing_loss_weight"}
     if tokens not in ("objects", "object-perceiver"):
         unfit |= _PAPERS.keys() - _PAPERS_FRAMES.keys()
     fit = {name: value for name, value in settings.items() if name not in unfit}
-    return {**fit, **length, **pretraining, **others}
+    return {**fit, **length, **trained, **others}
