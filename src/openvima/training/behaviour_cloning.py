@@ -62,9 +62,9 @@ class BehaviourCloning:
             rank=parallel.rank,
             num_ranks=parallel.num_ranks,
         )
-        if config.loader.first_steps:
-            tasks = [name.strip() for name in config.loader.first_tasks.split(",")]
-            self._order = show_first(self._order, training, tasks, config.loader.first_steps)
+        loader = config.loader
+        if loader.first_steps:
+            self._order = show_first(self._order, training, loader.early_tasks, loader.first_steps)
         self._batches: Iterator[list[tuple[Any, int]]] = iter(())
         self._next_step = -1
 

@@ -74,7 +74,12 @@ class LoaderConfig:
     @property
     def excluded_tasks(self) -> tuple[str, ...]:
         """The excluded tasks, sorted."""
-        return tuple(sorted({name.strip() for name in self.exclude_tasks.split(",")} - {""}))
+        return _split_names(self.exclude_tasks)
+
+    @property
+    def early_tasks(self) -> tuple[str, ...]:
+        """The tasks that the first steps show, sorted."""
+        return _split_names(self.first_tasks)
 
     @property
     def repeats(self) -> dict[str, int]:
@@ -93,6 +98,10 @@ class LoaderConfig:
                 )
             found[name] = int(count)
         return found
+
+
+def _split_names(names: str) -> tuple[str, ...]:
+    return tuple(sorted({name.strip() for name in names.split(",")} - {""}))
 
 
 @dataclass(frozen=True, slots=True)

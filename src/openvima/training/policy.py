@@ -86,9 +86,7 @@ def train(
     """
     config = resolve(config)
     load_assets(config.assets)  # fails before there is a run folder
-    dataset = open_demonstrations(
-        config.data, config.loader.excluded_tasks, allow_heldout=config.allow_heldout
-    )
+    dataset = open_demonstrations(config.data, config.loader, allow_heldout=config.allow_heldout)
     if config.loader.rerendered_prob:
         check_scenes(dataset)
     boxes = None

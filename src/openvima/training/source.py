@@ -1,6 +1,6 @@
 """The demonstrations of a run before its first step: opened, checked, and split for validation."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,26 +16,28 @@ from openvima.policies.processor import Processor
 from openvima.tasks.registry import list_tasks
 from openvima.training.augmentation.prompts import text_of
 from openvima.training.batches import BatchOrder, ExampleSource
+from openvima.training.config import LoaderConfig
 from openvima.training.run_folder import held_out_demonstrations
 
 _PRIOR_DEMONSTRATIONS = 10_000  # enough for the marginals of 100 bins
 
 
 def open_demonstrations(
-    folder: Path, excluded: Sequence[str] = (), *, allow_heldout: bool = False
+    folder: Path, loader: LoaderConfig | None = None, *, allow_heldout: bool = False
 ) -> Dataset:
-    """Open a folder of demonstrations without those of some tasks, for training.
+    """Open a folder of demonstrations for training.
 
     Args:
         folder: The folder.
-        excluded: Names of tasks; the folder need not have any of them.
+        loader: Settings that name tasks; demonstrations of `exclude_tasks` are left out. The folder need not
+            have the tasks that it names.
         allow_heldout: Accept demonstrations that are held out for evaluation.
 
     Raises:
-        ConfigError: There is no such task, or no other one is left.
+        ConfigError: There is no such task, or none is left.
         DatasetError: The folder is no finished data set, or holds demonstrations that are held out.
     """
-    dataset = _leave_out_tasks(folder, excluded)
+    dataset = _open_tasks(folder, loader or LoaderConfig())
     if (found := held_out_demonstrations(dataset)) and not allow_heldout:
         raise DatasetError(
             f"{folder} holds demonstrations for evaluation only: {', '.join(found)}. Train on level train, "
@@ -44,25 +46,25 @@ def open_demonstrations(
     return dataset
 
 
-def _leave_out_tasks(folder: Path, excluded: Sequence[str]) -> Dataset:
-    if not excluded:
-        return Dataset(folder)
+def _open_tasks(folder: Path, loader: LoaderConfig) -> Dataset:
     folder = data_folder(folder)
-    present = sorted(read_manifest(folder)["tasks"])
+    present, excluded = sorted(read_manifest(folder)["tasks"]), loader.excluded_tasks
     known = {*present, *list_tasks()}
-    if problems := [
-        unknown_name("task", name, known, f"{folder} has {', '.join(present)}.")
-        for name in excluded
-        if name not in known
-    ]:
-        raise ConfigError(f"loader.exclude_tasks: {' '.join(problems)}")
+    named = {"exclude_tasks": excluded, "first_tasks": loader.early_tasks, "repeat_tasks": loader.repeats}
+    for setting, tasks in named.items():
+        if problems := [
+            unknown_name("task", name, known, f"{folder} has {', '.join(present)}.")
+            for name in tasks
+            if name not in known
+        ]:
+            raise ConfigError(f"loader.{setting}: {' '.join(problems)}")
     kept = [task for task in present if task not in excluded]
     if not kept:
         raise ConfigError(
             f"loader.exclude_tasks is {', '.join(excluded)}; {folder} has no other task, only "
             f"{', '.join(present)}."
         )
-    return Dataset(folder, tasks=kept)
+    return Dataset(folder, tasks=kept) if excluded else Dataset(folder)
 
 
 def check_scenes(dataset: Dataset) -> None:
@@ -109,36 +111,22 @@ def split_examples(
 
 
 def repeat_tasks(source: ExampleSource, repeats: Mapping[str, int]) -> ExampleSource:
-    """Let an epoch show the demonstrations of some tasks several times.
-
-    Raises:
-        ConfigError: There is no such task.
-    """
-    counts = [repeats.get(task, 1) for task in _tasks_of(source, repeats, "repeat_tasks")]
+    """Let an epoch show the demonstrations of some tasks several times."""
+    counts = [repeats.get(task, 1) for task in _tasks_of(source)]
     rows, lengths = np.repeat(source.rows, counts), np.repeat(source.lengths, counts, axis=0)
     return replace(source, rows=rows, lengths=lengths)
 
 
 def show_first(order: BatchOrder, source: ExampleSource, tasks: Sequence[str], steps: int) -> BatchOrder:
-    """Let the first batches show the demonstrations of some tasks alone, if there are any.
-
-    Raises:
-        ConfigError: There is no such task.
-    """
-    places = np.flatnonzero(np.isin(_tasks_of(source, tasks, "first_tasks"), tasks))
+    """Let the first batches show the demonstrations of some tasks alone, if there are any."""
+    places = np.flatnonzero(np.isin(_tasks_of(source), tasks))
     # Those that are repeated are taken once.
     places = places[np.unique(source.rows[places], return_index=True)[1]]
     return replace(order, first_batches=steps, first_episodes=places) if len(places) else order
 
 
-def _tasks_of(source: ExampleSource, named: Iterable[str], setting: str) -> np.ndarray:
-    """Return the task of each demonstration; a setting may name these and those of the benchmark."""
-    tasks = source.cache.dataset.index.column("task").to_numpy(zero_copy_only=False)[source.rows]
-    known = {*tasks, *list_tasks()}
-    for name in named:
-        if name not in known:
-            raise ConfigError(f"loader.{setting}: {unknown_name('task', name, known)}")
-    return tasks
+def _tasks_of(source: ExampleSource) -> np.ndarray:
+    return source.cache.dataset.index.column("task").to_numpy(zero_copy_only=False)[source.rows]
 
 
 def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: int) -> ExampleSource:
