@@ -37,6 +37,15 @@ def test_metrics_have_stage_and_step_and_no_times_and_are_not_logged_twice(setti
 
 
 @pytest.mark.slow
+def test_nothing_is_held_out_against_tasks_that_have_not_been_shown(settings):
+    early = {"pretraining.steps": 0, "loader.first_tasks": "rotate", "loader.first_steps": 2}
+    config = TrainingConfig.of({**settings, **early})
+    train(config)
+    lines = [line for line in metrics_of(config.out) if "validation_score" in line]
+    assert [line["step"] for line in lines] == [4, 6]
+
+
+@pytest.mark.slow
 def test_differing_settings_are_named_and_force_starts_anew(settings):
     train(TrainingConfig.of(settings))
     changed = {**settings, "schedule.steps": 2, "optimizer.learning_rate": 5e-4}

@@ -133,6 +133,17 @@ def test_init_from_disables_pretraining_unless_it_is_set(trained, tmp_path) -> N
         assert resolve(trained[-1]).pretraining.steps == expected, words
 
 
+def test_init_from_shows_no_tasks_first_unless_it_is_asked_to(trained) -> None:
+    words = ["train", "--preset", "midas-nano", "--data", "demos", "--out", "run"]
+    for more, expected in (
+        ([], 1000),
+        (["--init-from", "other"], 0),
+        (["--init-from", "other", "--loader.first-steps", "5"], 5),
+    ):
+        assert main([*words, *more]) == 0
+        assert trained[-1].loader.first_steps == expected
+
+
 def test_steps_replace_the_epochs_of_a_recipe(trained, tmp_path) -> None:
     words = ["train", "--recipe", "workstation", "--preset", "nano", "--data", "demos", "--out", "run"]
     file = tmp_path / "mine.yaml"

@@ -157,6 +157,8 @@ def test_the_first_steps_show_some_tasks_alone_and_all_of_their_demonstrations(d
     assert shown == {example.row for example in training if example.episode.task == "rotate"}
     assert all((order.rows(n) == plain.rows(n)).all() for n in range(order.first_batches, 60))
     assert show_first(plain, source, ["twist"], steps=5) is plain  # there are none of these
+    everything = [*{example.episode.task for example in training}, "twist"]
+    assert show_first(plain, source, everything, steps=5) is plain
 
 
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):

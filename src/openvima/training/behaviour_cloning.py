@@ -87,9 +87,13 @@ class BehaviourCloning:
 
     @torch.no_grad()
     def validate(self) -> Metrics:
-        """Return loss and metrics on held-out demonstrations; `Learner.score` names the score."""
+        """Return loss and metrics on held-out demonstrations; `Learner.score` names the score.
+
+        There are none as long as some tasks are shown alone: scores of others mean nothing, and scores of
+        these alone cannot be compared with later ones.
+        """
         source, collate = self._validation, self._learner.collator()
-        if not len(source):
+        if not len(source) or 0 < self._order.first_batches >= self._next_step:
             return {}
         total = source.num_steps(np.arange(len(source)))
         ranks, parts = self._parallel.num_ranks, self._config.optimizer.grad_accum_steps

@@ -118,11 +118,14 @@ def repeat_tasks(source: ExampleSource, repeats: Mapping[str, int]) -> ExampleSo
 
 
 def show_first(order: BatchOrder, source: ExampleSource, tasks: Sequence[str], steps: int) -> BatchOrder:
-    """Let the first batches show the demonstrations of some tasks alone, if there are any."""
-    places = np.flatnonzero(np.isin(_tasks_of(source), tasks))
+    """Let the first batches show the demonstrations of some tasks alone, if there are these and others."""
+    is_first = np.isin(_tasks_of(source), tasks)
+    if is_first.all() or not is_first.any():
+        return order
     # Those that are repeated are taken once.
+    places = np.flatnonzero(is_first)
     places = places[np.unique(source.rows[places], return_index=True)[1]]
-    return replace(order, first_batches=steps, first_episodes=places) if len(places) else order
+    return replace(order, first_batches=steps, first_episodes=places)
 
 
 def _tasks_of(source: ExampleSource) -> np.ndarray:
