@@ -37,7 +37,7 @@ WORKER_VARIABLES = {
 }
 _KILLED = (
     "a worker process was killed (often for lack of memory; --workers lowers the need). "
-    "Whole files were kept, and the same command continues."
+    "Finished files are kept; repeat the command to resume."
 )
 _NOT_STARTED = (
     "the worker processes could not start. They import your script, which must be a file where all that runs "
@@ -384,7 +384,7 @@ def _run_all(
     except ray.exceptions.RayError as error:
         raise WorkerError(
             f"a worker of the Ray cluster died ({one_line(error)}); often for lack of memory. "
-            "Whole files were kept, and the same command continues."
+            "Finished files are kept; repeat the command to resume."
         ) from None
     finally:
         _stop(ray, list(running))
