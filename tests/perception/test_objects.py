@@ -57,7 +57,7 @@ def blobs(draw: st.DrawFn) -> np.ndarray:
     return shown
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60, derandomize=True)
 @given(blobs())
 def test_crops_boxes_and_grasps_equal_those_of_the_slow_twin(shown: np.ndarray) -> None:
     rgb = noise(shape=shown.shape)

@@ -56,7 +56,7 @@ def test_x_has_50_bins_y_100_and_every_quaternion_component_50():
     assert NUM_BINS == (50, 100, 50, 50, 50, 50) * 2
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100, derandomize=True)
 @given(st.floats(-0.5, 1.5, width=32))
 def test_a_value_falls_into_the_bin_of_the_definition(value):
     for count in (50, 100):  # whole float32 steps away from any boundary, where rounding would decide

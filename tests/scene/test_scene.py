@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from openvima.errors import ActionError, PromptError, SceneError
 from openvima.scene import (
@@ -67,14 +67,12 @@ def assert_close(a: Pose, b: Pose) -> None:
     np.testing.assert_allclose(a.matrix(), b.matrix(), atol=1e-9)  # q and −q are the same rotation
 
 
-@settings(deadline=None)
 @given(poses)
 def test_a_pose_times_its_inverse_is_the_identity(pose: Pose) -> None:
     assert_close(pose @ pose.inverse(), Pose((0.0, 0.0, 0.0)))
     assert_close(pose.inverse() @ pose, Pose((0.0, 0.0, 0.0)))
 
 
-@settings(deadline=None)
 @given(flat_poses, angles)
 def test_turning_on_the_spot_adds_to_the_heading_and_keeps_the_place(pose: Pose, turn: float) -> None:
     turned = pose.rotated(turn)
@@ -225,7 +223,6 @@ def arrays(**changes: object) -> dict[str, Any]:
     return action | changes
 
 
-@settings(deadline=None)
 @given(angles)
 def test_arrays_and_actions_convert_into_one_another(yaw: float) -> None:
     action = Action.planar((0.4, 0.1), (0.6, -0.2), yaw)

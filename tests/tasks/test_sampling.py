@@ -60,7 +60,7 @@ def test_seeds_domains_and_levels_share_no_scene() -> None:
     assert len(set(scenes)) == len(scenes)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seeds)
 def test_every_start_is_reproducible_open_inside_the_workspace_and_numbered_without_gaps(seed: int) -> None:
     task, level = EVERYWHERE[seed % len(EVERYWHERE)]

@@ -29,7 +29,7 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(VALUES, st.integers(3, 5))
 def test_plain_values_come_back(value: object, protocol: int) -> None:
     assert read_pickle(pickle.dumps(value, protocol)) == value
