@@ -26,12 +26,14 @@ class Example:
             there.
         row: Its number among all demonstrations.
         other: Another one, from which objects may be inserted.
+        keeps_prompt: Whether no draw exchanges its prompt for one of inverse dynamics.
     """
 
     episode: PreprocessedEpisode
     base: int = 0
     row: int = 0
     other: "Example | None" = None
+    keeps_prompt: bool = False
 
 
 # From examples and, in training, one generator for each, to a batch.
@@ -92,6 +94,7 @@ class BatchMaker:
             where it has the demonstration; see `training.source.alternative_source`.
         distractor_prob: Probability of inserting distractors from another demonstration, for those that allow
             it; see `with_distractors`.
+        first_batches: Number of batches, the first ones, whose demonstrations keep their prompts.
     """
 
     source: ExampleSource
@@ -100,6 +103,7 @@ class BatchMaker:
     largest: int
     alternatives: tuple[tuple[ExampleSource, float], ...] = ()
     distractor_prob: float = 0.0
+    first_batches: int = 0
 
     def __call__(self, indices: np.ndarray, number: int) -> list[tuple[Any, int]]:
         """Return the parts of one batch, each with its number of demonstration steps."""
@@ -108,6 +112,8 @@ class BatchMaker:
             rows = self.source.rows[part].tolist()
             rngs = [np.random.default_rng([self.seed, number, row]) for row in rows]
             examples = [self._draw(row, rng) for row, rng in zip(rows, rngs, strict=True)]
+            if number < self.first_batches:
+                examples = [replace(example, keeps_prompt=True) for example in examples]
             parts.append((self.collate(examples, rngs), self.source.num_steps(part)))
         return parts
 

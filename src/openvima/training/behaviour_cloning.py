@@ -123,6 +123,7 @@ class BehaviourCloning:
             largest=-(-ours // parts),
             alternatives=self._alternatives,
             distractor_prob=config.augmentation.distractor_prob,
+            first_batches=self._order.first_batches,
         )
         workers = min(config.loader.num_workers, num_cpus())
         return iter(read_batches(self._order, make, first=step, num_workers=workers))

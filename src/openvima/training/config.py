@@ -52,8 +52,8 @@ class LoaderConfig:
             validation.
         repeat_tasks: Tasks whose demonstrations an epoch shows several times, such as
             "novel_adj=2,twist=3"; each of the others is shown once.
-        first_tasks: Tasks, comma-separated, that the first steps show alone: what is hard to learn among all
-            others stays once it is learned.
+        first_tasks: Tasks, comma-separated, that the first steps show alone, with their own prompts: what is
+            hard to learn among all others stays once it is learned.
         first_steps: Number of these steps.
     """
 

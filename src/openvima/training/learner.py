@@ -202,7 +202,12 @@ class PolicyCollate:
         numbered = number_images([example.episode for example in shown], first_images)
         others = iter(numbered[len(examples) :])
         episodes = [
-            self._augmentation(episode, rng, None if example.other is None else next(others))
+            self._augmentation(
+                episode,
+                rng,
+                None if example.other is None else next(others),
+                keeps_prompt=example.keeps_prompt,
+            )
             for example, episode, rng in zip(examples, numbered, rngs or [None] * len(examples), strict=False)
         ]
         batch = self._processor.collate(episodes)

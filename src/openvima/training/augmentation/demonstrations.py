@@ -219,6 +219,8 @@ class DemonstrationAugmentation:
         episode: PreprocessedEpisode,
         rng: np.random.Generator | None,
         other: PreprocessedEpisode | None = None,
+        *,
+        keeps_prompt: bool = False,
     ) -> PreprocessedEpisode:
         """Augment a demonstration; without a generator, as in validation, only what is certain happens.
 
@@ -226,11 +228,13 @@ class DemonstrationAugmentation:
             episode: The demonstration.
             rng: Source of all draws.
             other: A demonstration from which distractors are inserted; None inserts none.
+            keeps_prompt: Whether no draw exchanges the prompt for that of inverse dynamics.
         """
         if self.centres_picks:
             episode = centre_picks(episode)
         prob = self.inverse_dynamics_prob
-        is_inverse = prob == 1 or (rng is not None and prob > 0 and rng.random() < prob)
+        is_drawn = rng is not None and prob > 0 and rng.random() < prob and not keeps_prompt
+        is_inverse = prob == 1 or is_drawn
         if self.leftmost_first and not is_inverse:
             episode = leftmost_first(episode)
         if is_inverse:
