@@ -14,9 +14,9 @@ from openvima.policies import preset
 from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
-from openvima.training.batches import Example
+from openvima.training.batches import BatchMaker, Example
 from openvima.training.learner import PolicyCollate
-from small_networks import rngs_of
+from small_networks import rngs_of, source_of_episodes
 
 PROCESSORS = {name: Processor.of(preset(name).inputs) for name in ("nano", "midas-nano")}  # objects, views
 
@@ -73,6 +73,18 @@ def test_the_draw_follows_from_the_example_alone(demonstrations_of_several_steps
     examples = [Example(episode) for episode in episodes]
     together = mixed(examples, rngs_of(episodes)).prompts.mask_BL.sum(1).tolist()
     assert together == [length for length, *_ in prompts_of(mixed, episodes, rngs_of(episodes))]
+
+
+def test_demonstrations_of_the_first_batches_keep_their_prompts(demonstrations_of_several_steps) -> None:
+    source = source_of_episodes([preprocess(demo, "objects") for demo in demonstrations_of_several_steps])
+
+    def words(share: float, number: int) -> list[list]:
+        make = BatchMaker(source, collate_of(PROCESSORS["nano"], share), 0, 99, first_batches=5)
+        parts = make(np.arange(len(source)), number)
+        return [batch.prompts.word_ids_BL.tolist() for batch, _ in parts]
+
+    assert words(0.9, 4) == words(0.0, 4)
+    assert words(0.9, 5) != words(0.0, 5)
 
 
 def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_is_inverse_dynamics(

@@ -109,8 +109,8 @@ _PAPERS_MIDAS: Mapping[str, Any] = {
     # Otherwise it never learns which object an image of the prompt shows. See
     # results/2026-11-29_midas_first_tasks.md.
     "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
-    "loader.first_steps": 1000,
-    "loader.repeat_tasks": "novel_adj=6,pick_in_order_then_restore=2",
+    "loader.first_steps": 900,
+    "augmentation.leftmost_first": False,  # this head need not foresee a choice
     "augmentation.inverse_dynamics_prob": 0.33,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
