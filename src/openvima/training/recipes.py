@@ -233,11 +233,14 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
 
     Steps replace epochs. `init_from` comes with a trained crop encoder, so it resets pretraining to the
     default of the preset, which is then none, and shows no tasks first, unless the others set it as well.
-    Settings of the recipe `papers` that other image tokens cannot have are dropped.
+    Settings of the recipe `papers` that other image tokens cannot have, or another head has no use for, are
+    dropped.
     """
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     trained = {"pretraining.steps": None, "loader.first_steps": 0} if others.get("init_from") else {}
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
+    if others.get("model.head") == "autoregressive":
+        unfit |= {"augmentation.leftmost_first"}
     if tokens != "objects":
         unfit |= {"model.points", "optimizer.pointing_loss_weight"}
     if tokens not in ("objects", "object-perceiver"):
