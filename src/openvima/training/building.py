@@ -15,6 +15,7 @@ from openvima.policies.architectures import TokenPolicyConfig
 from openvima.policies.build import PolicyConfig, appearance_width, build_network, config_to_dict
 from openvima.policies.checkpoint import load_network
 from openvima.policies.naming import find_checkpoint
+from openvima.policies.nn.heads import AutoregressiveConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.presets import PRESETS, own_policies, preset
@@ -100,6 +101,11 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
                 f"augmentation.{name} is {getattr(augmentation, name)}, but preset {config.preset!r} takes "
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
+    if augmentation.leftmost_first and isinstance(sizes.head, AutoregressiveConfig):
+        raise ConfigError(
+            "augmentation.leftmost_first is True, but an autoregressive head reads the actions to learn as "
+            "those that were done; set it to False."
+        )
     weight = config.optimizer.pointing_loss_weight
     if weight and not (isinstance(sizes, TokenPolicyConfig) and sizes.has_object_tokens):
         raise ConfigError(

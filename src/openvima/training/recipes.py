@@ -110,7 +110,7 @@ _PAPERS_MIDAS: Mapping[str, Any] = {
     # results/2026-11-29_midas_first_tasks.md.
     "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
     "loader.first_steps": 900,
-    "augmentation.leftmost_first": False,  # this head need not foresee a choice
+    "augmentation.leftmost_first": False,
     "augmentation.inverse_dynamics_prob": 0.33,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
@@ -233,8 +233,7 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
 
     Steps replace epochs. `init_from` comes with a trained crop encoder, so it resets pretraining to the
     default of the preset, which is then none, and shows no tasks first, unless the others set it as well.
-    Settings of the recipe `papers` that other image tokens cannot have, or another head has no use for, are
-    dropped.
+    Settings of the recipe `papers` that other image tokens or another head cannot have are dropped.
     """
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     trained = {"pretraining.steps": None, "loader.first_steps": 0} if others.get("init_from") else {}

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from openvima.data.object_cache import ObjectCache
-from openvima.data.reader import Dataset, data_folder, read_manifest, split_hashes
+from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import UNKNOWN_SCENES
 from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.perception.preprocessing import split_prompt
@@ -47,13 +47,13 @@ def open_demonstrations(
 
 
 def _open_tasks(folder: Path, loader: LoaderConfig) -> Dataset:
-    folder = data_folder(folder)
-    present, excluded = sorted(read_manifest(folder)["tasks"]), loader.excluded_tasks
+    dataset, excluded = Dataset(folder), loader.excluded_tasks
+    present = sorted(dataset.manifest["tasks"])
     known = {*present, *list_tasks()}
     named = {"exclude_tasks": excluded, "first_tasks": loader.early_tasks, "repeat_tasks": loader.repeats}
     for setting, tasks in named.items():
         if problems := [
-            unknown_name("task", name, known, f"{folder} has {', '.join(present)}.")
+            unknown_name("task", name, known, f"{dataset.path} has {', '.join(present)}.")
             for name in tasks
             if name not in known
         ]:
@@ -61,10 +61,10 @@ def _open_tasks(folder: Path, loader: LoaderConfig) -> Dataset:
     kept = [task for task in present if task not in excluded]
     if not kept:
         raise ConfigError(
-            f"loader.exclude_tasks is {', '.join(excluded)}; {folder} has no other task, only "
+            f"loader.exclude_tasks is {', '.join(excluded)}; {dataset.path} has no other task, only "
             f"{', '.join(present)}."
         )
-    return Dataset(folder, tasks=kept) if excluded else Dataset(folder)
+    return Dataset(folder, tasks=kept) if excluded else dataset
 
 
 def check_scenes(dataset: Dataset) -> None:

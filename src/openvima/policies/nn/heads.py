@@ -98,8 +98,7 @@ class AutoregressiveHead(nn.Module):
     ) -> ActionLoss:
         """Return the loss of whole histories, with teacher forcing also within an action; see `bins_loss`.
 
-        So the actions returned are more accurate than those of `decode_step`. Where others were executed, the
-        history shows the actions to learn all the same: they are its tokens.
+        So the actions returned are more accurate than those of `decode_step`.
         """
         segments = [observations.segment(), self._segment(targets.actions_BTC, targets.steps_BT)]
         (outputs_BTQD, actions_BTCD), _ = decoder.decode_segments(cache, segments)
