@@ -109,7 +109,7 @@ _PAPERS_MIDAS: Mapping[str, Any] = {
     # Otherwise it never learns which object an image of the prompt shows. See
     # results/2026-11-29_midas_first_tasks.md.
     "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
-    "loader.first_steps": 900,
+    "loader.first_steps": 600,
     "augmentation.leftmost_first": False,
     "augmentation.inverse_dynamics_prob": 0.33,
 }

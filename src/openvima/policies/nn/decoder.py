@@ -24,6 +24,7 @@ MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history toge
 MAX_PROMPT_POSITIONS = 256
 OBSERVATION_MARK = 4.0  # first channel of fresh observation tokens; the others are of the order of 1
 _MARK_GAIN = 3.0  # lowers a score by 3 · 3 · 4 / √(width of a head), 6 nats
+_POSITION_GAIN = 8.0  # of fresh position embeddings, which are added to tokens of the order of 1
 
 KeysValues = tuple[torch.Tensor, torch.Tensor]  # (B, H, S, K) each
 
@@ -223,6 +224,14 @@ class CausalDecoder(nn.Module):
         outputs_BLD = outputs_BPD.new_zeros(sequence_BLD.shape).scatter(1, index_BPD, outputs_BPD)
         return outputs_BLD.unflatten(1, valid_BTQ.shape[1:]).split(sizes, dim=2), cache
 
+    @torch.no_grad()
+    def _init_weights(self, std: float) -> None:
+        """Draw fresh weights; smaller positions are inaudible, see results/2026-11-29_positions.md."""
+        normal_weights(self, std)
+        for part in self.modules():
+            if isinstance(part, nn.Embedding):
+                part.weight.mul_(_POSITION_GAIN)
+
     def _cross_attend(
         self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
     ) -> torch.Tensor:
@@ -248,7 +257,7 @@ class Decoder(CausalDecoder):
         super().__init__(config.width, config.num_layers, config.num_self_heads, config.dropout)
         self.prompt_positions = nn.Embedding(MAX_PROMPT_POSITIONS, config.width)
         self.cross_blocks = nn.ModuleList(CrossBlock(config) for _ in range(config.num_layers))
-        normal_weights(self, config.initial_std)
+        self._init_weights(config.initial_std)
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Compute the keys and values of the prompt for every cross block."""
@@ -277,7 +286,7 @@ class PrefixDecoder(CausalDecoder):
     def __init__(self, config: PrefixDecoderConfig) -> None:
         super().__init__(config.width, config.num_layers, config.num_heads, config.dropout)
         self.separator = nn.Parameter(torch.zeros(config.width))
-        normal_weights(self, config.initial_std)
+        self._init_weights(config.initial_std)
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Decode prompt and separator; the prompt is causal as well."""
