@@ -24,7 +24,7 @@ MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history toge
 MAX_PROMPT_POSITIONS = 256
 OBSERVATION_MARK = 4.0  # first channel of fresh observation tokens; the others are of the order of 1
 _MARK_GAIN = 3.0  # lowers a score by 3 · 3 · 4 / √(width of a head), 6 nats
-_POSITION_GAIN = 8.0  # of fresh position embeddings, which are added to tokens of the order of 1
+_POSITION_GAIN = 8.0  # of position embeddings, which are added to tokens of the order of 1
 
 KeysValues = tuple[torch.Tensor, torch.Tensor]  # (B, H, S, K) each
 
@@ -143,8 +143,14 @@ class CausalDecoder(nn.Module):
         raise NotImplementedError
 
     def align(self) -> None:
-        """Let fresh attention to the prompt compare queries and keys by one matrix."""
-        raise NotImplementedError
+        """Let fresh attention to the prompt compare queries and keys by one matrix, and hear positions.
+
+        Small positions are learned slowly or, beside image tokens that grow, not at all; see
+        results/2026-11-29_positions.md.
+        """
+        for part in self.children():
+            if isinstance(part, nn.Embedding):
+                part.weight.mul_(_POSITION_GAIN)
 
     def forward(
         self,
@@ -224,14 +230,6 @@ class CausalDecoder(nn.Module):
         outputs_BLD = outputs_BPD.new_zeros(sequence_BLD.shape).scatter(1, index_BPD, outputs_BPD)
         return outputs_BLD.unflatten(1, valid_BTQ.shape[1:]).split(sizes, dim=2), cache
 
-    @torch.no_grad()
-    def _init_weights(self, std: float) -> None:
-        """Draw fresh weights; smaller positions are inaudible, see results/2026-11-29_positions.md."""
-        normal_weights(self, std)
-        for part in self.modules():
-            if isinstance(part, nn.Embedding):
-                part.weight.mul_(_POSITION_GAIN)
-
     def _cross_attend(
         self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
     ) -> torch.Tensor:
@@ -257,7 +255,7 @@ class Decoder(CausalDecoder):
         super().__init__(config.width, config.num_layers, config.num_self_heads, config.dropout)
         self.prompt_positions = nn.Embedding(MAX_PROMPT_POSITIONS, config.width)
         self.cross_blocks = nn.ModuleList(CrossBlock(config) for _ in range(config.num_layers))
-        self._init_weights(config.initial_std)
+        normal_weights(self, config.initial_std)
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Compute the keys and values of the prompt for every cross block."""
@@ -269,6 +267,7 @@ class Decoder(CausalDecoder):
 
     def align(self) -> None:
         """Do so in every cross block."""
+        super().align()
         for block in (cast(CrossBlock, each) for each in self.cross_blocks):
             _align(block.query.weight, block.key_value.weight[: self.width])
 
@@ -286,7 +285,7 @@ class PrefixDecoder(CausalDecoder):
     def __init__(self, config: PrefixDecoderConfig) -> None:
         super().__init__(config.width, config.num_layers, config.num_heads, config.dropout)
         self.separator = nn.Parameter(torch.zeros(config.width))
-        self._init_weights(config.initial_std)
+        normal_weights(self, config.initial_std)
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Decode prompt and separator; the prompt is causal as well."""
@@ -303,6 +302,7 @@ class PrefixDecoder(CausalDecoder):
         There objects are most like themselves, and training forgets the prompt within 300 steps. So the first
         channel of these heads lowers the score of tokens with `OBSERVATION_MARK` in their own first channel.
         """
+        super().align()
         block = cast(SelfBlock, self.self_blocks[0])
         head_width = self.width // self.num_heads
         aligned = -(-self.num_heads // 2) * head_width
