@@ -143,14 +143,8 @@ class CausalDecoder(nn.Module):
         raise NotImplementedError
 
     def align(self) -> None:
-        """Let fresh attention to the prompt compare queries and keys by one matrix, and hear positions.
-
-        Small positions are learned slowly or, beside image tokens that grow, not at all; see
-        results/2026-11-29_positions.md.
-        """
-        for part in self.children():
-            if isinstance(part, nn.Embedding):
-                part.weight.mul_(_POSITION_GAIN)
+        """Let fresh attention to the prompt compare queries and keys by one matrix."""
+        raise NotImplementedError
 
     def forward(
         self,
@@ -267,7 +261,6 @@ class Decoder(CausalDecoder):
 
     def align(self) -> None:
         """Do so in every cross block."""
-        super().align()
         for block in (cast(CrossBlock, each) for each in self.cross_blocks):
             _align(block.query.weight, block.key_value.weight[: self.width])
 
@@ -301,8 +294,11 @@ class PrefixDecoder(CausalDecoder):
 
         There objects are most like themselves, and training forgets the prompt within 300 steps. So the first
         channel of these heads lowers the score of tokens with `OBSERVATION_MARK` in their own first channel.
+
+        Positions start as strong as the tokens that they are added to: small ones are inaudible beside image
+        tokens, which grow in training. See results/2026-11-29_positions.md.
         """
-        super().align()
+        self.positions.weight.mul_(_POSITION_GAIN)
         block = cast(SelfBlock, self.self_blocks[0])
         head_width = self.width // self.num_heads
         aligned = -(-self.num_heads // 2) * head_width
