@@ -145,9 +145,13 @@ def test_the_loss_is_that_of_the_published_head_on_these_logits(network, demonst
 
 
 @torch.no_grad()
-def test_positions_from_objects_are_read_before_the_next_component_is_decoded(demonstrations) -> None:
+@pytest.mark.parametrize("at_scenes", [False, True])
+def test_positions_from_objects_are_read_before_the_next_component_is_decoded(
+    at_scenes, demonstrations
+) -> None:
     # A moved x may let y follow, and the place be near no object then; with this seed none does.
-    network = perturbed(with_variant(preset("midas-nano"), {"points": True}), seed=1).double()
+    config = with_variant(preset("midas-nano"), {"points": True, "points_at_scenes": at_scenes})
+    network = perturbed(config, seed=4).double()
     batch, features = read(network, demonstrations)
     prompt, steps = network.encode_prompt(batch.prompts, features), batch.targets.steps_BT[:, :1]
     none = torch.zeros_like(batch.targets.actions_BTC[:, :1])
@@ -155,11 +159,15 @@ def test_positions_from_objects_are_read_before_the_next_component_is_decoded(de
     actions, _ = network.decode_step(
         prompt, network.init_cache(prompt), history, features, none, torch.zeros_like(steps)
     )
+    targets = replace(batch.targets, actions_BTC=actions, steps_BT=steps)
+    if at_scenes:
+        metrics = network.loss(prompt, history, features, targets)[1]
+        assert metrics["pick_accuracy"] == metrics["place_accuracy"] == 1
+        return
     points = network.observe(history, features).points_BTQ2
     pick, place = (actions[:, :, None, part] - points for part in (slice(0, 2), slice(6, 8)))
     assert (pick.norm(dim=-1).amin(-1) < 1e-6).all()
     assert not (place.norm(dim=-1).amin(-1) < 1e-6).all()  # some places are near no object
-    targets = replace(batch.targets, actions_BTC=actions, steps_BT=steps)
     loss_of = network.head.loss(
         network.decoder, network.init_cache(prompt), network.observe(history, features), targets
     )
@@ -192,3 +200,13 @@ def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonst
     expected = on.prompt.images(tokens_IE)[prompts.object_index_BL[is_image_BL]]
     torch.testing.assert_close(added_BLD[is_image_BL], expected)  # widths are equal: no layer behind
     assert expected.abs().max() > 1e-3
+
+
+def test_fresh_tokens_of_bins_are_heard_and_alike_where_bins_are_near():
+    tokens = build_network(preset("midas-nano"), seed=0).head.actions
+    for component, count in enumerate(NUM_BINS):
+        vectors_ND = tokens.embed(component, torch.arange(count))
+        assert 0.25 < vectors_ND.std(dim=0).square().mean().sqrt() < 0.6
+        near = torch.cosine_similarity(vectors_ND[:-1], vectors_ND[1:])
+        far = torch.cosine_similarity(vectors_ND[: count // 2], vectors_ND[count // 2 :])
+        assert near.min() > 0.9 and far.abs().mean() < 0.4

@@ -68,6 +68,51 @@ def test_it_is_the_cross_entropy_of_the_object_nearest_to_the_demonstrated_posit
     assert observations.tokens_BTQD.grad[targets.steps_BT].isfinite().all()
 
 
+def _with_scenes(observations: ObservationTokens, generator: torch.Generator) -> ObservationTokens:
+    """Four tokens of the prompt: a word, and three objects of a scene, one of which has not moved."""
+    tokens = torch.randn(B, 4, D, generator=generator)
+    points = torch.rand(B, 4, 2, generator=generator, dtype=torch.float64) + 1
+    points[:, 0] = math.inf
+    points[:, 3] = observations.points_BTQ2[:, 0, 2]
+    return replace(observations, scene_tokens_BLD=tokens, scene_points_BL2=points)
+
+
+def test_a_place_may_be_that_of_the_picked_object_in_a_scene_of_the_prompt():
+    kinds = set()
+    for seed in range(6):
+        generator = torch.Generator().manual_seed(seed)
+        pick, place, observations, targets = _inputs(generator)
+        observations = _with_scenes(observations, generator)
+        targets.actions_BTC[:, 1, 6:8] = observations.scene_points_BL2[:, 2].float()
+        found = point_at_objects(targets.actions_BTC, pick, place, observations, greedy)
+        tokens, points = observations.tokens_BTQD.detach(), observations.points_BTQ2
+        loss = torch.zeros(())
+        for b, t in np.argwhere(targets.steps_BT.numpy()):
+            where = torch.cat([points[b, t], observations.scene_points_BL2[b]])
+            keys = torch.cat([tokens[b, t], observations.scene_tokens_BLD[b]])[where[:, 0].isfinite(), 4:]
+            where, goal = where[where[:, 0].isfinite()], targets.actions_BTC[b, t, 6:8]
+            picked, demonstrated = 0, 0  # the first is no object
+            if points[b, t, 1:].isfinite().all():
+                of_picks = (tokens[b, t, :, :4] @ pick[b, t, :4] / 2)[1:]
+                picked = 1 + of_picks.argmax()
+                demonstrated = (points[b, t] - targets.actions_BTC[b, t, :2]).norm(dim=-1).argmin()
+                loss = loss - of_picks.log_softmax(0)[demonstrated - 1]
+            of_places = [
+                torch.cat([keys @ (place[b, t] + tokens[b, t, slot])[4:] / 2, torch.zeros(1)])
+                for slot in (demonstrated, picked)
+            ]
+            apart = (where - goal).norm(dim=-1)
+            near = apart.min() < PLACE_NEAR_M
+            right = torch.cat([near & (apart <= apart.min() + 0.01), ~near[None]])
+            loss = loss - of_places[0].softmax(0)[right].sum().log()
+            slot = of_places[1].argmax()
+            torch.testing.assert_close(found[b, t, 6:8], goal if slot == len(where) else where[slot].float())
+            kinds.add("none" if slot == len(where) else "object" if slot < len(where) - 3 else "scene")
+        measured = pointing_loss(pick, place, observations, targets)
+        torch.testing.assert_close(measured, loss / targets.steps_BT.sum())
+    assert kinds == {"none", "scene", "object"}
+
+
 @pytest.mark.parametrize("name", ["small", "gato-nano", "flamingo-nano"])
 def test_policies_without_a_token_for_each_object_refuse_it(name):
     config = TrainingConfig.of(
@@ -104,8 +149,10 @@ def test_positions_are_those_of_the_objects_that_the_output_points_at():
     assert 0 < near < B * T
 
 
-def test_what_is_measured_in_training_is_what_the_policy_does(demonstrations):
-    network = build_network(replace(preset("vima-nano"), points=True), seed=0).eval()
+@pytest.mark.parametrize("at_scenes", [False, True])
+def test_what_is_measured_in_training_is_what_the_policy_does(at_scenes, demonstrations):
+    config = replace(preset("vima-nano"), points=True, points_at_scenes=at_scenes)
+    network = build_network(config, seed=0).eval()
     processor = Processor.of(network.config.inputs)
     examples, images = examples_of(demonstrations, processor)
     batch = collate_examples(processor, examples)

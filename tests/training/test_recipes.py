@@ -84,6 +84,12 @@ def test_a_recipe_leaves_out_what_other_parts_of_the_network_cannot_have(
     assert config.schedule.steps == recipe_settings("papers")["schedule.steps"]
 
 
+def test_midas_of_patches_reads_no_places_from_scenes() -> None:
+    words = ["--data", "demos", "--out", "run", "--preset", "midas-nano"]
+    assert resolve(parse(words)).model.points_at_scenes
+    assert not resolve(parse([*words, "--model.image-tokens", "patches"])).model.points_at_scenes
+
+
 def test_options_take_precedence_over_the_file_and_the_file_over_the_recipe(trained, tmp_path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("{optimizer: {learning_rate: 0.5}, loader: {batch_size: 7}, data: demos}")

@@ -70,6 +70,7 @@ class TokenPolicyConfig:
             from its last image token.
         points: Read positions from the object tokens that the action's output points at, as the pointing loss
             trains it, instead of from the head alone; see `point_at_objects`. It adds no weights.
+        points_at_scenes: With `points`, read places from the objects in scenes of the prompt as well.
     """
 
     architecture: Architecture
@@ -80,6 +81,7 @@ class TokenPolicyConfig:
     resampler: ResamplerConfig | None = None
     query_token: bool = False
     points: bool = False
+    points_at_scenes: bool = False
 
     def __post_init__(self) -> None:
         images, width = self.images, self.decoder.width
@@ -258,7 +260,9 @@ class TokenPolicy(PolicyNetwork):
                 tokens_IE = self._resample_images(self.resampler, prompts, tokens_IE)
         else:
             tokens_IE = self._frame_tokens(features_VSF)
-        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL)
+        at_scenes = self.config.points and self.config.points_at_scenes
+        points_BL2 = self._points_in_scenes(prompts) if at_scenes else None
+        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL, points_BL2)
 
     def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
         """Make the image tokens of each step, and the query behind them if there is one."""
@@ -290,6 +294,15 @@ class TokenPolicy(PolicyNetwork):
             points_BTQ2 = None if points_BTQ2 is None else F.pad(points_BTQ2, (0, 0, 0, 1), value=math.inf)
         return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, steps_BT, points_BTQ2)
 
+    def _points_in_scenes(self, prompts: PromptBatch) -> torch.Tensor:
+        """Return the table points of the objects in scenes that tokens stand for, (B, L, 2), from above."""
+        points_S2 = prompts.positions_S2.masked_fill(~prompts.in_scene_S[:, None], math.inf)
+        from_above = 0 if self.config.images.fuse_views else len(points_S2)  # front views come first
+        stands_BL = (prompts.object_index_BL >= from_above) & prompts.mask_BL
+        points_BL2 = points_S2.new_full((*stands_BL.shape, 2), math.inf)
+        points_BL2[stands_BL] = points_S2[prompts.object_index_BL[stands_BL] - from_above]
+        return points_BL2
+
     @torch.no_grad()
     def _align_attention(self) -> None:
         """Let fresh attention begin where the images of scene and prompt look alike.
@@ -312,6 +325,8 @@ class TokenPolicy(PolicyNetwork):
         layers[0].bias.fill_(_LINEAR_RANGE)
         layers[-1].bias.fill_(-_LINEAR_RANGE)
         self.decoder.align()
+        if isinstance(self.head, AutoregressiveHead):
+            self.head.actions.align()
         if isinstance(self.decoder, PrefixDecoder):  # it tells images of the prompt from observations
             for layer, mark in ((layers[-1], 0.0), (self.observation_out, OBSERVATION_MARK)):
                 layer.weight[0], layer.bias[0] = 0, mark

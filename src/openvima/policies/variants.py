@@ -253,6 +253,17 @@ def with_points(config: PolicyConfig, value: bool) -> PolicyConfig:
     return replace(config, points=value)
 
 
+def with_points_at_scenes(config: PolicyConfig, value: bool) -> PolicyConfig:
+    """Return the same network, which reads places from the prompt's scenes as well, or not.
+
+    Raises:
+        ConfigError: It cannot.
+    """
+    if isinstance(config, PointerConfig):
+        raise _not_of_pointers(f"points_at_scenes is {value}", "places in scenes in any case")
+    return replace(config, points_at_scenes=value)
+
+
 # In the order in which they are made: later ones see the parts of earlier ones.
 SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "text_encoder": with_text_encoder,
@@ -264,6 +275,7 @@ SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "head": with_head,
     "visual_residual": with_visual_residual,
     "points": with_points,
+    "points_at_scenes": with_points_at_scenes,
     "attributes": with_attributes,
     "crop_kernel": with_crop_kernel,
     "crop_width": with_crop_width,

@@ -242,7 +242,8 @@ def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     """Check that a network can begin with the weights of another, whose vocabulary may have another size."""
     here, there = flatten(config_to_dict(ours)), flatten(config_to_dict(theirs))
     for sizes in (here, there):
-        sizes.pop("points", None)  # it adds no weights
+        sizes.pop("points", None)  # these add no weights
+        sizes.pop("points_at_scenes", None)
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")

@@ -124,6 +124,7 @@ class ModelConfig:
             blocks.
         points: Read positions from the objects that the action's output points at; for VIMA and the like with
             a token for each object, trained with `optimizer.pointing_loss_weight`.
+        points_at_scenes: Read places from the objects in scenes of the prompt as well; with `points`.
         attributes: Compare objects by the attributes that a prompt names, such as "the same texture". For the
             preset small; `pretraining.attribute_loss_weight` trains them.
         crop_kernel: Kernel size of the last layer of a convolutional crop encoder (nano, small): 1 takes
@@ -140,6 +141,7 @@ class ModelConfig:
     width: Count | None = None
     num_layers: Count | None = None
     points: bool | None = None
+    points_at_scenes: bool | None = None
     attributes: bool | None = None
     crop_kernel: Literal[1, 3] | None = None
     crop_width: Count | None = None

@@ -105,11 +105,14 @@ _PAPERS: Mapping[str, Any] = {
 _PAPERS_MIDAS: Mapping[str, Any] = {
     **_PAPERS,
     "preset": "midas-nano",
-    "schedule.steps": 9000,  # each takes twice as long as one of VIMA
+    "schedule.steps": 12000,  # each takes twice as long as one of VIMA
     # Otherwise it never learns which object an image of the prompt shows. See
     # results/2026-11-29_midas_first_tasks.md.
     "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
     "loader.first_steps": 600,
+    "pretraining.steps": 4000,
+    "pretraining.num_scenes": 8000,
+    "model.points_at_scenes": True,
     "augmentation.leftmost_first": False,
     "augmentation.inverse_dynamics_prob": 0.33,
 }
@@ -241,7 +244,7 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     if others.get("model.head") == "autoregressive":
         unfit |= {"augmentation.leftmost_first"}
     if tokens != "objects":
-        unfit |= {"model.points", "optimizer.pointing_loss_weight"}
+        unfit |= {"model.points", "model.points_at_scenes", "optimizer.pointing_loss_weight"}
     if tokens not in ("objects", "object-perceiver"):
         unfit |= _PAPERS.keys() - _PAPERS_FRAMES.keys()
     fit = {name: value for name, value in settings.items() if name not in unfit}

@@ -46,6 +46,8 @@ class ObservationTokens:
         steps_BT: Which steps exist.
         points_BTQ2: Table points of the objects in the top view that tokens stand for, metres; infinite for
             other tokens. None without a pointing loss.
+        scene_tokens_BLD: Tokens of the encoded prompt, if places may also be read from its scenes.
+        scene_points_BL2: Table points of the objects in scenes that they stand for; infinite for others.
     """
 
     tokens_BTQD: torch.Tensor
@@ -53,6 +55,20 @@ class ObservationTokens:
     query_BT: torch.Tensor
     steps_BT: torch.Tensor
     points_BTQ2: torch.Tensor | None = None
+    scene_tokens_BLD: torch.Tensor | None = None
+    scene_points_BL2: torch.Tensor | None = None
+
+    def candidates(self, half: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the tokens (B, T, Q', D) and points (B, T, Q', 2) to pick, half 0, or to place at, half 1."""
+        assert self.points_BTQ2 is not None  # made where the loss has a weight, and settings are checked
+        if half == 0 or self.scene_tokens_BLD is None or self.scene_points_BL2 is None:
+            return self.tokens_BTQD, self.points_BTQ2
+        pairs = (self.tokens_BTQD, self.scene_tokens_BLD), (self.points_BTQ2, self.scene_points_BL2)
+        tokens, points = (
+            torch.cat([own, of_prompt[:, None].expand(-1, own.shape[1], -1, -1)], dim=2)
+            for own, of_prompt in pairs
+        )
+        return tokens, points
 
     def segment(self) -> TokenSegment:
         """Return them as a segment of the sequence."""
@@ -91,6 +107,7 @@ def decode_observations(
 
 
 _POSITIONS = (ACTION_PARTS["pose0_position"], ACTION_PARTS["pose1_position"])
+_SAME_M = 0.01  # objects that near have one position
 _NEAR_M = (math.inf, 0.06)  # a decoded place within this distance of an object is meant to be at one
 # The loss, a mean over all steps; its parts as `loss/<name>`; and the decoded actions, (B, T, C).
 ActionLoss = tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]
@@ -198,17 +215,24 @@ def pointing_loss(
         observations: The objects' tokens, as they enter the decoder.
         targets: Demonstrated actions; a place counts where an object is near.
     """
-    points_BTQ2 = observations.points_BTQ2
-    assert points_BTQ2 is not None  # they are made where the loss has a weight, and settings are checked
-    has_object_BT = points_BTQ2[..., 0].isfinite().any(-1) & targets.steps_BT
     loss = pick_BTD.new_zeros(())
+    picked_BT = torch.zeros_like(observations.query_BT)
     for half, query_BTD, limit_m in ((0, pick_BTD, math.inf), (1, place_BTD, PLACE_NEAR_M)):
-        scores_BTQ = _score_objects(half, query_BTD, observations)
+        scores_BTQ, points_BTQ2 = _score_objects(half, query_BTD, observations, picked_BT)
         target_BT12 = targets.actions_BTC[..., None, _POSITIONS[half]].to(points_BTQ2)
-        distance_BT, slot_BT = (points_BTQ2 - target_BT12).norm(dim=-1).min(dim=-1)
-        counts_BT = has_object_BT & (distance_BT < limit_m)
-        losses = F.cross_entropy(scores_BTQ[counts_BT], slot_BT[counts_BT], reduction="sum")
-        loss = loss + losses / targets.steps_BT.sum().clamp(min=1)
+        distance_BTQ = (points_BTQ2 - target_BT12).norm(dim=-1)
+        nearest_BT, picked_BT = distance_BTQ.min(dim=-1)
+        counts_BT = targets.steps_BT & (nearest_BT < limit_m)
+        is_right_BTQ = distance_BTQ <= nearest_BT[..., None]
+        if half == 1 and observations.scene_points_BL2 is not None:
+            # What lies still is in the prompt's scene as well: either is right. The last stands for none.
+            is_right_BTQ = distance_BTQ <= nearest_BT[..., None] + _SAME_M
+            is_right_BTQ = is_right_BTQ & counts_BT[..., None]
+            is_right_BTQ[..., -1] = ~counts_BT
+            counts_BT = targets.steps_BT & nearest_BT.isfinite()
+        right_BTQ = scores_BTQ.masked_fill(~is_right_BTQ, -math.inf)
+        losses_BT = scores_BTQ.logsumexp(-1) - right_BTQ.logsumexp(-1)
+        loss = loss + losses_BT[counts_BT].sum() / targets.steps_BT.sum().clamp(min=1)
     return loss
 
 
@@ -225,8 +249,9 @@ def point_at_objects(
     results/2026-11-28_vima_pointing.md. A place that is near no object stays.
     """
     actions_BTC = actions_BTC.clone()
+    picked_BT = torch.zeros_like(observations.query_BT)
     for half, query_BTD in enumerate((pick_BTD, place_BTD)):
-        point_at_object(half, actions_BTC, query_BTD, observations, strategy)
+        picked_BT = point_at_object(half, actions_BTC, query_BTD, observations, strategy, picked_BT)
     return actions_BTC
 
 
@@ -236,23 +261,45 @@ def point_at_object(
     query_BTD: torch.Tensor,
     observations: ObservationTokens,
     strategy: DecodingStrategy,
-) -> None:
-    """Do so in place with the pick, half 0, or the place, half 1; see `point_at_objects`."""
-    points_BTQ2, part = observations.points_BTQ2, _POSITIONS[half]
-    assert points_BTQ2 is not None
-    slot_BT = strategy(_score_objects(half, query_BTD, observations))
-    decoded_BT12 = actions_BTC[..., None, part].to(points_BTQ2)
-    is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < _NEAR_M[half])[..., None]
-    position_BT2 = torch.where(is_near_BT1, at(points_BTQ2, slot_BT), decoded_BT12.squeeze(2))
+    picked_BT: torch.Tensor,
+) -> torch.Tensor:
+    """Do so in place with the pick, half 0, or the place, half 1; see `point_at_objects`.
+
+    Returns:
+        The token that is pointed at; for the place it is to be given as `picked_BT`.
+    """
+    part = _POSITIONS[half]
+    scores_BTQ, points_BTQ2 = _score_objects(half, query_BTD, observations, picked_BT)
+    slot_BT = strategy(scores_BTQ)
+    decoded_BT12, point_BT2 = actions_BTC[..., None, part].to(points_BTQ2), at(points_BTQ2, slot_BT)
+    if half == 1 and observations.scene_points_BL2 is not None:
+        is_near_BT1 = point_BT2.isfinite()[..., :1]
+    else:
+        is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < _NEAR_M[half])[..., None]
+    position_BT2 = torch.where(is_near_BT1, point_BT2, decoded_BT12.squeeze(2))
     actions_BTC[..., part] = position_BT2.to(actions_BTC.dtype)
+    return slot_BT
 
 
-def _score_objects(half: int, query_BTD: torch.Tensor, observations: ObservationTokens) -> torch.Tensor:
-    """Score tokens as the object of the pick, half 0, or of the place, half 1; very low for no object."""
-    query_BTE, keys_BTQE = query_BTD.chunk(2, -1)[half], observations.tokens_BTQD.chunk(2, -1)[half]
+def _score_objects(
+    half: int, query_BTD: torch.Tensor, observations: ObservationTokens, picked_BT: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Score tokens as the object of the pick, half 0, or of the place, half 1; and return their points.
+
+    The score of what is no object is very low. Where places are read from scenes of the prompt, too, the query
+    of the place is joined by the token of the picked object, whose twin there is its goal; and the last score,
+    0, is that of no object.
+    """
+    at_scenes = half == 1 and observations.scene_points_BL2 is not None
+    tokens_BTQD, points_BTQ2 = observations.candidates(half)
+    if at_scenes:
+        query_BTD = query_BTD + at(observations.tokens_BTQD, picked_BT)
+    query_BTE, keys_BTQE = query_BTD.chunk(2, -1)[half], tokens_BTQD.chunk(2, -1)[half]
     scores_BTQ = torch.einsum("btqe,bte->btq", keys_BTQE, query_BTE) * query_BTE.shape[-1] ** -0.5
-    assert observations.points_BTQ2 is not None
-    return mask_scores(scores_BTQ, observations.points_BTQ2[..., 0].isfinite())
+    scores_BTQ = mask_scores(scores_BTQ, points_BTQ2[..., 0].isfinite())
+    if at_scenes:
+        scores_BTQ, points_BTQ2 = F.pad(scores_BTQ, (0, 1)), F.pad(points_BTQ2, (0, 0, 0, 1), value=math.inf)
+    return scores_BTQ, points_BTQ2
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history toge
 MAX_PROMPT_POSITIONS = 256
 OBSERVATION_MARK = 4.0  # first channel of fresh observation tokens; the others are of the order of 1
 _MARK_GAIN = 3.0  # lowers a score by 3 · 3 · 4 / √(width of a head), 6 nats
-_POSITION_GAIN = 8.0  # of position embeddings, which are added to tokens of the order of 1
+_POSITION_GAIN = 4.0  # of position embeddings, which are added to tokens of the order of 1
 
 KeysValues = tuple[torch.Tensor, torch.Tensor]  # (B, H, S, K) each
 

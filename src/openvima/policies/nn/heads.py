@@ -134,7 +134,7 @@ class AutoregressiveHead(nn.Module):
         bins_BTC = torch.zeros(
             *output_BTD.shape[:2], ACTION_WIDTH, dtype=torch.int64, device=output_BTD.device
         )
-        pointed, before = [], (output_BTD, ahead)
+        pointed, before, picked_BT = [], (output_BTD, ahead), torch.zeros_like(observations.query_BT)
 
         def read(component: int) -> None:
             nonlocal output_BTD, ahead
@@ -149,7 +149,9 @@ class AutoregressiveHead(nn.Module):
             bins_BTC[..., component] = strategy(classifier(output_BTD))
             if self.points and place == 1:  # the position is complete, and read again if it moves
                 actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
-                point_at_object(half, actions_BTC, before[0], observations, strategy)
+                picked_BT = point_at_object(
+                    half, actions_BTC, before[0], observations, strategy, picked_BT
+                )
                 part = slice(component - 1, component + 1)
                 pointed.append((part, actions_BTC[..., part]))
                 bins_BTC[..., part] = encode_bins(to_unit_range(actions_BTC.to(torch.float64)))[..., part]
@@ -165,6 +167,10 @@ class AutoregressiveHead(nn.Module):
     def _segment(self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor) -> TokenSegment:
         # Bins need all digits, whatever the network computes in.
         return action_segment(self.actions(to_unit_range(actions_BTC.to(torch.float64))), exists_BT)
+
+
+_ACTION_GAIN = 8.0  # as `_POSITION_GAIN` of the decoder: image tokens are of the order of 1
+_NUM_WAVES = 8
 
 
 class ComponentTokens(nn.Module):
@@ -183,6 +189,19 @@ class ComponentTokens(nn.Module):
     def forward(self, unit_actions: torch.Tensor) -> torch.Tensor:
         """Map actions in unit range, shape (..., 12), to tokens (..., 12, D)."""
         return self.bins(encode_bins(unit_actions) + self.offsets)
+
+    @torch.no_grad()
+    def align(self) -> None:
+        """Let fresh vectors be smooth over the bins of a component, and as strong as positions and images.
+
+        Those of a component are mixtures of its first few vectors by slow waves over the bins. Otherwise each
+        bin learns by itself where it is, and is not heard: see results/2026-11-29_midas_actions.md.
+        """
+        for vectors_ND in self.bins.weight.split(NUM_BINS):
+            wave_N1 = torch.linspace(0, math.pi, len(vectors_ND), device=vectors_ND.device)[:, None]
+            waves_NK = torch.cos(wave_N1 * torch.arange(_NUM_WAVES, device=vectors_ND.device))
+            gain = _ACTION_GAIN * (2 / (_NUM_WAVES + 1)) ** 0.5
+            vectors_ND.copy_(gain * waves_NK @ vectors_ND[:_NUM_WAVES])
 
     def embed(self, component: int, bins: torch.Tensor) -> torch.Tensor:
         """Map bins of one component, int64, any shape, to tokens (..., D)."""

@@ -5,7 +5,7 @@ features, D width of the decoder, E width of an image token, C components of an 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import torch
@@ -77,10 +77,13 @@ class EncodedPrompt(TensorRecord):
     Args:
         tokens_BLD: Encoded words and images.
         mask_BL: Which positions exist.
+        points_BL2: Table points of the objects in scenes that tokens stand for, infinite for others; None
+            where places are not read from them.
     """
 
     tokens_BLD: torch.Tensor
     mask_BL: torch.Tensor
+    points_BL2: torch.Tensor | None = None
 
 
 class PolicyNetwork(nn.Module):
@@ -155,7 +158,7 @@ class PolicyNetwork(nn.Module):
             accuracies; see `action_metrics`.
         """
         loss, metrics, actions_BTC = self.head.loss(
-            self.decoder, self.init_cache(prompt), self.observe(history, features_KF), targets
+            self.decoder, self.init_cache(prompt), self._observe(prompt, history, features_KF), targets
         )
         in_view_BTN = history.masks_BTVN.any(dim=2) & (self.object_encoder is not None)
         return loss, {**metrics, **action_metrics(actions_BTC, targets, history.grasps_BTN2, in_view_BTN)}
@@ -187,10 +190,17 @@ class PolicyNetwork(nn.Module):
         Raises:
             PolicyError: Prompt or history is longer than the decoder takes.
         """
-        observations = self.observe(history, features_KF)
+        observations = self._observe(prompt, history, features_KF)
         return self.head.decode_step(
             self.decoder, state, observations, previous_BTC, has_previous_BT, strategy
         )
+
+    def _observe(self, prompt: Any, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
+        """Make the tokens of each observation, beside those of the prompt's scenes if places may be there."""
+        observations = self.observe(history, features_KF)
+        if prompt.points_BL2 is None:
+            return observations
+        return replace(observations, scene_tokens_BLD=prompt.tokens_BLD, scene_points_BL2=prompt.points_BL2)
 
     def explain_step(
         self,
