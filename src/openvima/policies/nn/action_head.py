@@ -59,7 +59,7 @@ class ObservationTokens:
     scene_points_BL2: torch.Tensor | None = None
 
     def candidates(self, half: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the tokens (B, T, Q', D) and points (B, T, Q', 2) to pick, half 0, or to place at, half 1."""
+        """Return tokens (B, T, Q', D) and points (B, T, Q', 2) to pick, half 0, or to place at, half 1."""
         assert self.points_BTQ2 is not None  # made where the loss has a weight, and settings are checked
         if half == 0 or self.scene_tokens_BLD is None or self.scene_points_BL2 is None:
             return self.tokens_BTQD, self.points_BTQ2
@@ -286,9 +286,9 @@ def _score_objects(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Score tokens as the object of the pick, half 0, or of the place, half 1; and return their points.
 
-    The score of what is no object is very low. Where places are read from scenes of the prompt, too, the query
-    of the place is joined by the token of the picked object, whose twin there is its goal; and the last score,
-    0, is that of no object.
+    The score of what is no object is very low. Where places are read from scenes of the prompt, too, the
+    query of the place is joined by the token of the picked object, whose twin there is its goal; and the last
+    score, 0, is that of no object.
     """
     at_scenes = half == 1 and observations.scene_points_BL2 is not None
     tokens_BTQD, points_BTQ2 = observations.candidates(half)

@@ -149,9 +149,7 @@ class AutoregressiveHead(nn.Module):
             bins_BTC[..., component] = strategy(classifier(output_BTD))
             if self.points and place == 1:  # the position is complete, and read again if it moves
                 actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
-                picked_BT = point_at_object(
-                    half, actions_BTC, before[0], observations, strategy, picked_BT
-                )
+                picked_BT = point_at_object(half, actions_BTC, before[0], observations, strategy, picked_BT)
                 part = slice(component - 1, component + 1)
                 pointed.append((part, actions_BTC[..., part]))
                 bins_BTC[..., part] = encode_bins(to_unit_range(actions_BTC.to(torch.float64)))[..., part]
