@@ -22,6 +22,8 @@ from openvima.policies.nn.actions import (
 from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.model import Pointer
+from openvima.policies.presets import preset
+from openvima.policies.variants import with_variant
 from openvima.scene import Action, RenderedPrompt
 from small_networks import perturbed
 
@@ -39,7 +41,10 @@ for_one_network = pytest.mark.parametrize("policy", ["nano"], indirect=True)  # 
 )
 def policy(request) -> NetworkPolicy:
     """One policy in double precision for each kind of network; every test resets it."""
-    return NetworkPolicy(perturbed(request.param))
+    if request.param != "midas-nano":
+        return NetworkPolicy(perturbed(request.param))
+    points = {"points": True, "points_at_scenes": True}
+    return NetworkPolicy(perturbed(with_variant(preset(request.param), points)))
 
 
 @pytest.fixture(scope="module")
