@@ -58,6 +58,10 @@ class ObservationTokens:
     scene_tokens_BLD: torch.Tensor | None = None
     scene_points_BL2: torch.Tensor | None = None
 
+    def are_at_scenes(self, half: int) -> bool:
+        """Whether what is pointed at, half 0 the pick, half 1 the place, may be in scenes of the prompt."""
+        return half == 1 and self.scene_points_BL2 is not None
+
     def candidates(self, half: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return tokens (B, T, Q', D) and points (B, T, Q', 2) to pick, half 0, or to place at, half 1."""
         assert self.points_BTQ2 is not None  # made where the loss has a weight, and settings are checked
@@ -213,7 +217,8 @@ def pointing_loss(
         pick_BTD: The output from which the pick is decoded.
         place_BTD: That from which the place is decoded.
         observations: The objects' tokens, as they enter the decoder.
-        targets: Demonstrated actions; a place counts where an object is near.
+        targets: Demonstrated actions; a place counts where an object is near, or with scenes of the prompt
+            everywhere, where none is near as one at no object.
     """
     loss = pick_BTD.new_zeros(())
     picked_BT = torch.zeros_like(observations.query_BT)
@@ -224,7 +229,7 @@ def pointing_loss(
         nearest_BT, picked_BT = distance_BTQ.min(dim=-1)
         counts_BT = targets.steps_BT & (nearest_BT < limit_m)
         is_right_BTQ = distance_BTQ <= nearest_BT[..., None]
-        if half == 1 and observations.scene_points_BL2 is not None:
+        if observations.are_at_scenes(half):
             # What lies still is in the prompt's scene as well: either is right. The last stands for none.
             is_right_BTQ = distance_BTQ <= nearest_BT[..., None] + _SAME_M
             is_right_BTQ = is_right_BTQ & counts_BT[..., None]
@@ -272,7 +277,7 @@ def point_at_object(
     scores_BTQ, points_BTQ2 = _score_objects(half, query_BTD, observations, picked_BT)
     slot_BT = strategy(scores_BTQ)
     decoded_BT12, point_BT2 = actions_BTC[..., None, part].to(points_BTQ2), at(points_BTQ2, slot_BT)
-    if half == 1 and observations.scene_points_BL2 is not None:
+    if observations.are_at_scenes(half):
         is_near_BT1 = point_BT2.isfinite()[..., :1]
     else:
         is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < _NEAR_M[half])[..., None]
@@ -287,10 +292,10 @@ def _score_objects(
     """Score tokens as the object of the pick, half 0, or of the place, half 1; and return their points.
 
     The score of what is no object is very low. Where places are read from scenes of the prompt, too, the
-    query of the place is joined by the token of the picked object, whose twin there is its goal; and the last
+    query of the place is joined by the token of the picked object, which its goal looks like; and the last
     score, 0, is that of no object.
     """
-    at_scenes = half == 1 and observations.scene_points_BL2 is not None
+    at_scenes = observations.are_at_scenes(half)
     tokens_BTQD, points_BTQ2 = observations.candidates(half)
     if at_scenes:
         query_BTD = query_BTD + at(observations.tokens_BTQD, picked_BT)
