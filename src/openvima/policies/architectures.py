@@ -68,9 +68,9 @@ class TokenPolicyConfig:
             none.
         query_token: Append a learned token to each observation and decode the action from there, instead of
             from its last image token.
-        points: Read positions from the object tokens that the action's output points at, as the pointing loss
-            trains it, instead of from the head alone; see `point_at_objects`. It adds no weights.
-        points_at_scenes: With `points`, read places from the objects in scenes of the prompt as well.
+        points: Read positions from the object tokens that the action's output points at, instead of from the
+            head alone; places also from those in scenes of the prompt and at the first step. A loss of its
+            own trains it; see `point_at_objects`.
     """
 
     architecture: Architecture
@@ -81,7 +81,6 @@ class TokenPolicyConfig:
     resampler: ResamplerConfig | None = None
     query_token: bool = False
     points: bool = False
-    points_at_scenes: bool = False
 
     def __post_init__(self) -> None:
         images, width = self.images, self.decoder.width
@@ -237,6 +236,8 @@ class TokenPolicy(PolicyNetwork):
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head = build_head(config.head, width, actions)
         self.head.points = config.points
+        if config.points:
+            self.place_kinds = nn.Parameter(torch.zeros(2, width))
         if token_width == width:
             self._align_attention()
         # Other heads have no bins, or decode positions twice; the other decoder does not attend to the prompt
@@ -260,8 +261,7 @@ class TokenPolicy(PolicyNetwork):
                 tokens_IE = self._resample_images(self.resampler, prompts, tokens_IE)
         else:
             tokens_IE = self._frame_tokens(features_VSF)
-        at_scenes = self.config.points and self.config.points_at_scenes
-        points_BL2 = self._points_in_scenes(prompts) if at_scenes else None
+        points_BL2 = self._points_in_scenes(prompts) if self.config.points else None
         return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL, points_BL2)
 
     def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
@@ -274,7 +274,7 @@ class TokenPolicy(PolicyNetwork):
             mask_BTQ = history.masks_BTVN.any(dim=2) if fused else history.masks_BTVN.flatten(2)
             if self.resampler is not None:
                 tokens_BTQE, mask_BTQ = self.resampler(tokens_BTQE, mask_BTQ), None
-            elif self.head.pointing_weight or self.config.points:
+            elif self.config.points:
                 points_BTQ2 = _points_from_above(history, tokens_BTQE.shape[2])
         else:
             tokens_BTQE = self._frame_tokens(features_BTVNF)
@@ -325,8 +325,7 @@ class TokenPolicy(PolicyNetwork):
         layers[0].bias.fill_(_LINEAR_RANGE)
         layers[-1].bias.fill_(-_LINEAR_RANGE)
         self.decoder.align()
-        if isinstance(self.head, AutoregressiveHead):
-            self.head.actions.align()
+        self.head.actions.align()
         if isinstance(self.decoder, PrefixDecoder):  # it tells images of the prompt from observations
             for layer, mark in ((layers[-1], 0.0), (self.observation_out, OBSERVATION_MARK)):
                 layer.weight[0], layer.bias[0] = 0, mark

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
@@ -243,20 +242,15 @@ def _with_convolutions(config: PolicyConfig, given: str, **sizes: int) -> Policy
     return replace(config, images=replace(images, crop=replace(images.crop, **sizes)))
 
 
-def with_points(config: PolicyConfig, value: bool, *, name: str = "points") -> PolicyConfig:
+def with_points(config: PolicyConfig, value: bool) -> PolicyConfig:
     """Return the same network, which reads positions from objects or not; see `TokenPolicyConfig.points`.
-
-    Args:
-        config: The network.
-        value: Whether it does.
-        name: "points", or "points_at_scenes".
 
     Raises:
         ConfigError: It cannot.
     """
     if isinstance(config, PointerConfig):
-        raise _not_of_pointers(f"{name} is {value}", "objects to point at in any case")
-    return replace(config, **{name: value})
+        raise _not_of_pointers(f"points is {value}", "objects to point at in any case")
+    return replace(config, points=value)
 
 
 # In the order in which they are made: later ones see the parts of earlier ones.
@@ -270,7 +264,6 @@ SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "head": with_head,
     "visual_residual": with_visual_residual,
     "points": with_points,
-    "points_at_scenes": partial(with_points, name="points_at_scenes"),
     "attributes": with_attributes,
     "crop_kernel": with_crop_kernel,
     "crop_width": with_crop_width,

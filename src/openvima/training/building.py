@@ -11,7 +11,6 @@ import torch
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, differences
 from openvima.perception.preprocessing import split_prompt
-from openvima.policies.architectures import TokenPolicyConfig
 from openvima.policies.build import PolicyConfig, appearance_width, build_network, config_to_dict
 from openvima.policies.checkpoint import load_network
 from openvima.policies.naming import find_checkpoint
@@ -106,17 +105,6 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
             "augmentation.leftmost_first is True, but an autoregressive head reads the actions to learn as "
             "those that were done; set it to False."
         )
-    weight = config.optimizer.pointing_loss_weight
-    if weight and not (isinstance(sizes, TokenPolicyConfig) and sizes.has_object_tokens):
-        raise ConfigError(
-            f"optimizer.pointing_loss_weight is {weight:g}, but preset {config.preset!r} has no token for "
-            "each object, or picks among objects by itself; leave it out."
-        )
-    if isinstance(sizes, TokenPolicyConfig) and sizes.points and not (weight or config.init_from):
-        raise ConfigError(
-            "model.points is True, but optimizer.pointing_loss_weight is 0, so nothing would teach the "
-            "network to point; give a weight such as 1, or set model.points to False."
-        )
     has_appearance = appearance_width(sizes) > 0
     if config.pretraining.steps and sizes.inputs.tokens == "frames":
         raise ConfigError(
@@ -204,8 +192,6 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         size = tokenizer.vocabulary.size_for(sizes.prompt.vocabulary_size)
         sizes = replace(sizes, prompt=replace(sizes.prompt, vocabulary_size=size))
     network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
-    if weight := config.optimizer.pointing_loss_weight:
-        network.head.pointing_weight = weight
     if initial is not None:
         _copy_weights(initial, network)
     elif config.t5:
@@ -241,9 +227,6 @@ def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     """Check that a network can begin with the weights of another, whose vocabulary may have another size."""
     here, there = flatten(config_to_dict(ours)), flatten(config_to_dict(theirs))
-    for sizes in (here, there):
-        sizes.pop("points", None)  # these add no weights
-        sizes.pop("points_at_scenes", None)
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")

@@ -122,9 +122,8 @@ class ModelConfig:
         width: Width of the decoder and of image tokens, a multiple of the heads.
         num_layers: Layers of the decoder: pairs of a cross block and a self block, or with a prefix self
             blocks.
-        points: Read positions from the objects that the action's output points at; for VIMA and the like with
-            a token for each object, trained with `optimizer.pointing_loss_weight`.
-        points_at_scenes: Read places from the objects in scenes of the prompt as well; with `points`.
+        points: Read positions from the objects that the action's output points at, places also from those in
+            scenes of the prompt and at the first step; for VIMA and the like with a token for each object.
         attributes: Compare objects by the attributes that a prompt names, such as "the same texture". For the
             preset small; `pretraining.attribute_loss_weight` trains them.
         crop_kernel: Kernel size of the last layer of a convolutional crop encoder (nano, small): 1 takes
@@ -141,7 +140,6 @@ class ModelConfig:
     width: Count | None = None
     num_layers: Count | None = None
     points: bool | None = None
-    points_at_scenes: bool | None = None
     attributes: bool | None = None
     crop_kernel: Literal[1, 3] | None = None
     crop_width: Count | None = None
@@ -156,15 +154,12 @@ class OptimizerConfig:
         weight_decay: Decay of weight matrices.
         max_grad_norm: Gradients are clipped to this norm.
         grad_accum_steps: Parts into which each process splits its batch, to save memory.
-        pointing_loss_weight: Weight of a loss on which object is picked and at which one it is placed, for
-            policies of the papers with a token for each object.
     """
 
     learning_rate: Probability = 1e-3
     weight_decay: Annotated[float, Range(0)] = 0.01
     max_grad_norm: Annotated[float, Range(1e-6)] = 1.0
     grad_accum_steps: Count = 1
-    pointing_loss_weight: Annotated[float, Range(0, 100)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,14 +89,12 @@ _PAPERS: Mapping[str, Any] = {
     **_PAPERS_FRAMES,
     "preset": "vima-nano",
     "schedule.steps": 12000,
-    "pretraining.steps": 1600,
-    "pretraining.num_scenes": 5000,
+    "pretraining.steps": 4000,
+    "pretraining.num_scenes": 8000,
     **_VARIED_PAIRS,
     "pretraining.finetune_crop_encoder": False,  # nor after --init-from
-    "optimizer.pointing_loss_weight": 1.0,
     "model.points": True,
     "augmentation.centre_picks": True,
-    "augmentation.leftmost_first": True,
     "augmentation.rename_objects_prob": 0.3,
     "augmentation.turn_comparisons_prob": 0.8,
     "augmentation.shuffle_sentences_prob": 0.3,
@@ -110,10 +108,6 @@ _PAPERS_MIDAS: Mapping[str, Any] = {
     # results/2026-11-29_midas_first_tasks.md.
     "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
     "loader.first_steps": 600,
-    "pretraining.steps": 4000,
-    "pretraining.num_scenes": 8000,
-    "model.points_at_scenes": True,
-    "augmentation.leftmost_first": False,
     "augmentation.inverse_dynamics_prob": 0.33,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
@@ -241,10 +235,8 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     trained = {"pretraining.steps": None, "loader.first_steps": 0} if others.get("init_from") else {}
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
-    if others.get("model.head") == "autoregressive":
-        unfit |= {"augmentation.leftmost_first"}
     if tokens != "objects":
-        unfit |= {"model.points", "model.points_at_scenes", "optimizer.pointing_loss_weight"}
+        unfit |= {"model.points"}
     if tokens not in ("objects", "object-perceiver"):
         unfit |= _PAPERS.keys() - _PAPERS_FRAMES.keys()
     fit = {name: value for name, value in settings.items() if name not in unfit}

@@ -12,6 +12,7 @@ Shape suffixes: B batch, T steps, Q tokens of a step, D width, C components of a
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import nn
@@ -45,9 +46,9 @@ class ObservationTokens:
         query_BT: Index of the token from whose output the action is decoded; it may be padding.
         steps_BT: Which steps exist.
         points_BTQ2: Table points of the objects in the top view that tokens stand for, metres; infinite for
-            other tokens. None without a pointing loss.
-        scene_tokens_BLD: Tokens of the encoded prompt, if places may also be read from its scenes.
-        scene_points_BL2: Table points of the objects in scenes that they stand for; infinite for others.
+            other tokens. None where positions are not read from objects.
+        scene_tokens_BLD: Tokens of other scenes that places may be in: the prompt's, and the first step.
+        scene_points_BL2: Table points of the objects in these that they stand for; infinite for others.
     """
 
     tokens_BTQD: torch.Tensor
@@ -58,19 +59,15 @@ class ObservationTokens:
     scene_tokens_BLD: torch.Tensor | None = None
     scene_points_BL2: torch.Tensor | None = None
 
-    def are_at_scenes(self, half: int) -> bool:
-        """Whether what is pointed at, half 0 the pick, half 1 the place, may be in scenes of the prompt."""
-        return half == 1 and self.scene_points_BL2 is not None
-
     def candidates(self, half: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return tokens (B, T, Q', D) and points (B, T, Q', 2) to pick, half 0, or to place at, half 1."""
-        assert self.points_BTQ2 is not None  # made where the loss has a weight, and settings are checked
-        if half == 0 or self.scene_tokens_BLD is None or self.scene_points_BL2 is None:
-            return self.tokens_BTQD, self.points_BTQ2
-        pairs = (self.tokens_BTQD, self.scene_tokens_BLD), (self.points_BTQ2, self.scene_points_BL2)
+        own = cast(torch.Tensor, self.points_BTQ2)
+        if half == 0:
+            return self.tokens_BTQD, own
+        pairs = (self.tokens_BTQD, self.scene_tokens_BLD), (own, self.scene_points_BL2)
         tokens, points = (
-            torch.cat([own, of_prompt[:, None].expand(-1, own.shape[1], -1, -1)], dim=2)
-            for own, of_prompt in pairs
+            torch.cat([each, cast(torch.Tensor, others)[:, None].expand(-1, each.shape[1], -1, -1)], dim=2)
+            for each, others in pairs
         )
         return tokens, points
 
@@ -112,7 +109,6 @@ def decode_observations(
 
 _POSITIONS = (ACTION_PARTS["pose0_position"], ACTION_PARTS["pose1_position"])
 _SAME_M = 0.01  # objects that near have one position
-_NEAR_M = (math.inf, 0.06)  # a decoded place within this distance of an object is meant to be at one
 # The loss, a mean over all steps; its parts as `loss/<name>`; and the decoded actions, (B, T, C).
 ActionLoss = tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]
 
@@ -123,11 +119,9 @@ class ActionHead(nn.Module):
     A head defines `action_loss`, `action` and `fit_prior`.
 
     Attributes:
-        pointing_weight: Weight of `pointing_loss` in training.
-        points: Whether positions are read from objects; see `point_at_objects`.
+        points: Whether positions are read from objects, as `pointing_loss` trains it; see `point_at_objects`.
     """
 
-    pointing_weight = 0.0
     points = False
 
     def __init__(self, actions: ActionEncoder) -> None:
@@ -158,10 +152,8 @@ class ActionHead(nn.Module):
         outputs_BTQD, _ = decode_observations(decoder, cache, observations, previous)
         query_BTD = observations.query(outputs_BTQD)
         loss, metrics, actions_BTC = self.action_loss(query_BTD, targets)
-        if self.points:
-            actions_BTC = point_at_objects(actions_BTC, query_BTD, query_BTD, observations, greedy)
         found = loss, metrics, actions_BTC
-        return add_pointing(found, self.pointing_weight, query_BTD, query_BTD, observations, targets)
+        return add_pointing(found, self.points, query_BTD, query_BTD, observations, targets)
 
     def decode_step(
         self,
@@ -189,18 +181,22 @@ class ActionHead(nn.Module):
 
 def add_pointing(
     found: ActionLoss,
-    weight: float,
+    points: bool,
     pick_BTD: torch.Tensor,
     place_BTD: torch.Tensor,
     observations: ObservationTokens,
     targets: ActionTargets,
 ) -> ActionLoss:
-    """Add the spread of the queries to the metrics of an action loss, and with a weight `pointing_loss`."""
+    """Add the spread of the queries to the metrics of an action loss.
+
+    Where positions are read from objects, add `pointing_loss`, too, and let the decoded actions point.
+    """
     loss, metrics, actions_BTC = found
     metrics = {**metrics, "query_spread": spread(pick_BTD, targets.steps_BT)}
-    if weight:
+    if points:
         pointing = pointing_loss(pick_BTD, place_BTD, observations, targets)
-        loss, metrics["loss/pointing"] = loss + weight * pointing, pointing.detach()
+        actions_BTC = point_at_objects(actions_BTC, pick_BTD, place_BTD, observations, greedy)
+        loss, metrics["loss/pointing"] = loss + pointing, pointing.detach()
     return loss, metrics, actions_BTC
 
 
@@ -217,24 +213,22 @@ def pointing_loss(
         pick_BTD: The output from which the pick is decoded.
         place_BTD: That from which the place is decoded.
         observations: The objects' tokens, as they enter the decoder.
-        targets: Demonstrated actions; a place counts where an object is near, or with scenes of the prompt
-            everywhere, where none is near as one at no object.
+        targets: Demonstrated actions; a place that no object is near counts as one at no object.
     """
     loss = pick_BTD.new_zeros(())
     picked_BT = torch.zeros_like(observations.query_BT)
-    for half, query_BTD, limit_m in ((0, pick_BTD, math.inf), (1, place_BTD, PLACE_NEAR_M)):
+    for half, query_BTD in enumerate((pick_BTD, place_BTD)):
         scores_BTQ, points_BTQ2 = _score_objects(half, query_BTD, observations, picked_BT)
         target_BT12 = targets.actions_BTC[..., None, _POSITIONS[half]].to(points_BTQ2)
         distance_BTQ = (points_BTQ2 - target_BT12).norm(dim=-1)
         nearest_BT, picked_BT = distance_BTQ.min(dim=-1)
-        counts_BT = targets.steps_BT & (nearest_BT < limit_m)
-        is_right_BTQ = distance_BTQ <= nearest_BT[..., None]
-        if observations.are_at_scenes(half):
-            # What lies still is in the prompt's scene as well: either is right. The last stands for none.
-            is_right_BTQ = distance_BTQ <= nearest_BT[..., None] + _SAME_M
-            is_right_BTQ = is_right_BTQ & counts_BT[..., None]
-            is_right_BTQ[..., -1] = ~counts_BT
-            counts_BT = targets.steps_BT & nearest_BT.isfinite()
+        counts_BT = targets.steps_BT & nearest_BT.isfinite()
+        if half == 0:
+            is_right_BTQ = distance_BTQ <= nearest_BT[..., None]
+        else:  # what lies still is there in other scenes as well: either is right
+            is_at_one_BT = nearest_BT < PLACE_NEAR_M
+            is_right_BTQ = (distance_BTQ <= nearest_BT[..., None] + _SAME_M) & is_at_one_BT[..., None]
+            is_right_BTQ[..., -1] = ~is_at_one_BT
         right_BTQ = scores_BTQ.masked_fill(~is_right_BTQ, -math.inf)
         losses_BT = scores_BTQ.logsumexp(-1) - right_BTQ.logsumexp(-1)
         loss = loss + losses_BT[counts_BT].sum() / targets.steps_BT.sum().clamp(min=1)
@@ -248,10 +242,10 @@ def point_at_objects(
     observations: ObservationTokens,
     strategy: DecodingStrategy,
 ) -> torch.Tensor:
-    """Move each pick to the centre of the object that its output points at, and places at objects likewise.
+    """Move picks and places to the centres of the objects that their outputs point at.
 
     Independent bins of two equally good picks may give the column of one and the row of the other; see
-    results/2026-11-28_vima_pointing.md. A place that is near no object stays.
+    results/2026-11-28_vima_pointing.md. A place that points at no object stays.
     """
     actions_BTC = actions_BTC.clone()
     picked_BT = torch.zeros_like(observations.query_BT)
@@ -276,12 +270,8 @@ def point_at_object(
     part = _POSITIONS[half]
     scores_BTQ, points_BTQ2 = _score_objects(half, query_BTD, observations, picked_BT)
     slot_BT = strategy(scores_BTQ)
-    decoded_BT12, point_BT2 = actions_BTC[..., None, part].to(points_BTQ2), at(points_BTQ2, slot_BT)
-    if observations.are_at_scenes(half):
-        is_near_BT1 = point_BT2.isfinite()[..., :1]
-    else:
-        is_near_BT1 = ((points_BTQ2 - decoded_BT12).norm(dim=-1).amin(-1) < _NEAR_M[half])[..., None]
-    position_BT2 = torch.where(is_near_BT1, point_BT2, decoded_BT12.squeeze(2))
+    point_BT2 = at(points_BTQ2, slot_BT)
+    position_BT2 = torch.where(point_BT2.isfinite(), point_BT2, actions_BTC[..., part].to(point_BT2))
     actions_BTC[..., part] = position_BT2.to(actions_BTC.dtype)
     return slot_BT
 
@@ -291,18 +281,16 @@ def _score_objects(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Score tokens as the object of the pick, half 0, or of the place, half 1; and return their points.
 
-    The score of what is no object is very low. Where places are read from scenes of the prompt, too, the
-    query of the place is joined by the token of the picked object, which its goal looks like; and the last
-    score, 0, is that of no object.
+    The score of what is no object is very low. The query of the place is joined by the token of the picked
+    object, which its goal may look like; and the last score of places, 0, is that of no object.
     """
-    at_scenes = observations.are_at_scenes(half)
     tokens_BTQD, points_BTQ2 = observations.candidates(half)
-    if at_scenes:
+    if half == 1:
         query_BTD = query_BTD + at(observations.tokens_BTQD, picked_BT)
     query_BTE, keys_BTQE = query_BTD.chunk(2, -1)[half], tokens_BTQD.chunk(2, -1)[half]
     scores_BTQ = torch.einsum("btqe,bte->btq", keys_BTQE, query_BTE) * query_BTE.shape[-1] ** -0.5
     scores_BTQ = mask_scores(scores_BTQ, points_BTQ2[..., 0].isfinite())
-    if at_scenes:
+    if half == 1:
         scores_BTQ, points_BTQ2 = F.pad(scores_BTQ, (0, 1)), F.pad(points_BTQ2, (0, 0, 0, 1), value=math.inf)
     return scores_BTQ, points_BTQ2
 

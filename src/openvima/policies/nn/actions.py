@@ -11,7 +11,7 @@ from functools import cache
 import torch
 from torch import nn
 
-from openvima.policies.nn.layers import TensorRecord, mlp
+from openvima.policies.nn.layers import TensorRecord, layer_of, mlp
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 # Slices of the action vector: positions and quaternions of both poses, in this order in all policies.
@@ -32,6 +32,18 @@ class ActionEncoder(nn.Module):
         sizes = [part.stop - part.start for part in ACTION_PARTS.values()]
         self.parts = nn.ModuleList(mlp((size, part_width, part_width)) for size in sizes)
         self.out = nn.Linear(len(sizes) * part_width, width)
+
+    @torch.no_grad()
+    def align(self) -> None:
+        """Let fresh tokens differ about as much between actions as those of images do between objects.
+
+        The first layers read `4 · (action - 0.5)`, as those of boxes do.
+        """
+        for layers in self.parts:
+            first = layer_of(layers, 0)
+            first.weight.mul_(4)
+            first.bias.sub_(first.weight.sum(dim=1) / 2)
+        self.out.weight.mul_((self.out.in_features / len(self.parts)) ** 0.5 / 2)
 
     def forward(self, unit_actions: torch.Tensor) -> torch.Tensor:
         """Map actions in unit range, shape (..., 12), to tokens (..., D)."""

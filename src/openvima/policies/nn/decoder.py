@@ -94,6 +94,7 @@ class KVCache(TensorRecord):
         length_B: Number of these; the next valid token gets this position.
         prompt: Keys and values of each cross block; empty with a prefix.
         prompt_mask_BP: Which positions of the prompt may be attended to.
+        first: Tokens and table points of the objects at the first step, if positions are read from objects.
     """
 
     past: tuple[KeysValues, ...]
@@ -101,6 +102,7 @@ class KVCache(TensorRecord):
     length_B: torch.Tensor
     prompt: tuple[KeysValues, ...]
     prompt_mask_BP: torch.Tensor
+    first: tuple[torch.Tensor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,7 +262,9 @@ class Decoder(CausalDecoder):
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
 
     def align(self) -> None:
-        """Do so in every cross block."""
+        """Do so in every cross block. Positions start as in `PrefixDecoder.align`."""
+        self.positions.weight.mul_(_POSITION_GAIN)
+        self.prompt_positions.weight.mul_(_POSITION_GAIN)
         for block in (cast(CrossBlock, each) for each in self.cross_blocks):
             _align(block.query.weight, block.key_value.weight[: self.width])
 

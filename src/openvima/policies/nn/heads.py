@@ -35,7 +35,6 @@ from openvima.policies.nn.action_head import (
     encode_bins,
     fit_bins,
     point_at_object,
-    point_at_objects,
 )
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
@@ -81,8 +80,7 @@ class AutoregressiveHead(nn.Module):
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
 
-    pointing_weight = 0.0  # see `ActionHead`
-    points = False
+    points = False  # see `ActionHead`
 
     def __init__(self, hidden_width: int, width: int, actions: "ComponentTokens") -> None:
         super().__init__()
@@ -109,10 +107,8 @@ class AutoregressiveHead(nn.Module):
         loss, metrics, bins_BTC = bins_loss(logits, targets)
         actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
         pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
-        if self.points:
-            actions_BTC = point_at_objects(actions_BTC, pick_BTD, place_BTD, observations, greedy)
         found = loss, metrics, actions_BTC
-        return add_pointing(found, self.pointing_weight, pick_BTD, place_BTD, observations, targets)
+        return add_pointing(found, self.points, pick_BTD, place_BTD, observations, targets)
 
     def decode_step(
         self,

@@ -14,7 +14,7 @@ from torch import nn
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_head import ObservationTokens
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, action_metrics, greedy
-from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder
+from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder, KVCache
 from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -78,7 +78,7 @@ class EncodedPrompt(TensorRecord):
         tokens_BLD: Encoded words and images.
         mask_BL: Which positions exist.
         points_BL2: Table points of the objects in scenes that tokens stand for, infinite for others; None
-            where places are not read from them.
+            where positions are not read from objects.
     """
 
     tokens_BLD: torch.Tensor
@@ -102,6 +102,7 @@ class PolicyNetwork(nn.Module):
     head: Any  # one of `nn/heads.py`; the pointer models have their own
     end_effectors: nn.Embedding
     observation_out: nn.Linear
+    place_kinds: nn.Parameter  # added to tokens in scenes of the prompt and at the first step, (2, D)
     score = "accuracy"  # the metric that selects the best checkpoint, a fraction of 1
     explains: bool = False  # whether `explain_step` is of use
 
@@ -157,9 +158,8 @@ class PolicyNetwork(nn.Module):
             The loss, a mean over all steps, and metrics: every named part of the loss as `loss/<name>`, and
             accuracies; see `action_metrics`.
         """
-        loss, metrics, actions_BTC = self.head.loss(
-            self.decoder, self.init_cache(prompt), self._observe(prompt, history, features_KF), targets
-        )
+        observations, cache = self._observe(prompt, self.init_cache(prompt), history, features_KF)
+        loss, metrics, actions_BTC = self.head.loss(self.decoder, cache, observations, targets)
         in_view_BTN = history.masks_BTVN.any(dim=2) & (self.object_encoder is not None)
         return loss, {**metrics, **action_metrics(actions_BTC, targets, history.grasps_BTN2, in_view_BTN)}
 
@@ -190,17 +190,25 @@ class PolicyNetwork(nn.Module):
         Raises:
             PolicyError: Prompt or history is longer than the decoder takes.
         """
-        observations = self._observe(prompt, history, features_KF)
+        observations, state = self._observe(prompt, state, history, features_KF)
         return self.head.decode_step(
             self.decoder, state, observations, previous_BTC, has_previous_BT, strategy
         )
 
-    def _observe(self, prompt: Any, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
-        """Make the tokens of each observation, beside those of the prompt's scenes if places may be there."""
+    def _observe(
+        self, prompt: Any, cache: KVCache, history: HistoryBatch, features_KF: torch.Tensor
+    ) -> tuple[ObservationTokens, KVCache]:
+        """Make the tokens of each observation, with those of other scenes if places may be there."""
         observations = self.observe(history, features_KF)
-        if prompt.points_BL2 is None:
-            return observations
-        return replace(observations, scene_tokens_BLD=prompt.tokens_BLD, scene_points_BL2=prompt.points_BL2)
+        if observations.points_BTQ2 is None:
+            return observations, cache
+        if not cache.first:
+            cache = replace(cache, first=(observations.tokens_BTQD[:, 0], observations.points_BTQ2[:, 0]))
+        first_BQD, points_BQ2 = cache.first
+        in_prompt_D, at_first_D = self.place_kinds
+        tokens_BLD = torch.cat([prompt.tokens_BLD + in_prompt_D, first_BQD + at_first_D], dim=1)
+        points_BL2 = torch.cat([prompt.points_BL2.to(points_BQ2), points_BQ2], dim=1)
+        return replace(observations, scene_tokens_BLD=tokens_BLD, scene_points_BL2=points_BL2), cache
 
     def explain_step(
         self,
