@@ -41,10 +41,9 @@ for_one_network = pytest.mark.parametrize("policy", ["nano"], indirect=True)  # 
 )
 def policy(request) -> NetworkPolicy:
     """One policy in double precision for each kind of network; every test resets it."""
-    if request.param != "midas-nano":
+    if request.param not in ("vima-nano", "midas-nano"):
         return NetworkPolicy(perturbed(request.param))
-    points = {"points": True, "points_at_scenes": True}
-    return NetworkPolicy(perturbed(with_variant(preset(request.param), points)))
+    return NetworkPolicy(perturbed(with_variant(preset(request.param), {"points": True})))
 
 
 @pytest.fixture(scope="module")

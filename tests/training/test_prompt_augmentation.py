@@ -18,7 +18,6 @@ from openvima.scene import Action
 from openvima.tasks.novel_words import NOUNS
 from openvima.training import TrainingConfig, train
 from openvima.training.augmentation.demonstrations import (
-    ANY_ORDER,
     MAX_DISTRACTORS,
     DemonstrationAugmentation,
     drop_unused_objects,
@@ -268,27 +267,6 @@ def _action(numbers: np.ndarray) -> Action:
     pose0, pose1 = np.split(numbers.astype(np.float64), 2)
     arrays = {"pose0_position": pose0[:2], "pose0_rotation": pose0[2:]}
     return Action.from_arrays(arrays | {"pose1_position": pose1[:2], "pose1_rotation": pose1[2:]})
-
-
-@pytest.mark.parametrize("task", ANY_ORDER)
-def test_the_leftmost_action_may_be_done_in_place_of_the_demonstrated_one(task) -> None:
-    env, num_changed = TabletopEnv(task, level="train", domain="user"), 0
-    for seed in range(8):
-        episode = preprocess(rollout_oracle(env, seed), "objects")
-        labelled = DemonstrationAugmentation(leftmost_first=True)(episode, None)
-        assert labelled.executed is episode.actions
-        for t, action in enumerate(labelled.actions):
-            assert action[1] <= episode.actions[t, 1]
-            if np.array_equal(action, episode.actions[t]):
-                continue
-            num_changed += 1
-            env.reset(seed=seed)
-            for each in (*episode.actions[:t], action):
-                _, _, terminated, _, info = env.step(_action(each))
-            while not terminated:
-                _, _, terminated, _, info = env.step(env.oracle_decision().action)
-            assert info["success"]
-    assert num_changed
 
 
 @pytest.fixture(scope="module")

@@ -66,28 +66,22 @@ def test_every_preset_has_a_recipe_that_trains_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "points", "weight", "pretraining"),
+    ("options", "points", "pretraining"),
     [
-        ([], True, 1.0, 1600),
-        (["--model.image-tokens", "object-perceiver", "--model.conditioning", "prefix"], None, 0.0, 1600),
-        (["--model.image-tokens=patches"], None, 0.0, 0),
-        (["--model.head", "autoregressive"], True, 1.0, 1600),
-        (["--init-from", "openvima-vima"], True, 1.0, 0),
+        ([], True, 4000),
+        (["--model.image-tokens", "object-perceiver", "--model.conditioning", "prefix"], None, 4000),
+        (["--model.image-tokens=patches"], None, 0),
+        (["--model.head", "autoregressive"], True, 4000),
+        (["--init-from", "openvima-vima"], True, 0),
     ],
 )
 def test_a_recipe_leaves_out_what_other_parts_of_the_network_cannot_have(
-    options, points, weight, pretraining
+    options, points, pretraining
 ) -> None:
     config = resolve(parse(["--data", "demos", "--out", "run", "--preset", "vima-nano", *options]))
-    assert (config.model.points, config.optimizer.pointing_loss_weight) == (points, weight)
+    assert config.model.points == points
     assert config.pretraining.steps == pretraining
     assert config.schedule.steps == recipe_settings("papers")["schedule.steps"]
-
-
-def test_midas_of_patches_reads_no_places_from_scenes() -> None:
-    words = ["--data", "demos", "--out", "run", "--preset", "midas-nano"]
-    assert resolve(parse(words)).model.points_at_scenes
-    assert not resolve(parse([*words, "--model.image-tokens", "patches"])).model.points_at_scenes
 
 
 def test_options_take_precedence_over_the_file_and_the_file_over_the_recipe(trained, tmp_path) -> None:

@@ -64,7 +64,6 @@ class PreprocessedEpisode:
             `images[n - 1]`.
         descriptions: Texture and name of the objects in object images of the task's prompt, by placeholder;
             see `openvima.tasks.prompts.image_descriptions`.
-        executed: Actions of the oracle, where others are to be learned.
     """
 
     task: str
@@ -80,7 +79,6 @@ class PreprocessedEpisode:
     actions: np.ndarray
     images: np.ndarray
     descriptions: Mapping[str, str] = field(default_factory=dict)
-    executed: np.ndarray | None = None
 
     @property
     def num_steps(self) -> int:

@@ -216,16 +216,11 @@ class Processor:
             self._slots_of(np.concatenate([getattr(episode, name) for episode in episodes]), objects, counts)
             for name in ("pick_ids", "place_ids")
         )
-        executed = None
-        if any(episode.executed is not None for episode in episodes):
-            done = [e.actions if e.executed is None else e.executed for e in episodes]
-            executed = torch.from_numpy(steps.pad(np.concatenate(done)))
         targets = ActionTargets(
             torch.from_numpy(steps.pad(np.concatenate([episode.actions for episode in episodes]))),
             torch.from_numpy(steps.pad(pick, fill=-1)),
             torch.from_numpy(steps.pad(place, fill=-1)),
             history.steps_BT,
-            executed,
         )
         return Batch(
             self.batch_prompts([episode.prompt for episode in episodes]),

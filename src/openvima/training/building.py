@@ -14,7 +14,6 @@ from openvima.perception.preprocessing import split_prompt
 from openvima.policies.build import PolicyConfig, appearance_width, build_network, config_to_dict
 from openvima.policies.checkpoint import load_network
 from openvima.policies.naming import find_checkpoint
-from openvima.policies.nn.heads import AutoregressiveConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.presets import PRESETS, own_policies, preset
@@ -37,7 +36,6 @@ from openvima.user_code import with_absolute_path
 
 _FOR_OBJECTS = (
     "centre_picks",
-    "leftmost_first",
     "drop_unused_objects_prob",
     "rename_objects_prob",
     "distractor_prob",
@@ -100,11 +98,6 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
                 f"augmentation.{name} is {getattr(augmentation, name)}, but preset {config.preset!r} takes "
                 f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
-    if augmentation.leftmost_first and isinstance(sizes.head, AutoregressiveConfig):
-        raise ConfigError(
-            "augmentation.leftmost_first is True, but an autoregressive head reads the actions to learn as "
-            "those that were done; set it to False."
-        )
     has_appearance = appearance_width(sizes) > 0
     if config.pretraining.steps and sizes.inputs.tokens == "frames":
         raise ConfigError(

@@ -255,9 +255,6 @@ class AugmentationConfig:
         centre_picks: Move each demonstrated pick, a random point of its object, to the object's most interior
             pixel, and the place with it; in validation, too. Pointer models read the pick from the object
             and have no use for it.
-        leftmost_first: Where the goals of a task may be met in any order, learn at each step the leftmost of
-            the actions that could be next, in place of the one that the oracle took; in validation, too. Not
-            for autoregressive heads, whose parts of an action know of each other.
         false_positive_prob: Probability that a view of a step contains a false detection.
         inverse_dynamics_prob: Probability of replacing the prompt by "Follow this motion: frame … frame":
             1 for inverse-dynamics pretraining, less for in-context demonstrations. Validation uses the
@@ -285,7 +282,6 @@ class AugmentationConfig:
     """
 
     centre_picks: bool = False
-    leftmost_first: bool = False
     false_positive_prob: Probability = 0.05
     inverse_dynamics_prob: Probability = 0.0
     drop_unused_objects_prob: Probability = 0.0

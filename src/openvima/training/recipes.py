@@ -109,6 +109,7 @@ _PAPERS_MIDAS: Mapping[str, Any] = {
     "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
     "loader.first_steps": 600,
     "augmentation.inverse_dynamics_prob": 0.33,
+    "augmentation.drop_unused_objects_prob": 0.5,  # `follow_motion` shows what moves alone
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
 RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(

@@ -89,7 +89,7 @@ def action_segment(tokens_BTQD: torch.Tensor, exists_BT: torch.Tensor) -> TokenS
 
 def shift_actions(targets: ActionTargets) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the action before each step, (B, T, C), zero before the first; and whether there is one."""
-    actions_BTC = targets.actions_BTC if targets.executed_BTC is None else targets.executed_BTC
+    actions_BTC = targets.actions_BTC
     previous_BTC = torch.cat([torch.zeros_like(actions_BTC[:, :1]), actions_BTC[:, :-1]], dim=1)
     return previous_BTC, F.pad(targets.steps_BT[:, 1:], (1, 0), value=False)
 

@@ -81,14 +81,12 @@ class ActionTargets(TensorRecord):
         pick_BT: Slot of the picked object in view; -1 where it is not in view.
         place_BT: Slot of the object relative to which it was placed; -1 where there is none.
         steps_BT: Which steps exist.
-        executed_BTC: Actions that were executed; None where they are those to learn.
     """
 
     actions_BTC: torch.Tensor
     pick_BT: torch.Tensor
     place_BT: torch.Tensor
     steps_BT: torch.Tensor
-    executed_BTC: torch.Tensor | None = None
 
 
 def greedy(logits: torch.Tensor) -> torch.Tensor:

@@ -131,51 +131,6 @@ def centre_picks(episode: PreprocessedEpisode) -> PreprocessedEpisode:
     return replace(episode, actions=actions)
 
 
-# Of these the goals of one stage may be met in any order, which no network can foresee.
-ANY_ORDER = ("rearrange", "rearrange_then_restore", "same_shape", "twist")
-_OCCUPIED_M = 0.1  # a place is taken where an object is nearer
-
-
-def leftmost_first(episode: PreprocessedEpisode) -> PreprocessedEpisode:
-    """Let each step's label be the leftmost in the pictures of the actions that could be next.
-
-    Where goals may be met in any order, the oracle takes one that cannot be foreseen. A network whose parts
-    of an action are independent then picks one object and puts it where another belongs.
-    """
-    if episode.task not in ANY_ORDER:
-        return episode
-    picks, steps = episode.pick_ids.tolist(), range(episode.num_steps)
-    stage, moved = [], set[int]()
-    for pick in picks:  # an object that moves again begins the next stage
-        stage.append((stage[-1] if stage else 0) + (pick in moved))
-        moved = {pick} if pick in moved else moved | {pick}
-    objects, step = episode.objects, np.repeat(steps, episode.objects_per_step)
-    points = unproject(objects.grasps[:, TOP], CAMERAS["top"])
-    near = [  # of each action, where another object is at its place, in all steps
-        objects.masks[:, TOP] & (objects.ids != pick) & (np.linalg.norm(points - place, axis=1) < _OCCUPIED_M)
-        for pick, place in zip(picks, episode.actions[:, PLACE], strict=True)
-    ]
-
-    def is_free(action: int, now: int) -> bool:  # nothing is at its place that leaves it before
-        there_now, there_then = (set(objects.ids[near[action] & (step == t)].tolist()) for t in (now, action))
-        return there_now <= there_then
-
-    labels = [
-        min(
-            (s for s in steps[t:] if stage[s] == stage[t] and is_free(s, t)),
-            key=lambda s: episode.actions[s, PICK][1],
-        )
-        for t in steps
-    ]
-    return replace(
-        episode,
-        actions=episode.actions[labels],
-        pick_ids=episode.pick_ids[labels],
-        place_ids=episode.place_ids[labels],
-        executed=episode.actions,
-    )
-
-
 Transform: TypeAlias = Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
 
 
@@ -203,14 +158,12 @@ class DemonstrationAugmentation:
     Args:
         inverse_dynamics_prob: Probability of the inverse-dynamics prompt.
         centres_picks: Whether picks are moved, see `centre_picks`.
-        leftmost_first: Whether labels are changed, see `leftmost_first`; not of inverse dynamics.
         of_inverse_dynamics: Transforms of demonstrations with that prompt.
         of_tasks: Transforms of those with the prompt of their task, after distractors were inserted.
     """
 
     inverse_dynamics_prob: float = 0.0
     centres_picks: bool = False
-    leftmost_first: bool = False
     of_inverse_dynamics: tuple[Transform, ...] = ()
     of_tasks: tuple[Transform, ...] = ()
 
@@ -235,8 +188,6 @@ class DemonstrationAugmentation:
         prob = self.inverse_dynamics_prob
         is_drawn = rng is not None and prob > 0 and rng.random() < prob and not keeps_prompt
         is_inverse = prob == 1 or is_drawn
-        if self.leftmost_first and not is_inverse:
-            episode = leftmost_first(episode)
         if is_inverse:
             episode = with_motion_prompt(episode)
         elif rng is not None and other is not None:
@@ -256,7 +207,6 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
     return DemonstrationAugmentation(
         config.inverse_dynamics_prob,
         config.centre_picks,
-        config.leftmost_first,
         of_inverse_dynamics=(partial(drop_unused_objects, prob=config.drop_unused_objects_prob), shuffle),
         of_tasks=(
             Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
