@@ -8,16 +8,20 @@ from openvima.env import TabletopEnv
 from openvima.errors import PolicyError
 from openvima.policies import load_policy
 from openvima.policies.inference import NetworkPolicy
+from openvima.policies.presets import preset
+from openvima.policies.variants import with_variant
 from openvima.render import TOP, unproject
 from openvima.scene.explanation import Explanation, bin_positions
 from small_networks import perturbed
 
-NAMES = ("nano", "small", "nano-bins", "vima-nano")
-FAST = ("nano", "small")
+POINTING = "vima-nano that points"
+NAMES = ("nano", "small", "nano-bins", "vima-nano", POINTING)
+FAST = ("nano", "small", POINTING)
 
 
 def policy_of(name: str, **options) -> NetworkPolicy:
-    network = perturbed(name)
+    points = name == POINTING
+    network = perturbed(with_variant(preset("vima-nano"), {"points": True}) if points else name)
     with torch.no_grad():
         for key, parameter in network.named_parameters():
             if "offset" in key:  # as fresh pointers, it places exactly at its candidate
@@ -67,8 +71,10 @@ def test_every_distribution_sums_to_one_and_its_peak_is_the_action_that_asking_k
             assert np.array_equal(explanation.action[key], values)
         if explanation.bins:
             check_bins(explanation)
-        else:
+        elif explanation.objects:
             check_pointers(explanation)
+        if explanation.bins and explanation.objects:
+            check_positions(explanation)
 
 
 def check_bins(explanation: Explanation) -> None:
@@ -77,6 +83,8 @@ def check_bins(explanation: Explanation) -> None:
         assert probabilities.sum() == pytest.approx(1)
         key, axis = name.split(".")
         taken = explanation.action[key]["xyzw".index(axis)]
+        if "position" in key and explanation.objects:
+            continue
         if "position" in key:
             decoded = bin_positions(len(probabilities), "xy".index(axis))
         else:
@@ -84,6 +92,18 @@ def check_bins(explanation: Explanation) -> None:
         assert decoded[probabilities.argmax()] == pytest.approx(taken, abs=1e-6)
     heat_map = explanation.heat_map("pose1")
     assert heat_map.shape == (50, 100) and heat_map.sum() == pytest.approx(1)
+
+
+def check_positions(explanation: Explanation) -> None:
+    """Of a policy over bins that reads positions from objects."""
+    for probabilities in (explanation.objects, explanation.places):
+        assert sum(each.probability for each in probabilities) == pytest.approx(1)
+    picked = max(explanation.objects, key=lambda each: each.probability)
+    centre = unproject(np.array(picked.boxes["top"][:2], float), TOP)
+    np.testing.assert_allclose(centre, explanation.action["pose0_position"], atol=1e-6)
+    place = max(explanation.places, key=lambda each: each.probability)
+    np.testing.assert_allclose(place.position, explanation.action["pose1_position"], atol=1e-6)
+    assert {each.kind for each in explanation.places} >= {"in view", "first step", "grid"}
 
 
 def check_pointers(explanation: Explanation) -> None:
@@ -127,6 +147,18 @@ def test_sampled_choices_are_explained_as_they_were_drawn(demos) -> None:
         assert any(np.allclose(grasp, action["pose0_position"], atol=1e-6) for grasp in grasps)
         probabilities = [each.probability for each in explanation.objects]
         assert max(probabilities) - min(probabilities) < 0.2  # as hot as that nothing is preferred
+
+
+def test_bundled_vima_picks_what_the_prompt_shows_and_places_it_at_an_object_in_view() -> None:
+    policy = load_policy("openvima-vima")
+    env = TabletopEnv("visual_manipulation", level="L1")
+    observation, _ = env.reset(seed=0)
+    policy.reset([env.prompt])
+    policy.act([observation])
+    (explanation,) = policy.explain()
+    picked = max(explanation.objects, key=lambda each: each.probability)
+    assert picked.object_id == env.episode.problem.goals[0].object_id
+    assert explanation.distinct_places()[0].kind in ("in view", "first step")
 
 
 def test_the_bundled_policy_attends_to_what_it_picks_and_to_where_it_goes() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import torch
 
-from openvima.perception.objects import ObjectViews
+from openvima.perception.objects import TOP, ObjectViews
 from openvima.perception.preprocessing import extract_observation
 from openvima.policies.batch import WORD, PromptBatch
 from openvima.policies.nn.actions import ACTION_PARTS
@@ -48,10 +48,10 @@ def explain_row(
         follow_coreference: Whether words have the appearance of the images they refer to; attention to such a
             word counts as attention to these images then.
     """
-    scale = temperature or 1.0
-    probabilities = [
-        torch.softmax(logits[row].to("cpu", torch.float64) / scale, dim=-1).numpy() for logits in trace.logits
-    ]
+
+    def probabilities(logits: torch.Tensor) -> np.ndarray:
+        return torch.softmax(logits[row].to("cpu", torch.float64) / (temperature or 1.0), dim=-1).numpy()
+
     batch, _ = processor.encode_prompts([prompt])
     words, piece_L = _prompt_pieces(prompt, batch, processor)
     attention = {}
@@ -62,11 +62,13 @@ def explain_row(
             weights_L = weights_L * (refers_LL.sum(dim=1) == 0) + weights_L @ refers_LL
         weights_L = weights_L / weights_L.sum()  # exactly, whatever the network computes in
         attention[kind] = np.bincount(piece_L, weights_L.numpy(), minlength=len(words))
+    bins = {name: probabilities(logits) for name, logits in zip(COMPONENTS, trace.bins, strict=False)}
     if trace.positions_BC2 is None or trace.masks_BC is None or trace.kinds_C is None:
-        bins = dict(zip(COMPONENTS, probabilities, strict=True))
         return Explanation(action, words, attention, bins=bins)
-    picks, places, yaws = probabilities
+    picks, places, *rotation = (probabilities(logits) for logits in trace.logits)
     found = extract_observation(observation, processor.input_kind, processor.extractor)
+    if processor.layout == "views":  # the tokens have another order
+        picks = picks[np.argsort(np.lexsort((found.ids, ~found.masks[TOP])))]
     return Explanation(
         action,
         words,
@@ -77,10 +79,14 @@ def explain_row(
             for index, (x, y) in enumerate(trace.positions_BC2[row].tolist())
             if trace.masks_BC[row, index]
         ),
-        (bin_to_yaw(torch.arange(len(yaws)), len(yaws), torch.float64).numpy() + math.pi) % (2 * math.pi)
-        - math.pi,
-        yaws,
+        *((_yaws(len(rotation[0])), rotation[0]) if rotation else ()),
+        bins=bins,
     )
+
+
+def _yaws(count: int) -> np.ndarray:
+    yaws = bin_to_yaw(torch.arange(count), count, torch.float64).numpy()
+    return (yaws + math.pi) % (2 * math.pi) - math.pi
 
 
 def _objects(found: ObjectViews, picks: np.ndarray, *, has_ids: bool) -> Iterator[ObjectProbability]:

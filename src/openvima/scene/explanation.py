@@ -36,7 +36,7 @@ class PlaceProbability:
     Args:
         kind: Where it comes from, one of `PLACE_KINDS`: "in view", an object in view; "first step", an object
             where it was at the first step; "prompt", an object where an image of the prompt shows it; "grid",
-            a point of the table.
+            a point of the table, that of the most probable bins for policies over bins.
         position: x and y in metres. The policy adds an offset to it.
         probability: Probability of placing there.
     """
@@ -50,8 +50,9 @@ class PlaceProbability:
 class Explanation:
     """How a policy came to its last action in one episode.
 
-    Policies that point fill `objects`, `places` and `yaw_…`; policies over bins fill `bins`. Probabilities of
-    each distribution sum to 1, and so do the weights of each kind of attention.
+    Policies that point fill `objects`, `places` and `yaw_…`; policies over bins fill `bins`, and where they
+    read positions from objects, `objects` and `places` as well. Probabilities of each distribution sum to 1,
+    and so do the weights of each kind of attention.
 
     Args:
         action: The action, as `act` returned it.

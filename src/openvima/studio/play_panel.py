@@ -329,7 +329,7 @@ class WhyPanel:
             if proposal.explanation is not None:
                 if proposal.explanation.words:
                     lines.append(f"{name} said:\n\n> {_quoted(proposal.explanation.words)}")
-                elif proposal.explanation.bins:
+                elif proposal.explanation.bins and not proposal.explanation.objects:
                     self._add_heat_maps(table, proposal.explanation)
                 else:
                     self._explain(table, run, proposal.explanation)

@@ -48,7 +48,7 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
     image = Rasteriser(assets).scene(scene, views=("top",), enlarge=ENLARGE)["top"]
     panel = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     panel[: TOP.height * ENLARGE] = channels_last(image.rgb)
-    if explanation is not None and explanation.bins:
+    if explanation is not None and explanation.bins and not explanation.objects:
         _tint_heat_maps(panel, explanation)
     elif explanation is not None:
         _tint_objects(panel, image.segm, explanation.objects)

@@ -10,15 +10,24 @@ from typing import Any, cast
 
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
-from openvima.policies.nn.action_head import ObservationTokens
-from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, action_metrics, greedy
+from openvima.policies.nn.action_head import ObservationTokens, actions_from_bins
+from openvima.policies.nn.actions import (
+    ACTION_PARTS,
+    ACTION_WIDTH,
+    ActionTargets,
+    DecodingStrategy,
+    action_metrics,
+    greedy,
+)
 from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder, KVCache
 from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.scene import END_EFFECTORS
+from openvima.scene.explanation import PLACE_KINDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,11 +35,13 @@ class StepTrace:
     """Logits and attention of one step.
 
     Args:
-        logits: Of each choice in the order of decoding, (B, classes) each.
+        logits: Of the object in view, the place candidate and the rotation, (B, classes) each; without a
+            rotation or none where bins give it.
         attention: Kind of attention to weights of the prompt's positions, (B, L), which sum to 1.
         positions_BC2: Positions of the place candidates, metres; None without any.
         masks_BC: Which of them exist.
         kinds_C: Kind of each, an index of `PLACE_KINDS`.
+        bins: Logits of each component of the action, of policies over bins.
     """
 
     logits: Sequence[torch.Tensor]
@@ -38,6 +49,7 @@ class StepTrace:
     positions_BC2: torch.Tensor | None = None
     masks_BC: torch.Tensor | None = None
     kinds_C: torch.Tensor | None = None
+    bins: Sequence[torch.Tensor] = ()
 
 
 class Replay:
@@ -234,8 +246,25 @@ class PolicyNetwork(nn.Module):
         finally:
             hook.remove()
         # An autoregressive head goes on with the components of the action.
+        attention = {"decoder": normalize_weights(weights[0].mean(dim=1), prompt.mask_BL)}
+        bins, logits = replay.logits[:ACTION_WIDTH], replay.logits[ACTION_WIDTH:]
+        if not logits:
+            return StepTrace((), attention, bins=bins)
+        observations, _ = self._observe(prompt, state, history, features_KF)
+        points_BC2, num_own = observations.candidates(1)[1][:, 0], observations.tokens_BTQD.shape[2]
+        picks_BQ, places_BC = logits
+        end = num_own - self.config.query_token  # before it are the tokens of the top view
+        num_first = points_BC2.shape[1] - num_own - prompt.mask_BL.shape[1]
+        classes_BK = torch.stack([each.argmax(-1) for each in bins], dim=-1)
+        at_no_object_B2 = actions_from_bins(classes_BK, points_BC2.dtype)[:, ACTION_PARTS["pose1_position"]]
+        kinds = ("in view",) * num_own + ("prompt",) * prompt.mask_BL.shape[1] + ("first step",) * num_first
         return StepTrace(
-            replay.logits, {"decoder": normalize_weights(weights[0].mean(dim=1), prompt.mask_BL)}
+            (picks_BQ[:, end - history.masks_BTVN.shape[-1] : end], places_BC),
+            attention,
+            torch.cat([points_BC2, at_no_object_B2[:, None]], dim=1),
+            F.pad(points_BC2[..., 0].isfinite(), (0, 1), value=True),
+            torch.tensor([PLACE_KINDS.index(kind) for kind in (*kinds, "grid")]),
+            bins,
         )
 
     def add_end_effector(self, tokens_BTQE: torch.Tensor, end_effector_BT: torch.Tensor) -> torch.Tensor:
