@@ -70,12 +70,15 @@ def test_the_decoders_of_all_architectures_are_of_equal_size(size: str) -> None:
 
 @pytest.mark.parametrize("name", ["small", *(name for name in PRESETS if "nano" in name or "2m" in name)])
 def test_every_parameter_belongs_to_one_part(name: str) -> None:
-    network = outline_network(preset(name))
+    sizes = preset(name)
+    if getattr(sizes, "has_object_tokens", False):
+        sizes = replace(sizes, points=True)
+    network = outline_network(sizes)
     for parameter, _ in network.named_parameters():
         owners = [part for part, prefixes in PARTS.items() if parameter.startswith(prefixes)]
         expected = 2 if parameter.startswith("head.actions.") else 1  # of two the first counts, "actions"
         assert len(owners) == expected, (parameter, owners)
-    total = policy_size(preset(name)).parameters
+    total = policy_size(sizes).parameters
     assert total.total == sum(parameter.numel() for parameter in network.parameters())
 
 

@@ -86,7 +86,7 @@ PARTS = {
     ),
     "decoder": ("decoder.self_blocks.", "decoder.cross_blocks."),
     "actions": ("actions.", "head.actions."),
-    "head": ("head.", "text_appearance."),
+    "head": ("head.", "text_appearance.", "place_kinds"),
     "positions": ("decoder.positions.", "decoder.prompt_positions.", "decoder.separator", "query"),
 }
 
