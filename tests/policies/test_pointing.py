@@ -39,8 +39,9 @@ def _inputs(
     scene_points[:, 0] = math.inf
     scene_points[:, 3] = points[:, 0, 2]
     query = torch.zeros(B, T, dtype=torch.int64)
+    grasps = torch.where(points.isfinite(), torch.rand(points.shape, generator=generator), points)
     observations = ObservationTokens(
-        tokens, points[..., 0].isfinite(), query, steps, points, scene_tokens, scene_points
+        tokens, points[..., 0].isfinite(), query, steps, points, scene_tokens, scene_points, grasps
     )
     actions = torch.rand(B, T, 12, generator=generator)
     actions[:, 0, 6:8] = points[:, 0, 2].float() + PLACE_NEAR_M / 2  # near an object; the others may not be
@@ -65,7 +66,8 @@ def test_a_place_is_scored_with_the_picked_object_in_all_scenes_or_at_none():
             if points[b, t, 1:].isfinite().all():
                 of_picks = (tokens[b, t, :, :4] @ pick[b, t, :4] / 2)[1:]
                 picked = 1 + of_picks.argmax()
-                demonstrated = (points[b, t] - targets.actions_BTC[b, t, :2]).norm(dim=-1).argmin()
+                grasps = observations.grasps_BTQ2[b, t]
+                demonstrated = (grasps - targets.actions_BTC[b, t, :2]).norm(dim=-1).argmin()
                 loss = loss - of_picks.log_softmax(0)[demonstrated - 1]
             of_places = [
                 torch.cat([keys @ (place[b, t] + tokens[b, t, slot])[4:] / 2, torch.zeros(1)])

@@ -12,7 +12,7 @@ from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, merge
 from openvima.errors import ConfigError, DatasetError, PromptError
-from openvima.perception.objects import observe
+from openvima.perception.objects import TOP, observe
 from openvima.policies.loading import held_out_data
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import WordTokenizer
@@ -249,6 +249,10 @@ def test_false_positives_come_anywhere_among_the_ordered_objects_of_a_view(views
         )
         assert added in ([], [false])
         assert not added or before.steps_BT[b, t]
+        if v == TOP:  # points in which objects are picked go with them
+            points = [each.grasps_BTN2[b, t, each.masks_BTVN[b, t, v]].tolist() for each in (before, after)]
+            kept = [point for slot, point in zip(new, points[1], strict=True) if slot in old]
+            assert kept == points[0]
         places += [(new.index(slot), len(old)) for slot in added]
     assert 0.3 < len(places) / (2 * int(before.steps_BT.sum())) < 0.7
     assert {place == 0 for place, _ in places} == {True, False}

@@ -49,6 +49,7 @@ class ObservationTokens:
             other tokens. None where positions are not read from objects.
         scene_tokens_BLD: Tokens of other scenes that places may be in: the prompt's, and the first step.
         scene_points_BL2: Table points of the objects in these that they stand for; infinite for others.
+        grasps_BTQ2: As `points_BTQ2`, under the most interior pixels in place of the boxes' centres.
     """
 
     tokens_BTQD: torch.Tensor
@@ -58,6 +59,7 @@ class ObservationTokens:
     points_BTQ2: torch.Tensor | None = None
     scene_tokens_BLD: torch.Tensor | None = None
     scene_points_BL2: torch.Tensor | None = None
+    grasps_BTQ2: torch.Tensor | None = None
 
     def candidates(self, half: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return tokens (B, T, Q', D) and points (B, T, Q', 2) to pick, half 0, or to place at, half 1."""
@@ -219,6 +221,8 @@ def pointing_loss(
     picked_BT = torch.zeros_like(observations.query_BT)
     for half, query_BTD in enumerate((pick_BTD, place_BTD)):
         scores_BTQ, points_BTQ2 = _score_objects(half, query_BTD, observations, picked_BT)
+        if half == 0:  # the centre of a container may be nearer than that of what is picked out of it
+            points_BTQ2 = cast(torch.Tensor, observations.grasps_BTQ2)
         target_BT12 = targets.actions_BTC[..., None, _POSITIONS[half]].to(points_BTQ2)
         distance_BTQ = (points_BTQ2 - target_BT12).norm(dim=-1)
         nearest_BT, picked_BT = distance_BTQ.min(dim=-1)

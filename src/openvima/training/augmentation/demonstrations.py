@@ -311,7 +311,10 @@ def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, drawn_BTV: to
     )
     num_slots_BT = (batch.history.num_slots_BT + shows_BTV.sum(dim=2)).cummax(dim=1).values
     num_slots_BT = torch.where(history.steps_BT, num_slots_BT, 0)
-    views = _reorder(history, rank_BTVN.argsort(dim=3))
+    order_BTVN = rank_BTVN.argsort(dim=3)
+    order_BTN2 = order_BTVN[:, :, TOP, :, None].expand_as(history.grasps_BTN2)
+    grasps_BTN2 = history.grasps_BTN2.gather(2, order_BTN2)
+    views = replace(_reorder(history, order_BTVN), grasps_BTN2=grasps_BTN2)
     return replace(batch, history=replace(views, num_slots_BT=num_slots_BT))
 
 
