@@ -99,8 +99,8 @@ def main() -> None:
     arguments = parser.parse_args()
     network, _ = load_network(arguments.policy)
     encoder = network.object_encoder
-    if encoder is None or not encoder.config.appearance_width:
-        parser.error(f"{arguments.policy} has no appearance embedding.")
+    if encoder is None:
+        parser.error(f"{arguments.policy} encodes no crops.")
     results: dict[str, dict[str, float]] = {}
     keys = ("prompt", "second_view", "rotation")
     print(f"{'scenes':<31}{'objects':>9}" + "".join(f"{key:>13}" for key in keys))
