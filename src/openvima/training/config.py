@@ -252,8 +252,8 @@ class AugmentationConfig:
     """Augmentation of demonstrations, drawn anew for each demonstration and batch.
 
     Args:
-        centre_picks: Move each demonstrated pick, a random point of its object, to the object's most interior
-            pixel, and the place with it; in validation, too. Pointer models read the pick from the object
+        centre_picks: Move each demonstrated pick, a random point of its object, to the centre of the object's
+            box, and the place with it; in validation, too. Pointer models read the pick from the object
             and have no use for it.
         false_positive_prob: Probability that a view of a step contains a false detection.
         inverse_dynamics_prob: Probability of replacing the prompt by "Follow this motion: frame … frame":

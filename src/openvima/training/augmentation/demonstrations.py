@@ -114,17 +114,18 @@ def _boxes_by_view(objects: ObjectTable) -> tuple[np.ndarray, np.ndarray]:
 
 
 def centre_picks(episode: PreprocessedEpisode) -> PreprocessedEpisode:
-    """Move picks to the most interior visible pixel of their object, and places so that it ends as before.
+    """Move picks to the centre of the box of their object, and places so that it ends as before.
 
     Demonstrated picks are random points of an object. Bins cannot predict which one, so they learn the choice
-    of the object through noise of two nats a coordinate. Sweeps stay as they are.
+    of the object through noise of two nats a coordinate. Policies that read positions from objects pick at
+    the centre as well. Sweeps stay as they are.
     """
     if episode.end_effector:
         return episode
     step = np.repeat(np.arange(episode.num_steps), episode.objects_per_step)
     is_picked = (episode.objects.ids == episode.pick_ids[step]) & episode.objects.masks[:, TOP]
     step = step[is_picked]
-    points = unproject(episode.objects.grasps[is_picked, TOP], CAMERAS["top"])
+    points = unproject(episode.objects.boxes[is_picked, TOP, :2], CAMERAS["top"])
     actions = episode.actions.copy()
     actions[step, PLACE] = carry(torch.from_numpy(actions[step]), torch.from_numpy(points)).numpy()
     actions[step, PICK] = points
