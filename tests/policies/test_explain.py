@@ -99,8 +99,7 @@ def check_positions(explanation: Explanation) -> None:
     for probabilities in (explanation.objects, explanation.places):
         assert sum(each.probability for each in probabilities) == pytest.approx(1)
     picked = max(explanation.objects, key=lambda each: each.probability)
-    centre = unproject(np.array(picked.boxes["top"][:2], float), TOP)
-    np.testing.assert_allclose(centre, explanation.action["pose0_position"], atol=1e-6)
+    np.testing.assert_allclose(picked.grasp, explanation.action["pose0_position"], atol=1e-6)
     place = max(explanation.places, key=lambda each: each.probability)
     np.testing.assert_allclose(place.position, explanation.action["pose1_position"], atol=1e-6)
     assert {each.kind for each in explanation.places} >= {"in view", "first step", "grid"}

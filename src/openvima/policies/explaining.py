@@ -67,13 +67,14 @@ def explain_row(
         return Explanation(action, words, attention, bins=bins)
     picks, places, *rotation = (probabilities(logits) for logits in trace.logits)
     found = extract_observation(observation, processor.input_kind, processor.extractor)
+    grasps = found.positions() if bins else found.grasp_points()
     if processor.layout == "views":  # the tokens have another order
         picks = picks[np.argsort(np.lexsort((found.ids, ~found.masks[TOP])))]
     return Explanation(
         action,
         words,
         attention,
-        tuple(_objects(found, picks, has_ids=processor.extractor is None)),
+        tuple(_objects(found, grasps, picks, has_ids=processor.extractor is None)),
         tuple(
             PlaceProbability(PLACE_KINDS[trace.kinds_C[index]], (x, y), float(places[index]))
             for index, (x, y) in enumerate(trace.positions_BC2[row].tolist())
@@ -89,9 +90,10 @@ def _yaws(count: int) -> np.ndarray:
     return (yaws + math.pi) % (2 * math.pi) - math.pi
 
 
-def _objects(found: ObjectViews, picks: np.ndarray, *, has_ids: bool) -> Iterator[ObjectProbability]:
-    grasps = found.grasp_points().tolist()
-    for slot, (object_id, (x, y)) in enumerate(zip(found.ids.tolist(), grasps, strict=True)):
+def _objects(
+    found: ObjectViews, grasps: np.ndarray, picks: np.ndarray, *, has_ids: bool
+) -> Iterator[ObjectProbability]:
+    for slot, (object_id, (x, y)) in enumerate(zip(found.ids.tolist(), grasps.tolist(), strict=True)):
         boxes = {
             view: tuple(found.boxes[v, slot].tolist()) for v, view in enumerate(VIEWS) if found.masks[v, slot]
         }

@@ -19,7 +19,8 @@ class ObjectProbability:
     Args:
         object_id: Its value in segmentations; -1 if a detector found it.
         boxes: View name to box, (centre x, centre y, height, width) in pixels; only views that show it.
-        grasp: Table point under its most interior pixel, x and y in metres, where it would be picked.
+        grasp: Table point where it would be picked, x and y in metres: under its most interior pixel, or for
+            policies over bins under the centre of its box.
         probability: Probability of picking it.
     """
 

@@ -220,6 +220,8 @@ def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     """Check that a network can begin with the weights of another, whose vocabulary may have another size."""
     here, there = flatten(config_to_dict(ours)), flatten(config_to_dict(theirs))
+    for sizes in (here, there):
+        sizes.pop("points", None)  # its two vectors may begin anew
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")
@@ -231,13 +233,13 @@ def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
 
 
 def _copy_weights(initial: PolicyNetwork, network: PolicyNetwork) -> None:
-    """Copy all weights; embeddings of words behind those of the other network stay fresh."""
+    """Copy all weights; further embeddings of words, and kinds of places that the other lacks, stay fresh."""
     weights, fresh = initial.state_dict(), network.state_dict()
     for name in ("prompt.words.weight", "attributes.words.weight"):
         if name in weights:
             fresh[name][: len(weights[name])] = weights[name]
             weights[name] = fresh[name]
-    network.load_state_dict(weights)
+    network.load_state_dict({name: weights.get(name, tensor) for name, tensor in fresh.items()})
 
 
 def training_texts(
