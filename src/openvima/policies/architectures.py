@@ -262,7 +262,7 @@ class TokenPolicy(PolicyNetwork):
         else:
             tokens_IE = self._frame_tokens(features_VSF)
         points_BL2 = self._points_in_scenes(prompts) if self.config.points else None
-        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL, points_BL2)
+        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL, points_BL2, prompts.start_B)
 
     def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
         """Make the image tokens of each step, and the query behind them if there is one."""

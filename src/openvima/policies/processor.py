@@ -183,6 +183,7 @@ class Processor:
             _table_points(objects, objects.boxes[..., :2]),
             image_index,
             in_scene[first_of[b] + image],
+            *([starts] if (starts := np.array([prompt.start for prompt in prompts])).any() else []),
         )
         return PromptBatch(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
