@@ -59,6 +59,20 @@ def test_invalid_positions_are_zero_and_change_nothing(decoder) -> None:
     torch.testing.assert_close(decoder(packed, later, mask)[0], decoder(whole, later, mask)[0])
 
 
+def test_positions_of_a_prompt_may_begin_at_another_than_the_first(decoder) -> None:
+    tokens, prompt, mask = torch.randn(2, 4, 16), torch.randn(2, 3, 16), torch.ones(2, 4, dtype=torch.bool)
+    starts = torch.tensor([0, 5])
+    shifted, _ = decoder(decoder.init_cache(prompt, mask[:, :3], starts), tokens, mask)
+    plain, _ = decoder(decoder.init_cache(prompt, mask[:, :3]), tokens, mask)
+    torch.testing.assert_close(shifted[0], plain[0])
+    assert not torch.allclose(shifted[1], plain[1], atol=1e-4)
+    table = decoder.prompt_positions if isinstance(decoder, Decoder) else decoder.positions
+    with torch.no_grad():
+        table.weight.copy_(table.weight.roll(-5, dims=0))
+    rolled, _ = decoder(decoder.init_cache(prompt, mask[:, :3]), tokens, mask)
+    torch.testing.assert_close(shifted[1], rolled[1])
+
+
 def test_too_long_a_history_is_refused(decoder) -> None:
     tokens, prompt = torch.zeros(1, 513, 16), torch.zeros(1, 1, 16)
     mask = torch.ones(1, 513, dtype=torch.bool)

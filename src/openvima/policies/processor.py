@@ -8,7 +8,7 @@ Shape suffixes: see `openvima.policies.batch`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -183,9 +183,10 @@ class Processor:
             _table_points(objects, objects.boxes[..., :2]),
             image_index,
             in_scene[first_of[b] + image],
-            *([starts] if (starts := np.array([prompt.start for prompt in prompts])).any() else []),
         )
-        return PromptBatch(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+        batch = PromptBatch(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+        starts = torch.tensor([prompt.start for prompt in prompts])
+        return replace(batch, start_B=starts) if starts.any() else batch
 
     def collate(self, episodes: "Sequence[PreprocessedEpisode]") -> Batch:
         """Pad demonstrations to equal lengths.

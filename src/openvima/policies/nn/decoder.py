@@ -261,8 +261,11 @@ class Decoder(CausalDecoder):
     ) -> KVCache:
         """Compute the keys and values of the prompt for every cross block."""
         check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
-        start_B1 = 0 if start_B is None else start_B[:, None]
-        prompt_BPD = prompt_BPD + self.prompt_positions(position_ids(mask_BP) + start_B1)
+        positions_BP = position_ids(mask_BP)
+        if start_B is not None:
+            most = MAX_PROMPT_POSITIONS - prompt_BPD.shape[1]
+            positions_BP = positions_BP + start_B.clamp(max=most)[:, None]
+        prompt_BPD = prompt_BPD + self.prompt_positions(positions_BP)
         blocks = (cast(CrossBlock, block) for block in self.cross_blocks)
         prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
