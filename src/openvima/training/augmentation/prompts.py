@@ -116,7 +116,7 @@ def offset_prompt(
     """Let the prompt's positions begin at a random one up to `most`.
 
     Networks tell which of two compared images has more by their absolute positions, which another prompt
-    shifts; see results/2026-11-29_prompt_offset.md.
+    shifts; see results/2026-11-29_prompt_positions.md.
     """
     start = int(rng.integers(most + 1)) if most else 0
     return replace(episode, prompt=replace(episode.prompt, start=start))
