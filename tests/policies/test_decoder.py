@@ -19,7 +19,6 @@ from openvima.policies.nn.layers import (
     Unpadder,
     round_rows,
 )
-from openvima.policies.nn.prompt_encoder import relative_bucket
 from openvima.policies.pointer.inputs import yaw_to_bin
 from openvima.policies.processor import Processor
 from small_networks import check_mixed_precision, collate_examples, examples_of
@@ -58,20 +57,6 @@ def test_invalid_positions_are_zero_and_change_nothing(decoder) -> None:
     assert not actual[~exist].any()
     later, mask = torch.randn(3, 2, 16), torch.ones(3, 2, dtype=torch.bool)
     torch.testing.assert_close(decoder(packed, later, mask)[0], decoder(whole, later, mask)[0])
-
-
-def test_positions_of_a_prompt_may_begin_at_another_than_the_first(decoder) -> None:
-    tokens, prompt, mask = torch.randn(2, 4, 16), torch.randn(2, 3, 16), torch.ones(2, 4, dtype=torch.bool)
-    starts = torch.tensor([0, 5])
-    shifted, _ = decoder(decoder.init_cache(prompt, mask[:, :3], starts), tokens, mask)
-    plain, _ = decoder(decoder.init_cache(prompt, mask[:, :3]), tokens, mask)
-    torch.testing.assert_close(shifted[0], plain[0])
-    assert not torch.allclose(shifted[1], plain[1], atol=1e-4)
-    table = decoder.prompt_positions if isinstance(decoder, Decoder) else decoder.positions
-    with torch.no_grad():
-        table.weight.copy_(table.weight.roll(-5, dims=0))
-    rolled, _ = decoder(decoder.init_cache(prompt, mask[:, :3]), tokens, mask)
-    torch.testing.assert_close(shifted[1], rolled[1])
 
 
 def test_too_long_a_history_is_refused(decoder) -> None:
@@ -140,20 +125,6 @@ def test_fresh_attention_finds_the_object_that_the_prompt_shows(name):
         project = decoder.self_blocks[0].query_key_value
         query_ND, key_ND = project(scene_ND)[:, :64], project(torch.cat([in_prompt_ND, scene_ND]))[:, 128:192]
     assert (query_ND @ key_ND.T).argmax(dim=1).tolist() == [0, 1, 2, 3, 4, 5]
-
-
-def test_fresh_attention_of_the_prompt_sees_neighbours_and_past_actions_are_heard():
-    network = build_network(preset("vima-nano"), seed=0)
-    numbers = torch.arange(60)
-    offset_LL = numbers[None] - numbers[:, None]
-    attention_LLH = network.prompt.text.position_bias(relative_bucket(offset_LL)).softmax(dim=1)
-    for head, is_near_LL in enumerate(
-        ((offset_LL >= -3) & (offset_LL < 0), (offset_LL > 0) & (offset_LL <= 3))
-    ):
-        assert (attention_LLH[..., head] * is_near_LL).sum(dim=1)[3:57].min() > 0.8
-    generator = torch.Generator().manual_seed(0)
-    tokens_ND = network.head.actions(torch.rand(200, 12, generator=generator))
-    assert 0.3 < tokens_ND.std(dim=0).square().mean().sqrt() < 0.9  # image tokens: 0.4
 
 
 @pytest.mark.parametrize("bias", [True, False])

@@ -24,7 +24,6 @@ from openvima.training.augmentation.demonstrations import (
     with_distractors,
 )
 from openvima.training.augmentation.prompts import (
-    offset_prompt,
     paraphrase,
     rename_objects,
     shuffle_prompt_objects,
@@ -171,18 +170,6 @@ def test_turned_comparisons_ask_for_the_same_without_less():
         assert _images(after) == _images(episode)
         turned += 1
     assert turned and plain
-
-
-def test_a_prompt_begins_at_any_of_the_first_positions(episodes):
-    processor, starts = Processor("objects"), set()
-    ((example,), _) = stack_images([episodes["rotate"]])
-    assert processor.collate([example.episode]).prompts.start_B is None
-    for seed in range(60):
-        episode = offset_prompt(example.episode, np.random.default_rng(seed), most=5)
-        batch = processor.collate([episode, example.episode]).prompts
-        starts.add(0 if batch.start_B is None else batch.start_B.tolist()[0])
-        assert batch.start_B is None or batch.start_B[1] == 0
-    assert starts == set(range(6))
 
 
 def test_an_instruction_of_two_sentences_stays_in_one_piece(episodes):

@@ -148,14 +148,12 @@ class PreprocessedPrompt:
         objects_per_image: Number of objects of each image, shape (I,), int16.
         is_scene: Whether the image shows the table (`PromptImage.kind` "scene") or one object on white
             ("object"), shape (I,), bool.
-        start: Position of the first token in the decoder, above 0 in training alone.
     """
 
     text: str
     objects: ObjectTable
     objects_per_image: np.ndarray
     is_scene: np.ndarray
-    start: int = 0
 
     @property
     def image_names(self) -> tuple[str, ...]:

@@ -262,7 +262,7 @@ class TokenPolicy(PolicyNetwork):
         else:
             tokens_IE = self._frame_tokens(features_VSF)
         points_BL2 = self._points_in_scenes(prompts) if self.config.points else None
-        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL, points_BL2, prompts.start_B)
+        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL, points_BL2)
 
     def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
         """Make the image tokens of each step, and the query behind them if there is one."""
@@ -327,7 +327,6 @@ class TokenPolicy(PolicyNetwork):
         # Image tokens are of the order of 1: so far above zero, the ReLUs between the layers are linear.
         layers[0].bias.fill_(_LINEAR_RANGE)
         layers[-1].bias.fill_(-_LINEAR_RANGE)
-        self.prompt.text.align()
         self.decoder.align()
         self.head.actions.align()
         if isinstance(self.decoder, PrefixDecoder):  # it tells images of the prompt from observations

@@ -36,7 +36,6 @@ class PromptBatch(TensorRecord):
         positions_S2: Table points under the boxes, metres.
         image_index_S: Which image of its prompt contains the object, counted from 0 in reading order.
         in_scene_S: Whether that image is a scene, where the object has a position on the table.
-        start_B: Position of the first token in the decoder; None for 0.
     """
 
     word_ids_BL: torch.Tensor
@@ -49,7 +48,6 @@ class PromptBatch(TensorRecord):
     positions_S2: torch.Tensor
     image_index_S: torch.Tensor
     in_scene_S: torch.Tensor
-    start_B: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

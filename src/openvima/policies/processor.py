@@ -8,7 +8,7 @@ Shape suffixes: see `openvima.policies.batch`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -184,9 +184,7 @@ class Processor:
             image_index,
             in_scene[first_of[b] + image],
         )
-        batch = PromptBatch(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
-        starts = torch.tensor([prompt.start for prompt in prompts])
-        return replace(batch, start_B=starts) if starts.any() else batch
+        return PromptBatch(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
     def collate(self, episodes: "Sequence[PreprocessedEpisode]") -> Batch:
         """Pad demonstrations to equal lengths.

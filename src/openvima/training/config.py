@@ -277,8 +277,6 @@ class AugmentationConfig:
             `tasks/paraphrases.yaml`.
         unknown_word_prob: Probability for each word of a task's prompt of the unknown token in its place, so
             that words which training lacks can be read past.
-        prompt_offset: Positions of the prompt's tokens in the decoder begin at a random one up to this, so
-            that no rule is tied to positions.
         shuffle_prompt_objects_prob: Probability of listing the objects of each prompt image in an order of
             its own; else an object has the same position in all frames.
     """
@@ -296,7 +294,6 @@ class AugmentationConfig:
     synonym_prob: Probability = 0.0
     paraphrase_prob: Probability = 0.0
     unknown_word_prob: Probability = 0.0
-    prompt_offset: Annotated[int, Range(0, 100)] = 0
     shuffle_prompt_objects_prob: Probability = 0.0
 
     @property

@@ -99,7 +99,6 @@ _PAPERS: Mapping[str, Any] = {
     "augmentation.turn_comparisons_prob": 0.8,
     "augmentation.shuffle_sentences_prob": 0.3,
     "augmentation.distractor_prob": 0.3,
-    "augmentation.prompt_offset": 24,
 }
 _PAPERS_MIDAS: Mapping[str, Any] = {
     **_PAPERS,

@@ -132,15 +132,12 @@ class CausalDecoder(nn.Module):
         self.self_blocks = nn.ModuleList(SelfBlock(width, num_heads, dropout) for _ in range(num_layers))
         self.dropout = nn.Dropout(dropout)
 
-    def init_cache(
-        self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor, start_B: torch.Tensor | None = None
-    ) -> KVCache:
+    def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Process the prompt; once per episode.
 
         Args:
             prompt_BPD: Encoded prompt.
             mask_BP: Which of its positions are valid, bool.
-            start_B: Number of the first position, 0 by default.
 
         Raises:
             PolicyError: The prompt is longer than the position table.
@@ -256,16 +253,10 @@ class Decoder(CausalDecoder):
         self.cross_blocks = nn.ModuleList(CrossBlock(config) for _ in range(config.num_layers))
         normal_weights(self, config.initial_std)
 
-    def init_cache(
-        self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor, start_B: torch.Tensor | None = None
-    ) -> KVCache:
+    def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Compute the keys and values of the prompt for every cross block."""
         check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
-        positions_BP = position_ids(mask_BP)
-        if start_B is not None:
-            most = MAX_PROMPT_POSITIONS - prompt_BPD.shape[1]
-            positions_BP = positions_BP + start_B.clamp(max=most)[:, None]
-        prompt_BPD = prompt_BPD + self.prompt_positions(positions_BP)
+        prompt_BPD = prompt_BPD + self.prompt_positions(position_ids(mask_BP))
         blocks = (cast(CrossBlock, block) for block in self.cross_blocks)
         prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
@@ -293,19 +284,14 @@ class PrefixDecoder(CausalDecoder):
         self.separator = nn.Parameter(torch.zeros(config.width))
         normal_weights(self, config.initial_std)
 
-    def init_cache(
-        self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor, start_B: torch.Tensor | None = None
-    ) -> KVCache:
+    def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Decode prompt and separator; the prompt is causal as well."""
         check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
         separator_B1D = self.separator.expand(len(prompt_BPD), 1, -1)
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
         # Nothing attends to what is masked, most of it padding, so none of it is computed.
-        cache = self._empty_cache(tokens_BPD, mask_BP)
-        if start_B is not None:
-            cache = replace(cache, length_B=start_B)
-        return self(cache, tokens_BPD, mask_BP, mask_BP, only_cache=True)[1]
+        return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP, mask_BP, only_cache=True)[1]
 
     def align(self) -> None:
         """Do so in half of the heads of the first block, whose attention reaches the history as well.

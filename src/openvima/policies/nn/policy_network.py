@@ -91,13 +91,11 @@ class EncodedPrompt(TensorRecord):
         mask_BL: Which positions exist.
         points_BL2: Table points of the objects in scenes that tokens stand for, infinite for others; None
             where positions are not read from objects.
-        start_B: Position of the first token in the decoder; None for 0.
     """
 
     tokens_BLD: torch.Tensor
     mask_BL: torch.Tensor
     points_BL2: torch.Tensor | None = None
-    start_B: torch.Tensor | None = None
 
 
 class PolicyNetwork(nn.Module):
@@ -154,7 +152,7 @@ class PolicyNetwork(nn.Module):
 
     def init_cache(self, prompt: Any) -> Any:
         """Return the state of decoding after the prompt and before the first step."""
-        return self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL, prompt.start_B)
+        return self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)
 
     def loss(
         self, prompt: Any, history: HistoryBatch, features_KF: torch.Tensor, targets: ActionTargets

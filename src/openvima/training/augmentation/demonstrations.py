@@ -23,7 +23,6 @@ from openvima.tasks.registry import task_spec
 from openvima.training.augmentation.prompts import (
     describe_objects,
     mask_words,
-    offset_prompt,
     paraphrase,
     rename_objects,
     shuffle_prompt_objects,
@@ -206,15 +205,10 @@ NO_AUGMENTATION = DemonstrationAugmentation()
 def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugmentation:
     """Return the transforms that the settings ask for."""
     shuffle = Randomly(config.shuffle_prompt_objects_prob, shuffle_prompt_objects)
-    offset = partial(offset_prompt, most=config.prompt_offset)
     return DemonstrationAugmentation(
         config.inverse_dynamics_prob,
         config.centre_picks,
-        of_inverse_dynamics=(
-            partial(drop_unused_objects, prob=config.drop_unused_objects_prob),
-            shuffle,
-            offset,
-        ),
+        of_inverse_dynamics=(partial(drop_unused_objects, prob=config.drop_unused_objects_prob), shuffle),
         of_tasks=(
             Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
             Randomly(config.rename_objects_prob, rename_objects),
@@ -229,7 +223,6 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
             ),
             partial(mask_words, prob=config.unknown_word_prob),
             shuffle,
-            offset,
         ),
     )
 

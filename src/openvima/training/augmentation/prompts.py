@@ -108,20 +108,6 @@ def _noun_phrase(before: str, noun: str) -> str:
 
 
 _SENTENCE_END = re.compile(r"(?<=\.) ")
-
-
-def offset_prompt(
-    episode: PreprocessedEpisode, rng: np.random.Generator, *, most: int
-) -> PreprocessedEpisode:
-    """Let the prompt's positions begin at a random one up to `most`.
-
-    Networks tell which of two compared images has more by their absolute positions, which another prompt
-    shifts; see results/2026-11-29_prompt_positions.md.
-    """
-    start = int(rng.integers(most + 1)) if most else 0
-    return replace(episode, prompt=replace(episode.prompt, start=start))
-
-
 _IS_COMPARISON = re.compile(r"\} is \w+ than \{")
 
 
