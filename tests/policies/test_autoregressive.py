@@ -158,7 +158,9 @@ def test_positions_from_objects_are_read_before_the_next_component_is_decoded(de
     targets = replace(batch.targets, actions_BTC=actions, steps_BT=steps)
     metrics = network.loss(prompt, history, features, targets)[1]
     assert metrics["pick_accuracy"] == metrics["place_accuracy"] == 1
-    points = network.observe(history, features).points_BTQ2
+    observations, cache = network._observe(prompt, network.init_cache(prompt), history, features)
+    points = observations.points_BTQ2
+    torch.testing.assert_close(network.head.loss(network.decoder, cache, observations, targets)[2], actions)
     assert ((actions[:, :, None, :2] - points).norm(dim=-1).amin(-1) < 1e-6).all()
 
 

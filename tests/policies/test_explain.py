@@ -71,10 +71,10 @@ def test_every_distribution_sums_to_one_and_its_peak_is_the_action_that_asking_k
             assert np.array_equal(explanation.action[key], values)
         if explanation.bins:
             check_bins(explanation)
-        elif explanation.objects:
+            if explanation.objects:
+                check_positions(explanation)
+        else:
             check_pointers(explanation)
-        if explanation.bins and explanation.objects:
-            check_positions(explanation)
 
 
 def check_bins(explanation: Explanation) -> None:
@@ -148,29 +148,29 @@ def test_sampled_choices_are_explained_as_they_were_drawn(demos) -> None:
         assert max(probabilities) - min(probabilities) < 0.2  # as hot as that nothing is preferred
 
 
-def test_bundled_vima_picks_what_the_prompt_shows_and_places_it_at_an_object_in_view() -> None:
-    policy = load_policy("openvima-vima")
-    env = TabletopEnv("visual_manipulation", level="L1")
+def explain_bundled(name: str) -> tuple[Explanation, int]:
+    """What a bundled policy considers in an episode, and the id of the object that it should pick."""
+    policy, env = load_policy(name), TabletopEnv("visual_manipulation", level="L1")
     observation, _ = env.reset(seed=0)
     policy.reset([env.prompt])
     policy.act([observation])
     (explanation,) = policy.explain()
+    return explanation, env.episode.problem.goals[0].object_id
+
+
+def test_bundled_vima_picks_what_the_prompt_shows_and_places_it_at_an_object_in_view() -> None:
+    explanation, goal_id = explain_bundled("openvima-vima")
     picked = max(explanation.objects, key=lambda each: each.probability)
-    assert picked.object_id == env.episode.problem.goals[0].object_id
+    assert picked.object_id == goal_id
     assert explanation.distinct_places()[0].kind in ("in view", "first step")
 
 
 def test_the_bundled_policy_attends_to_what_it_picks_and_to_where_it_goes() -> None:
-    policy = load_policy("openvima-small")
-    env = TabletopEnv("visual_manipulation", level="L1")
-    observation, _ = env.reset(seed=0)
-    policy.reset([env.prompt])
-    policy.act([observation])
-    (explanation,) = policy.explain()
+    explanation, goal_id = explain_bundled("openvima-small")
     peaks = {kind: explanation.prompt[weights.argmax()] for kind, weights in explanation.attention.items()}
     assert peaks == {"pick": "{dragged_obj_1}", "place": "{base_obj}"}
     picked = max(explanation.objects, key=lambda each: each.probability)
-    assert picked.object_id == env.episode.problem.goals[0].object_id
+    assert picked.object_id == goal_id
 
 
 def test_what_cannot_be_explained_is_refused(demos) -> None:

@@ -267,7 +267,7 @@ class TokenPolicy(PolicyNetwork):
     def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
         """Make the image tokens of each step, and the query behind them if there is one."""
         features_BTVNF = features_KF[history.crop_index_BTVN]
-        steps_BT, mask_BTQ, points_2BTQ2 = history.steps_BT, None, None
+        steps_BT, mask_BTQ, points = history.steps_BT, None, ()
         if isinstance(self.images, ObjectEncoder):
             tokens_BTQE = self.images(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
             fused = self.images.config.fuse_views
@@ -275,7 +275,7 @@ class TokenPolicy(PolicyNetwork):
             if self.resampler is not None:
                 tokens_BTQE, mask_BTQ = self.resampler(tokens_BTQE, mask_BTQ), None
             elif self.config.points:
-                points_2BTQ2 = _points_from_above(history, tokens_BTQE.shape[2])
+                points = _points_from_above(history, tokens_BTQE.shape[2])
         else:
             tokens_BTQE = self._frame_tokens(features_BTVNF)
         tokens_BTQD = self.add_end_effector(tokens_BTQE, history.end_effector_BT)
@@ -291,11 +291,8 @@ class TokenPolicy(PolicyNetwork):
             query_BT1D = self.query.expand(*tokens_BTQD.shape[:2], 1, -1)
             tokens_BTQD = torch.cat([tokens_BTQD, query_BT1D], dim=2)
             mask_BTQ = torch.cat([mask_BTQ, steps_BT[..., None]], dim=2)
-            points_2BTQ2 = None if points_2BTQ2 is None else F.pad(points_2BTQ2, (0, 0, 0, 1), value=math.inf)
-        observations = ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, steps_BT)
-        if points_2BTQ2 is None:
-            return observations
-        return replace(observations, points_BTQ2=points_2BTQ2[0], grasps_BTQ2=points_2BTQ2[1])
+            points = [F.pad(points_BTQ2, (0, 0, 0, 1), value=math.inf) for points_BTQ2 in points]
+        return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, steps_BT, *points)
 
     def _points_in_scenes(self, prompts: PromptBatch) -> torch.Tensor:
         """Return the table points of the objects in scenes that tokens stand for, (B, L, 2), from above."""
@@ -384,14 +381,16 @@ def _table_axes() -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(origin), torch.from_numpy(np.stack([right - origin, down - origin]))
 
 
-def _points_from_above(history: HistoryBatch, num_tokens: int) -> torch.Tensor:
-    """Return the table points under the boxes and the most interior pixels of the top view, (2, B, T, Q, 2).
+def _points_from_above(history: HistoryBatch, num_tokens: int) -> list[torch.Tensor]:
+    """Return the table points under the boxes, and under the most interior pixels, of the top view.
 
-    They are those of the last N of Q tokens.
+    Both are (B, T, Q, 2), of the last N of Q tokens.
     """
     boxes_BTN4, mask_BTN = history.boxes_BTVN4[:, :, TOP], history.masks_BTVN[:, :, TOP]
     origin, axes = (each.to(boxes_BTN4.device) for each in _table_axes())
     points_BTN2 = origin + boxes_BTN4[..., :2].to(axes) @ axes
-    points_2BTN2 = torch.stack([points_BTN2, history.grasps_BTN2.to(axes)])
-    points_2BTN2 = points_2BTN2.masked_fill(~mask_BTN[..., None], math.inf)
-    return F.pad(points_2BTN2, (0, 0, num_tokens - mask_BTN.shape[-1], 0), value=math.inf)
+    pad = (0, 0, num_tokens - mask_BTN.shape[-1], 0)
+    return [
+        F.pad(each_BTN2.masked_fill(~mask_BTN[..., None], math.inf), pad, value=math.inf)
+        for each_BTN2 in (points_BTN2, history.grasps_BTN2.to(axes))
+    ]

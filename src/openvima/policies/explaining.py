@@ -13,7 +13,7 @@ from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.nn.policy_network import StepTrace
 from openvima.policies.pointer.inputs import bin_to_yaw
 from openvima.policies.pointer.words import coreference
-from openvima.policies.processor import Processor
+from openvima.policies.processor import Processor, order_in_view
 from openvima.render.camera import VIEWS
 from openvima.scene import RenderedPrompt
 from openvima.scene.explanation import PLACE_KINDS, Explanation, ObjectProbability, PlaceProbability
@@ -68,8 +68,9 @@ def explain_row(
     picks, places, *rotation = (probabilities(logits) for logits in trace.logits)
     found = extract_observation(observation, processor.input_kind, processor.extractor)
     grasps = found.positions() if bins else found.grasp_points()
-    if processor.layout == "views":  # the tokens have another order
-        picks = picks[np.argsort(np.lexsort((found.ids, ~found.masks[TOP])))]
+    if processor.layout == "views":
+        order = order_in_view(found.ids, found.masks[TOP], np.zeros_like(found.ids))
+        picks = picks[np.argsort(order)]
     return Explanation(
         action,
         words,

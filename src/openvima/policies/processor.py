@@ -420,9 +420,13 @@ def _table_points(objects: ObjectTable, pixels: np.ndarray) -> np.ndarray:
 
 def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
     """Sort the objects of each step separately in each view: visible ones first, then by id."""
-    masks = objects.masks
-    order = np.stack([np.lexsort((objects.ids, ~masks[:, v], step)) for v in (FRONT, TOP)], axis=1)
-    return _select_views(objects, order)
+    views = (order_in_view(objects.ids, objects.masks[:, v], step) for v in (FRONT, TOP))
+    return _select_views(objects, np.stack([*views], axis=1))
+
+
+def order_in_view(ids: np.ndarray, is_visible: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return the order of objects in one view of layout "views": by step, visible ones first, then by id."""
+    return np.lexsort((ids, ~is_visible, step))
 
 
 def _select_views(objects: ObjectTable, rows: np.ndarray) -> ObjectTable:

@@ -47,9 +47,9 @@ class ObservationTokens:
         steps_BT: Which steps exist.
         points_BTQ2: Table points of the objects in the top view that tokens stand for, metres; infinite for
             other tokens. None where positions are not read from objects.
+        grasps_BTQ2: As `points_BTQ2`, under the most interior pixels in place of the boxes' centres.
         scene_tokens_BLD: Tokens of other scenes that places may be in: the prompt's, and the first step.
         scene_points_BL2: Table points of the objects in these that they stand for; infinite for others.
-        grasps_BTQ2: As `points_BTQ2`, under the most interior pixels in place of the boxes' centres.
     """
 
     tokens_BTQD: torch.Tensor
@@ -57,9 +57,9 @@ class ObservationTokens:
     query_BT: torch.Tensor
     steps_BT: torch.Tensor
     points_BTQ2: torch.Tensor | None = None
+    grasps_BTQ2: torch.Tensor | None = None
     scene_tokens_BLD: torch.Tensor | None = None
     scene_points_BL2: torch.Tensor | None = None
-    grasps_BTQ2: torch.Tensor | None = None
 
     def candidates(self, half: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return tokens (B, T, Q', D) and points (B, T, Q', 2) to pick, half 0, or to place at, half 1."""

@@ -35,8 +35,8 @@ class StepTrace:
     """Logits and attention of one step.
 
     Args:
-        logits: Of the object in view, the place candidate and the rotation, (B, classes) each; without a
-            rotation or none where bins give it.
+        logits: Of the object in view, the place candidate and the rotation, (B, classes) each; without the
+            rotation where bins give it, and none where they give the whole action.
         attention: Kind of attention to weights of the prompt's positions, (B, L), which sum to 1.
         positions_BC2: Positions of the place candidates, metres; None without any.
         masks_BC: Which of them exist.
