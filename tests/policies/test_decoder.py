@@ -19,6 +19,7 @@ from openvima.policies.nn.layers import (
     Unpadder,
     round_rows,
 )
+from openvima.policies.nn.prompt_encoder import relative_bucket
 from openvima.policies.pointer.inputs import yaw_to_bin
 from openvima.policies.processor import Processor
 from small_networks import check_mixed_precision, collate_examples, examples_of
@@ -125,6 +126,20 @@ def test_fresh_attention_finds_the_object_that_the_prompt_shows(name):
         project = decoder.self_blocks[0].query_key_value
         query_ND, key_ND = project(scene_ND)[:, :64], project(torch.cat([in_prompt_ND, scene_ND]))[:, 128:192]
     assert (query_ND @ key_ND.T).argmax(dim=1).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_fresh_attention_of_the_prompt_sees_neighbours_and_past_actions_are_heard():
+    network = build_network(preset("vima-nano"), seed=0)
+    numbers = torch.arange(60)
+    offset_LL = numbers[None] - numbers[:, None]
+    attention_LLH = network.prompt.text.position_bias(relative_bucket(offset_LL)).softmax(dim=1)
+    for head, is_near_LL in enumerate(
+        ((offset_LL >= -3) & (offset_LL < 0), (offset_LL > 0) & (offset_LL <= 3))
+    ):
+        assert (attention_LLH[..., head] * is_near_LL).sum(dim=1)[3:57].min() > 0.8
+    generator = torch.Generator().manual_seed(0)
+    tokens_ND = network.head.actions(torch.rand(200, 12, generator=generator))
+    assert 0.3 < tokens_ND.std(dim=0).square().mean().sqrt() < 0.9  # image tokens: 0.4
 
 
 @pytest.mark.parametrize("bias", [True, False])

@@ -15,7 +15,7 @@ from openvima.errors import ConfigError
 from openvima.perception.objects import observe
 from openvima.policies.processor import Processor
 from openvima.scene import Action
-from openvima.tasks.novel_words import NOUNS
+from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 from openvima.training import TrainingConfig, train
 from openvima.training.augmentation.demonstrations import (
     MAX_DISTRACTORS,
@@ -30,6 +30,7 @@ from openvima.training.augmentation.prompts import (
     shuffle_sentences,
     turn_comparisons,
     with_motion_prompt,
+    with_unused_definitions,
 )
 from openvima.training.batches import BatchMaker
 from openvima.training.building import training_texts
@@ -269,6 +270,44 @@ def _action(numbers: np.ndarray) -> Action:
     pose0, pose1 = np.split(numbers.astype(np.float64), 2)
     arrays = {"pose0_position": pose0[:2], "pose0_rotation": pose0[2:]}
     return Action.from_arrays(arrays | {"pose1_position": pose1[:2], "pose1_rotation": pose1[2:]})
+
+
+@pytest.mark.parametrize("task", ["novel_noun", "novel_adj", "visual_manipulation", "follow_order"])
+@pytest.mark.parametrize("source", ["novel_noun", "novel_adj"])
+def test_unused_definitions_come_before_the_instruction_and_define_other_words(task, source, episodes):
+    before, other = number_images([episodes[task], episodes[source]])
+    words, images, counts, positions = {*NOUNS, *ADJECTIVES}, _images(before), set(), set()
+    for seed in range(30):
+        after = with_unused_definitions(before, other, np.random.default_rng(seed))
+        sentences = after.prompt.text.split(". ")
+        own = [sentence for sentence in sentences if "{unused_" not in sentence]
+        assert ". ".join(own) == before.prompt.text
+        assert all(_images(after)[name] == rows for name, rows in images.items())
+        inserted = [sentence for sentence in sentences if sentence not in own]
+        there = _images(other)
+        for name, rows in _images(after).items():
+            assert name in images or rows == there[name.removeprefix("unused_")]
+        (instruction,) = (k for k, sentence in enumerate(sentences) if sentence.startswith(("Put", "Stack")))
+        assert all(sentences.index(sentence) < instruction for sentence in inserted)
+        defined = [(words & {*re.findall(r"\w+", sentence)}).pop() for sentence in inserted]
+        assert not set(defined) & {*re.findall(r"\w+", before.prompt.text)}
+        assert len(set(defined)) == (1 if source == "novel_adj" else len(defined))
+        counts.add(len(inserted))
+        positions.update(sentences.index(sentence) for sentence in inserted)
+    assert counts == ({1, 2, 3} if source == "novel_adj" else {1, 2})
+    assert len(positions) > 1
+
+
+def test_unused_definitions_are_inserted_in_training_only_with_their_probability(episodes):
+    source = source_of_episodes([episodes["novel_adj"], episodes["visual_manipulation"]])
+    collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
+
+    def lengths(prob: float) -> list[int]:
+        make = BatchMaker(source, collate, 0, 99, definers=np.array([0]), unused_definitions_prob=prob)
+        return torch.cat([batch.prompts.mask_BL.sum(dim=1) for batch, _ in make(np.arange(2), 4)]).tolist()
+
+    plain = lengths(0.0)
+    assert all(more > few for more, few in zip(lengths(1.0), plain, strict=True))
 
 
 @pytest.fixture(scope="module")

@@ -324,6 +324,7 @@ class TokenPolicy(PolicyNetwork):
         # Image tokens are of the order of 1: so far above zero, the ReLUs between the layers are linear.
         layers[0].bias.fill_(_LINEAR_RANGE)
         layers[-1].bias.fill_(-_LINEAR_RANGE)
+        self.prompt.text.align()
         self.decoder.align()
         self.head.actions.align()
         if isinstance(self.decoder, PrefixDecoder):  # it tells images of the prompt from observations

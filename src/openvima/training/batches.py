@@ -1,7 +1,7 @@
 """Batches of a training: which demonstrations each takes, from which cache, and in which parts."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -26,6 +26,7 @@ class Example:
             there.
         row: Its number among all demonstrations.
         other: Another one, from which objects may be inserted.
+        definer: Another one, from whose prompt definitions may be inserted.
         keeps_prompt: Whether no draw exchanges its prompt for one of inverse dynamics.
     """
 
@@ -33,6 +34,7 @@ class Example:
     base: int = 0
     row: int = 0
     other: "Example | None" = None
+    definer: "Example | None" = None
     keeps_prompt: bool = False
 
 
@@ -94,6 +96,9 @@ class BatchMaker:
             where it has the demonstration; see `training.source.alternative_source`.
         distractor_prob: Probability of inserting distractors from another demonstration, for those that allow
             it; see `with_distractors`.
+        definers: Demonstrations, by their index in the cache, whose prompts define words, shape (D,).
+        unused_definitions_prob: Probability of inserting such sentences of one of them, see
+            `with_unused_definitions`.
         first_batches: Number of batches, the first ones, whose demonstrations keep their prompts.
     """
 
@@ -103,6 +108,8 @@ class BatchMaker:
     largest: int
     alternatives: tuple[tuple[ExampleSource, float], ...] = ()
     distractor_prob: float = 0.0
+    definers: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    unused_definitions_prob: float = 0.0
     first_batches: int = 0
 
     def __call__(self, indices: np.ndarray, number: int) -> list[tuple[Any, int]]:
@@ -118,7 +125,7 @@ class BatchMaker:
         return parts
 
     def _draw(self, row: int, rng: np.random.Generator) -> Example:
-        """Draw which cache an example is from, and the source of its distractors."""
+        """Draw which cache an example is from, and the sources of its distractors and unused definitions."""
         source = self.source
         if self.alternatives:
             drawn, ends = rng.random(), np.cumsum([prob for _, prob in self.alternatives])
@@ -126,9 +133,11 @@ class BatchMaker:
                 other, _ = self.alternatives[int(np.searchsorted(ends, drawn, side="right"))]
                 source = other if other.has(row) else source
         example, prob = source.example(row), self.distractor_prob
-        if not prob or not allows_distractors(example.episode.task) or rng.random() >= prob:
-            return example
-        return replace(example, other=self.source[int(rng.integers(len(self.source)))])
+        if prob and allows_distractors(example.episode.task) and rng.random() < prob:
+            example = replace(example, other=self.source[int(rng.integers(len(self.source)))])
+        if len(self.definers) and rng.random() < self.unused_definitions_prob:
+            example = replace(example, definer=self.source.example(int(rng.choice(self.definers))))
+        return example
 
     def _divide(self, indices: np.ndarray) -> list[np.ndarray]:
         return [

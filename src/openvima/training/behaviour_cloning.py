@@ -19,7 +19,7 @@ from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Metrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.stage import crop_parameters
-from openvima.training.source import make_order, show_first
+from openvima.training.source import find_definers, make_order, show_first
 
 CHUNK = 64  # demonstrations per batch of precomputed features
 MAX_FEATURES = 4_000_000  # images, about 1 kB each; above, features are computed in every step
@@ -123,6 +123,8 @@ class BehaviourCloning:
             largest=-(-ours // parts),
             alternatives=self._alternatives,
             distractor_prob=config.augmentation.distractor_prob,
+            definers=find_definers(self._training),
+            unused_definitions_prob=config.augmentation.unused_definitions_prob,
             first_batches=self._order.first_batches,
         )
         workers = min(config.loader.num_workers, num_cpus())

@@ -267,6 +267,8 @@ class AugmentationConfig:
         turn_comparisons_prob: Probability of asking without "less", with all comparisons turned round.
         shuffle_sentences_prob: Probability of shuffling the sentences that define novel words, and of keeping
             only some of several comparisons.
+        unused_definitions_prob: Probability of inserting up to three sentences of another demonstration's
+            prompt that define words which this prompt does not use.
         distractor_prob: Probability of inserting up to three distractors from another demonstration, in tasks
             whose prompts allow it.
         text_description_prob: Probability for each object image of a task's prompt of the text "red swirl
@@ -288,6 +290,7 @@ class AugmentationConfig:
     rename_objects_prob: Probability = 0.0
     turn_comparisons_prob: Probability = 0.0
     shuffle_sentences_prob: Probability = 0.0
+    unused_definitions_prob: Probability = 0.0
     distractor_prob: Probability = 0.0
     text_description_prob: Probability = 0.0
     text_prompt_prob: Probability = 0.0

@@ -197,7 +197,10 @@ class PolicyCollate:
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
     ) -> Batch:
         """Make a batch; see `Learner.collator`."""
-        shown = [*examples, *(example.other for example in examples if example.other is not None)]
+        added = [
+            each for example in examples for each in (example.other, example.definer) if each is not None
+        ]
+        shown = [*examples, *added]
         first_images = None if self._with_images else [example.base for example in shown]
         numbered = number_images([example.episode for example in shown], first_images)
         others = iter(numbered[len(examples) :])
@@ -206,6 +209,7 @@ class PolicyCollate:
                 episode,
                 rng,
                 None if example.other is None else next(others),
+                None if example.definer is None else next(others),
                 keeps_prompt=example.keeps_prompt,
             )
             for example, episode, rng in zip(examples, numbered, rngs or [None] * len(examples), strict=False)

@@ -98,6 +98,7 @@ _PAPERS: Mapping[str, Any] = {
     "augmentation.rename_objects_prob": 0.3,
     "augmentation.turn_comparisons_prob": 0.8,
     "augmentation.shuffle_sentences_prob": 0.3,
+    "augmentation.unused_definitions_prob": 0.4,
     "augmentation.distractor_prob": 0.3,
 }
 _PAPERS_MIDAS: Mapping[str, Any] = {

@@ -13,7 +13,7 @@ from openvima.data.rerender import UNKNOWN_SCENES
 from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.processor import Processor
-from openvima.tasks.registry import list_tasks
+from openvima.tasks.registry import list_tasks, task_spec
 from openvima.training.augmentation.prompts import text_of
 from openvima.training.batches import BatchOrder, ExampleSource
 from openvima.training.config import LoaderConfig
@@ -126,6 +126,12 @@ def show_first(order: BatchOrder, source: ExampleSource, tasks: Sequence[str], s
     places = np.flatnonzero(is_first)
     places = places[np.unique(source.rows[places], return_index=True)[1]]
     return replace(order, first_batches=steps, first_episodes=places)
+
+
+def find_definers(source: ExampleSource) -> np.ndarray:
+    """Return the demonstrations whose prompts define words, by their index in the cache, shape (D,)."""
+    defining = [name for name in list_tasks() if "{novel_" in task_spec(name).template]
+    return np.unique(source.rows[np.isin(_tasks_of(source), defining)])
 
 
 def _tasks_of(source: ExampleSource) -> np.ndarray:

@@ -18,6 +18,7 @@ from openvima.policies.batch import PromptBatch
 from openvima.policies.nn.layers import Linear, Unpadder, mlp
 
 NUM_BUCKETS = 32  # half for keys before the query, half for keys after it
+_NEIGHBOUR_BIAS = 5.0  # of scores: three of 60 positions get 88 % of the attention
 _EXACT = 8  # distances below have a bucket each
 _MAX_DISTANCE = 128
 
@@ -50,6 +51,16 @@ class TextEncoder(nn.Module):
         self.blocks = nn.ModuleList(TextBlock(config) for _ in range(config.num_layers))
         self.norm_after = RmsNorm(config.width)
         nn.init.normal_(self.position_bias.weight, std=config.width**-0.5)
+
+    @torch.no_grad()
+    def align(self) -> None:
+        """Let fresh attention of one head begin at the three positions before, of another at those behind.
+
+        Otherwise attention stays a mean of the whole prompt, and which of two images comes first is learned
+        from the decoder's absolute positions alone; see results/2026-11-29_prompt_positions.md.
+        """
+        for head, first in ((0, 1), (1, NUM_BUCKETS // 2 + 1)):
+            self.position_bias.weight[first : first + 3, head] += _NEIGHBOUR_BIAS
 
     def forward(self, tokens_BLW: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
         """Encode the sequence with full attention to valid positions.

@@ -29,6 +29,7 @@ from openvima.training.augmentation.prompts import (
     shuffle_sentences,
     turn_comparisons,
     with_motion_prompt,
+    with_unused_definitions,
 )
 from openvima.training.config import AugmentationConfig
 
@@ -173,6 +174,7 @@ class DemonstrationAugmentation:
         episode: PreprocessedEpisode,
         rng: np.random.Generator | None,
         other: PreprocessedEpisode | None = None,
+        definer: PreprocessedEpisode | None = None,
         *,
         keeps_prompt: bool = False,
     ) -> PreprocessedEpisode:
@@ -182,6 +184,7 @@ class DemonstrationAugmentation:
             episode: The demonstration.
             rng: Source of all draws.
             other: A demonstration from which distractors are inserted; None inserts none.
+            definer: One from whose prompt unused definitions are inserted; None inserts none.
             keeps_prompt: Whether no draw exchanges the prompt for that of inverse dynamics.
         """
         if self.centres_picks:
@@ -196,6 +199,8 @@ class DemonstrationAugmentation:
         if rng is not None:
             for transform in self.of_inverse_dynamics if is_inverse else self.of_tasks:
                 episode = transform(episode, rng)
+            if definer is not None and not is_inverse:
+                episode = with_unused_definitions(episode, definer, rng)
         return episode
 
 

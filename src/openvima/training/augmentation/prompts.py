@@ -135,6 +135,44 @@ def shuffle_sentences(episode: PreprocessedEpisode, rng: np.random.Generator) ->
     return with_prompt(episode, text, images_by_name(episode.prompt))
 
 
+MAX_DEFINITIONS = 3
+
+
+def with_unused_definitions(
+    episode: PreprocessedEpisode, other: PreprocessedEpisode, rng: np.random.Generator
+) -> PreprocessedEpisode:
+    """Insert up to three sentences of another prompt that define words, before the instruction.
+
+    The words are exchanged for some that this prompt lacks, so that nothing in it refers to them: which
+    sentences count has to be read, and they are at no position of their own. Only table rows are copied.
+
+    Args:
+        episode: The demonstration.
+        other: Its prompt has the sentences; the images of both are numbered in one stack.
+        rng: Draws sentences, words and positions.
+    """
+    there = [s for s in _SENTENCE_END.split(other.prompt.text) if _defines(s)]
+    own = _SENTENCE_END.split(episode.prompt.text)
+    num_leading = next((n for n, sentence in enumerate(own) if not _defines(sentence)), len(own))
+    words: dict[str, str] = {}
+    for kind in (NOUNS, ADJECTIVES):
+        free = [word for word in kind if not re.search(rf"\b{word}\b", episode.prompt.text)]
+        used = [word for word in kind if re.search(rf"\b{word}\b", other.prompt.text)]
+        words |= zip(used, (free[int(n)] for n in rng.permutation(len(free))), strict=False)
+    for index in rng.permutation(len(there))[: int(rng.integers(1, MAX_DEFINITIONS + 1))]:
+        found = _NOVEL_WORD.search(there[int(index)])
+        if found and found[0] in words:
+            sentence = there[int(index)].replace(f" {found[0]} ", f" {words[found[0]]} ")
+            own.insert(int(rng.integers(num_leading + 1)), sentence.replace("{", "{unused_"))
+            num_leading += 1
+    images = {f"unused_{name}": image for name, image in images_by_name(other.prompt).items()}
+    return with_prompt(episode, " ".join(own), images | images_by_name(episode.prompt))
+
+
+def _defines(sentence: str) -> bool:
+    return bool(_IS_COMPARISON.search(sentence)) or sentence.startswith(DEFINITION.partition("{")[0])
+
+
 _COMPARISON = re.compile(r"(\{\w+\}) is (\w+) than (\{\w+\})")
 _LESS = re.compile(r"\bless (?=\w+ \{)")
 
