@@ -47,10 +47,6 @@ class Guess:
         pairs = zip(self._envs, observations, strict=True)
         return [None if seen is None else self._move(*episode) for episode, seen in pairs]
 
-    def near_ties(self) -> Sequence[bool]:
-        """Return nothing: there are no scores."""
-        return ()
-
     def _move(self, env: TabletopEnv, rng: np.random.Generator) -> Action:
         loose = [p for p in env.scene.placements if not p.fixed]
         fixed = [p for p in env.scene.placements if p.fixed]

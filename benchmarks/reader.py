@@ -50,10 +50,6 @@ class Reader:
         episodes = zip(self._tables, self._moves, observations, strict=True)
         return [None if seen is None else _next(table, moves, seen) for table, moves, seen in episodes]
 
-    def near_ties(self) -> Sequence[bool]:
-        """Return nothing: there are no scores."""
-        return ()
-
 
 def _next(table: "Table", moves: Moves, seen: Mapping) -> Action | AnswerError:
     table.look(seen)

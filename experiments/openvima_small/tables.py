@@ -80,7 +80,7 @@ def _level_table(
         about = _PREVIOUS if what.startswith("previous") else ours
         lines.append(Line(what, (*(about if models else ()), *_cells(means, LEVELS))))
     for model in models:
-        rates = (model.written(level, model.levels[level], keep_marks=False) for level in LEVELS)
+        rates = (model.written(level, model.levels[level]).rstrip("*†‡") for level in LEVELS)
         cells = (f"{model.size} and T5", f"{PUBLISHED_DEMONSTRATIONS:,}", *rates)
         lines.append(Line(f"{model.model}, published", cells))
     counts = (row.episodes for name in shown for row in _plain(findings.scores.get(name)))

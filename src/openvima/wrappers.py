@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from openvima.errors import ActionError, ConfigError
+from openvima.errors import ActionError, ConfigError, echo
 from openvima.perception.objects import TOP, ObjectViews, observe, observe_prompt_image
 from openvima.render.camera import CAMERAS
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action
@@ -70,15 +70,13 @@ class FlatAction(gymnasium.ActionWrapper):
             values = np.asarray(action)
         except (TypeError, ValueError, RuntimeError):
             # Such as nested lists of unequal lengths, or a tensor on a device or with gradients.
-            values = np.empty(0, object)
-        if values.shape != (ACTION_SIZE,) or values.dtype.kind != "f":
+            values = np.empty(0)
+        fits = values.shape == (ACTION_SIZE,) and values.dtype.kind == "f"
+        if not fits or not (np.abs(values) <= 1).all():  # also without NaN
             raise ActionError(
-                f"the action has shape {values.shape} and dtype {values.dtype}; it must be "
-                f"({ACTION_SIZE},) of floating-point numbers. Nothing was moved."
+                f"the action is {echo(repr(action))}; it must be an array of {ACTION_SIZE} floating-point "
+                "numbers, each in -1 … 1. Nothing was moved."
             )
-        if not (np.abs(values) <= 1).all():  # also without NaN
-            given = ", ".join(f"{value:.4g}" for value in values)
-            raise ActionError(f"the action is ({given}); each value must lie in -1 … 1. Nothing was moved.")
         pick, place = _LOW + (values.reshape(3, 2)[:2].astype(np.float64) + 1) / 2 * (_HIGH - _LOW)
         return Action.planar(tuple(pick), tuple(place), float(np.arctan2(*values[4:]))).to_arrays()
 
@@ -200,30 +198,27 @@ class ImageObservation(gymnasium.ObservationWrapper):
 
     | key | value |
     |---|---|
-    | `front`, `top` | uint8, shape (3, 128 / shrink, 256 / shrink) |
+    | `front`, `top` | uint8, shape (3, 64, 128): averaged over squares of 2 × 2 pixels |
     | `prompt` | top views of the prompt's images in reading order, one below the other in channels: uint8, \
-shape (3 × max_prompt_images, 128 / shrink, 256 / shrink), zeros where there is none |
+shape (3 × max_prompt_images, 64, 128), zeros where there is none |
     | `words` | words of the prompt and end effector, with control "end_effector" also the tool, as in \
 `FlatObservation`: float32, shape (65,) or (71,), −1 … 1 |
 
     Args:
         env: An environment of the package, wrapped or not, that observes `rgb`.
         max_prompt_images: Images of a prompt at most.
-        shrink: Images are averaged over squares of so many pixels a side: 1, 2 or 4.
 
     Raises:
-        ConfigError: The environment does not observe `rgb`, or `shrink` is another number.
+        ConfigError: The environment does not observe `rgb`.
     """
 
-    def __init__(self, env: gymnasium.Env, *, max_prompt_images: int = 4, shrink: int = 2) -> None:
+    def __init__(self, env: gymnasium.Env, *, max_prompt_images: int = 4) -> None:
         super().__init__(env)
         self._base: Any = env.unwrapped  # a TabletopEnv, as in `FlatObservation`
         if "rgb" not in self._base.modalities:
             raise ConfigError(f"modalities are {self._base.modalities}; ImageObservation needs rgb.")
-        if shrink not in (1, 2, 4):
-            raise ConfigError(f"shrink is {shrink!r}; allowed are 1, 2 and 4.")
-        self.max_prompt_images, self.shrink = max_prompt_images, shrink
-        shape = CAMERAS["top"].height // shrink, CAMERAS["top"].width // shrink
+        self.max_prompt_images = max_prompt_images
+        shape = CAMERAS["top"].height // 2, CAMERAS["top"].width // 2
         images = {**dict.fromkeys(CAMERAS, 3), "prompt": 3 * max_prompt_images}
         num_words = NUM_BUCKETS + 1 + TOOL_SIZE * (self._base.control == END_EFFECTOR)
         parts: dict[str, spaces.Space] = {
@@ -248,14 +243,14 @@ shape (3 × max_prompt_images, 128 / shrink, 256 / shrink), zeros where there is
             )
         self._prompt = np.zeros(self.observation_space["prompt"].shape, np.uint8)  # type: ignore[index]
         for index, image in enumerate(images):
-            self._prompt[3 * index : 3 * index + 3] = _shrunk(image, self.shrink)
+            self._prompt[3 * index : 3 * index + 3] = _shrunk(image)
         self._words = _words(parts)
         return self.observation(observation), info
 
     def observation(self, observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Return an observation of the running episode as a flat dictionary."""
         tool = _tool(observation["tool"]) if "tool" in observation else ()
-        images = {view: _shrunk(image, self.shrink) for view, image in observation["rgb"].items()}
+        images = {view: _shrunk(image) for view, image in observation["rgb"].items()}
         words = np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
         return {**images, "prompt": self._prompt.copy(), "words": words}
 
@@ -274,13 +269,12 @@ class ProgressReward(gymnasium.Wrapper):
 
     Args:
         env: An environment of the package, wrapped or not.
-        weight: Factor of the potential.
         reach_weight: Factor of the reach.
     """
 
-    def __init__(self, env: gymnasium.Env, weight: float = 1.0, *, reach_weight: float = 0.0) -> None:
+    def __init__(self, env: gymnasium.Env, *, reach_weight: float = 0.0) -> None:
         super().__init__(env)
-        self.weight, self.reach_weight = weight, reach_weight
+        self.reach_weight = reach_weight
         self._base: Any = env.unwrapped  # a TabletopEnv, as in `FlatObservation`
         self._potential = 0.0
 
@@ -300,7 +294,7 @@ class ProgressReward(gymnasium.Wrapper):
         return observation, float(reward) + self._potential - before - cost, terminated, truncated, info
 
     def _potential_of(self, info: Mapping[str, Any]) -> float:
-        potential = self.weight * _potential(info["progress"])
+        potential = _potential(info["progress"])
         if self.reach_weight and self._base.control == END_EFFECTOR:
             potential -= self.reach_weight * self._reach(self._base.tool[:2])
         return potential
@@ -342,10 +336,10 @@ def _words(parts: Sequence[object]) -> np.ndarray:
     return words
 
 
-def _shrunk(image: np.ndarray, side: int) -> np.ndarray:
-    """Average an image over squares: shape (3, H, W) to (3, H / side, W / side), uint8."""
+def _shrunk(image: np.ndarray) -> np.ndarray:
+    """Average an image over squares: shape (3, H, W) to (3, H / 2, W / 2), uint8."""
     channels, height, width = image.shape
-    tiles = image.reshape(channels, height // side, side, width // side, side)
+    tiles = image.reshape(channels, height // 2, 2, width // 2, 2)
     return tiles.mean(axis=(2, 4)).astype(np.uint8)
 
 

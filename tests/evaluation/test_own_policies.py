@@ -105,7 +105,10 @@ def test_invalid_actions_are_counted_and_the_first_is_shown(file, capsys):
             "return 1 / 0",
             r"mine raised ZeroDivisionError: .* \(my policies.py, line 11\), in rotate, L1, seeds 0, 1",
         ),
-        ("return actions[0]", "mine gave a dict; act must return a list with an action for each observation"),
+        (
+            "return actions[0]",
+            "mine gave a dict for 2 observations; act must return a list",
+        ),
         ("return actions[:1]", "mine gave 1 actions for 2 observations"),
         (
             "return [actions[0], None]",

@@ -70,9 +70,6 @@ class RolloutPolicy:
         self.asked.append([observation is not None for observation in observations])
         return [None if observation is None else self.decision for observation in observations]
 
-    def near_ties(self):
-        return ()
-
 
 def test_success_failure_and_step_limit_are_told_apart():
     solved = Env({}, {"success": True})
@@ -105,6 +102,7 @@ def test_an_episode_in_which_only_other_objects_were_picked_is_counted_apart():
 
 def test_outcomes_hold_the_strict_limit_and_the_decisions_that_rounding_may_have_made():
     class Wavering(RolloutPolicy):
+        @property
         def near_ties(self):
             return [True, len(self.asked) == 2]
 

@@ -42,11 +42,6 @@ def test_wilson_interval_ends_exactly_at_zero_and_one():
         assert wilson_interval(episodes, episodes)[1] == 1.0
 
 
-def test_higher_confidence_widens_the_interval():
-    narrow, wide = wilson_interval(5, 10, 0.8), wilson_interval(5, 10, 0.99)
-    assert wide[0] < narrow[0] < 0.5 < narrow[1] < wide[1]
-
-
 def test_mean_of_one_rate_is_that_rate_with_its_own_interval():
     mean, interval = mean_of_rates([(8, 10)])
     assert mean == 0.8

@@ -15,7 +15,7 @@ from openvima.report import write_report
 from openvima.report.curves import read_charts, read_run_charts
 from openvima.report.page import default_command
 from openvima.report.published import published_tasks
-from openvima.report.text import Confirmation, role
+from openvima.report.text import role
 from openvima.video.encoder import load_clips, save_clips
 from small_data_sets import outcomes
 
@@ -103,17 +103,6 @@ def test_the_table_shows_rates_intervals_and_counts(text):
     assert "75.0 %" in mean[1]
     published = {row[0].strip(): row[-1].strip() for row in table[2:5]}  # of the same task only
     assert published == {"rotate": "99.5 %", "stack<b>": "–", "mean of 2": "–"}
-
-
-def test_success_within_the_oracles_steps_is_shown_where_it_differs(text, results, tmp_path):
-    strict = [row for row in Page(text).tables[0] if row[0].startswith("mean within the oracle")]
-    assert [row[1].split()[0] for row in strict] == [
-        "0.0",
-        "0.0",
-    ]  # all took two steps, the oracle may take one
-    quick = tuple(replace(row, oracle_max_steps=2) for row in results.rows)
-    path = write_report(replace(results, rows=quick), tmp_path / "quick.html")
-    assert "mean within the oracle" not in path.read_text(encoding="utf-8")
 
 
 def test_names_and_reasons_are_escaped(text):
@@ -206,8 +195,7 @@ def test_code_is_hashed_as_source_and_weights_as_weights(results, tmp_path):
 
 
 def test_tables_are_marked_if_all_outcomes_were_confirmed_by_replay(results, tmp_path):
-    confirmed = Confirmation("my run", True)
-    text = write_report(results, tmp_path / "a.html", confirmations=[confirmed]).read_text("utf-8")
+    text = write_report(results, tmp_path / "a.html", confirmations={"my run": True}).read_text("utf-8")
     assert all(
         "confirmed by replay</a>" in section(text, name) for name in ("overview", "results", "families")
     )
@@ -215,7 +203,7 @@ def test_tables_are_marked_if_all_outcomes_were_confirmed_by_replay(results, tmp
     said = section(text, "verification")
     assert "who acted (policies)" in said and "claim until openvima verify-results &#39;my run&#39;" in said
 
-    both = [confirmed, Confirmation("b", False)]
+    both = {"my run": True, "b": False}
     text = write_report(results, tmp_path / "b.html", confirmations=both).read_text("utf-8")
     assert "confirmed by replay</a>" not in text
     assert "Not confirmed by replay. openvima verify-results b plays" in section(text, "verification")
@@ -324,7 +312,8 @@ def test_all_episodes_are_listed_failures_first_and_lead_to_their_videos(text):
     assert rows[1] == ["mine", "L1", "rotate", "▶ 9", "failed", "2", reason]
     assert rows[-1] == ["random", "L1", "stack<b>", "0", "solved", "2", ""]
     assert 'data-value="object left the workspace"' in section(text, "episodes")
-    assert '<a href="#video-1">' in text and 'id="video-1"' in section(text, "videos")
+    assert '<a href="#mine/rotate/L1/9">' in text
+    assert 'id="mine/rotate/L1/9"' in section(text, "videos")
 
 
 def test_of_very_many_episodes_failures_alone_are_listed(results, tmp_path, monkeypatch):

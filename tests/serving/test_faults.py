@@ -20,7 +20,7 @@ from openvima.errors import ServerError
 from openvima.policies.base import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
-from openvima.serving.protocol import encode_observation, encode_prompt, pack, unpack
+from openvima.serving.protocol import encode_observation, encode_prompt, pack
 from openvima.serving.server import Session
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
@@ -158,7 +158,7 @@ class Untouched(Telltale):
 
 def refusal(message: Any, policy: Any = None) -> str:
     session = Session(policy or Untouched(), 64)
-    answer = session.read(pack(message))
+    answer = session.answer(pack(message))
     assert isinstance(answer, str)
     return answer
 
@@ -175,13 +175,12 @@ def test_a_policy_that_reads_language_is_served_descriptions() -> None:
 
     policy = Listener()
     session = Session(policy, 64, "text")
-    request = session.read(pack({"type": "reset", "prompts": [encode_prompt(made_up_prompt(3))]}))
-    assert not isinstance(request, str)
-    assert session.reply(request) == pack({"type": "reset"})
+    request = pack({"type": "reset", "prompts": [encode_prompt(made_up_prompt(3))]})
+    assert session.answer(request) == pack({"type": "reset"})
     (prompt,) = policy.prompts
     assert (prompt.text, prompt.images) == ("Look at the red swirl bowl, number 3.", {})
     long = prompt_with(objects=[{"object_id": 2, "object": "x" * 201, "texture": "red"}])
-    assert "names of over 200 characters" in str(session.read(pack({"type": "reset", "prompts": [long]})))
+    assert "names of over 200 characters" in str(session.answer(pack({"type": "reset", "prompts": [long]})))
 
 
 def records(*ids: int) -> list[dict[str, Any]]:
@@ -225,25 +224,6 @@ def test_a_policy_states_its_own_limits() -> None:
     assert "32 characters; this policy takes 30" in refusal(sent, Terse())
 
 
-def test_a_request_that_takes_long_to_read_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    reading, finished = threading.Event(), threading.Event()
-
-    def slow(data: bytes) -> Any:
-        if data == b"slow":
-            reading.set()
-            assert finished.wait(10)
-        return unpack(data)
-
-    monkeypatch.setattr("openvima.serving.server.unpack", slow)
-    with serve_in_thread(ForMany()) as url, RemotePolicy(url) as bad, RemotePolicy(url) as good:
-        bad._socket.send(b"slow")
-        assert reading.wait(10)
-        good.reset([made_up_prompt(3)])
-        assert told(good.act([made_up_observation(4)])[0]) == (3, 4, 1)
-        finished.set()
-        assert "no whole MessagePack" in str(bad._socket.recv())
-
-
 def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCaptureFixture) -> None:
     hostile = "\x1b[2J\u202e\n" + "y" * 10_000
 
@@ -252,10 +232,8 @@ def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCap
             raise KeyError(hostile)
 
     session = Session(Failing(), 64)
-    request = session.read(pack({"type": "reset", "prompts": [prompt_with()]}))
-    assert not isinstance(request, str)
     with caplog.at_level(logging.ERROR):
-        answers = [session.reply(request)]
+        answers = [session.answer(pack({"type": "reset", "prompts": [prompt_with()]}))]
     answers += [
         refusal({"type": hostile}),
         refusal({"type": "reset", hostile: 1}),

@@ -45,7 +45,10 @@ def test_fractions_differ_by_seed_and_share_their_source() -> None:
     study = study_of(Run("all"), Run("tenth", data_fraction=0.1))
     plan = plan_study(study, INPUTS, OUT, seeds=2)
     assert list(plan.data.values()) == [OUT / "data/1"]
-    assert [(s.out.name, s.seed) for s in plan.subsets] == [("1-0.1-seed-0", 0), ("1-0.1-seed-1", 1)]
+    assert [(s.out.name, s.seed) for s, _ in plan.subsets.values()] == [
+        ("1-0.1-seed-0", 0),
+        ("1-0.1-seed-1", 1),
+    ]
     assert [t.config.data.name for t in plan.trainings] == ["1", "1", "1-0.1-seed-0", "1-0.1-seed-1"]
     assert [t.config.seed for t in plan.trainings] == [0, 1, 0, 1]
     assert [e.config.seed for e in plan.evaluations] == [0, 5, 0, 5]  # episodes of their own
@@ -55,7 +58,7 @@ def test_pretraining_of_several_runs_is_trained_once_for_each_seed() -> None:
     init = {"augmentation.inverse_dynamics_prob": 1.0}
     study = study_of(Run("a", init=init), Run("b", init=init, settings={"schedule.steps": 7}), Run("c"))
     plan = plan_study(study, INPUTS, OUT, seeds=2)
-    assert [t.config.out for t in plan.initial] == [OUT / f"initial/1/seed-{seed}" for seed in (0, 1)]
+    assert list(plan.initial) == [OUT / f"initial/1/seed-{seed}" for seed in (0, 1)]
     sources = [t.config.init_from for t in plan.trainings]
     assert sources == [str(OUT / f"initial/1/seed-{seed}") for seed in (0, 1, 0, 1)] + [None] * 2
     assert plan.trainings[2].config.schedule.steps == 7
@@ -76,7 +79,7 @@ def test_every_study_can_be_planned_at_every_scale(name: str, scale: str) -> Non
     plan = plan_study(study, inputs, OUT, seeds=2)
     assert study.name == name
     assert plan.num_stages >= len(study.runs)
-    for training in (*plan.initial, *plan.trainings):
+    for training in plan.all_trainings:
         resolve(training.config)
 
 

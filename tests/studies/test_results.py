@@ -37,7 +37,7 @@ def made_up(name: str, folder: Path, seeds: int = 2) -> tuple[Study, StudyInputs
         ]
         Results(tuple(rows)).write(config.out / "results.json")
     costs = {"parameters": 10**6, "demonstrations": 9, "steps": {"2-cloning": 7}, "cpu_seconds": 90.0}
-    for training in (*plan.initial, *plan.trainings):
+    for training in plan.all_trainings:
         training.config.out.mkdir(parents=True)
         (training.config.out / COST_FILE).write_text(json.dumps(costs))
     return study, inputs, plan, study_points(study, plan)
@@ -64,7 +64,7 @@ def test_a_figure_has_the_panels_and_the_axis_of_the_study(
     figure = study_figure(study, points)
     assert list(figure.panels) == panels
     assert figure.named == named
-    assert all(curve.points for curves in figure.panels.values() for curve in curves)
+    assert all(points for curves in figure.panels.values() for points in curves.values())
 
 
 @pytest.mark.parametrize("name", ["corrupted-prompts", "level-drop"])

@@ -89,9 +89,8 @@ def main(
         raise ConfigError(f"--boxes is {boxes!r}, but {policy} uses no boxes; name a trained policy.")
     from openvima.catalog import load_assets
     from openvima.env import EnvConfig, load_episode
-    from openvima.evaluation.config import Batch
     from openvima.evaluation.recording import record_episode
-    from openvima.evaluation.rollout_policies import load_rollout_policy
+    from openvima.evaluation.rollout_policies import load_own_rollout_policy
     from openvima.evaluation.sources import PolicySource
     from openvima.policies.naming import ORACLE
     from openvima.scene import HOST_TASK
@@ -115,22 +114,12 @@ def main(
         check_task_options((task,), env_config.task_options)
         env = env_config.make(task, level, domain="user", realtime=True)
         what, title = f"{task}, seed {seed}", f"{task} · {level} · seed {seed}"
-    batch = Batch(
-        policy,
-        policy,
-        env.task,
-        env.level,
-        first_seed=seed,
-        episodes=1,
-        env_config=env_config,
-        device=device,
-        boxes=boxes or "",
-        trust_code=trust_code,
-        vlm=VlmConfig(base_url, view, vlm),
-    )
     explain = explain or source.kind == "vlm"
     title = f"{title} · {Path(policy).name}"
-    outcome = record_episode(env, load_rollout_policy(batch), start, out, title=title, explain=explain)
+    acts = load_own_rollout_policy(
+        policy, boxes=boxes or "", trust_code=trust_code, device=device, vlm=VlmConfig(base_url, view, vlm)
+    )
+    outcome = record_episode(env, acts, start, out, title=title, explain=explain)
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
     if not env.episode.problem.goals and not env.outcome.failure:
         ended = outcome.reason

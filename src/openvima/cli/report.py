@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -18,7 +18,6 @@ def main(
     out: Path | None = None,
     compare: str | None = None,
     runs: tuple[Path, ...] = (),
-    tables: Literal["all", "levels"] = "all",
     published: bool = True,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -36,8 +35,6 @@ def main(
         compare: Policies with commas in between; each is compared with the first, seed by seed.
             POLICY:ABLATION stands for its score under an ablation.
         runs: Folders of training runs, or their metrics.jsonl, whose learning curves to show.
-        tables: What a .md or .tex file has: all, or levels, a compact one of the means by level with the best
-            policy of each in bold.
         published: Whether to show published numbers of the same tasks beside those measured.
         as_json: Print the comparisons as JSON.
 
@@ -52,8 +49,8 @@ def main(
     from openvima.report.curves import run_labels
     from openvima.report.page import default_command
     from openvima.report.table import latex, markdown
-    from openvima.report.tables import compact_tables, paper_tables
-    from openvima.report.text import Confirmation, finding
+    from openvima.report.tables import paper_tables
+    from openvima.report.text import finding
     from openvima.report.videos import REPORT_NAME, require_extra
     from openvima.video.encoder import load_clips
 
@@ -63,20 +60,16 @@ def main(
     merged = merge(dict(zip(labels, evaluations.values(), strict=True)))
     pairs = _pairs(compare) if compare is not None else default_pairs(merged.results)
     comparisons = compare_pairs(merged.results, pairs)
-    confirmations = [
+    confirmations = {
         # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
-        Confirmation(label if len(labels) > 1 else "DIR", is_marked_verified(path))
+        label if len(labels) > 1 else "DIR": is_marked_verified(path)
         for label, path in zip(labels, evaluations, strict=True)
-    ]
+    }
     write = None if out is None else {".md": markdown, ".tex": latex}.get(out.suffix.lower())
     if out is not None and write is not None:
-        confirmed = all(each.confirmed for each in confirmations)
-        written = (
-            paper_tables(merged.results, comparisons, published=published, confirmed=confirmed)
-            if tables == "all"
-            else compact_tables(merged.results, published=published)
-        )
-        atomic_write_file(out, write(written))
+        confirmed = all(confirmations.values())
+        tables = paper_tables(merged.results, comparisons, published=published, confirmed=confirmed)
+        atomic_write_file(out, write(tables))
         print(f"Tables: {out}")
         return 0
     if as_json:

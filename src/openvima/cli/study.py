@@ -62,7 +62,7 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.studies import Execution, StudyInputs, check_options, make_study, run_study, scale_named
+    from openvima.studies import StudyInputs, check_options, make_study, run_study, scale_named
     from openvima.studies.plan import plan_study
     from openvima.studies.runner import check_plan
 
@@ -82,16 +82,14 @@ def main(
     words = [f"--{option} {shlex.quote(value)}" for option, value in options.items() if value]
     start = f"openvima study {shlex.quote(name)} --scale {scale} --seeds {seeds}"
     command = " ".join([start, *words, "--out DIR"])
-    execution = Execution(workers, engine, address)
+    how = {"device": device, "workers": workers, "engine": engine, "address": address}
     if dry_run:
-        found = plan_study(study, inputs, out, seeds=seeds, device=device)
+        found = plan_study(study, inputs, out, seeds=seeds, **how)
         check_plan(found, inputs)
         _print_plan(found)
         return 0
     with progress_bar("stages") as bar:
-        page = run_study(
-            study, inputs, out, seeds=seeds, device=device, execution=execution, command=command, report=bar
-        )
+        page = run_study(study, inputs, out, seeds=seeds, command=command, report=bar, **how)
     print(f"Report: {page}", file=sys.stderr)
     print(page)
     return 0
@@ -107,7 +105,7 @@ def _print_plan(plan: "Plan") -> None:
         table.add_row(
             f"{demonstrations.episodes:,} demonstrations of {len(demonstrations.tasks)} tasks", f"{out}"
         )
-    for training in (*plan.initial, *plan.trainings):
+    for training in plan.all_trainings:
         table.add_row(f"training of {training.config.preset}", f"{training.config.out}")
     for evaluation in plan.evaluations:
         episodes = sum(batch.episodes for batch in plan_evaluation(evaluation.config))

@@ -10,9 +10,9 @@ import pyarrow as pa
 from openvima.atomic_io import atomic_write
 from openvima.data.shard import DAMAGE_ERRORS
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, PolicyError, one_line
+from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, one_line
 from openvima.evaluation.results import Row
-from openvima.evaluation.rollout_policies import Decision, Explainer, Observation, RolloutPolicy
+from openvima.evaluation.rollout_policies import Decision, Observation, RolloutPolicy
 from openvima.input_files import open_regular
 from openvima.scene import ACTION_SHAPES, Action
 from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES, ToolCommand
@@ -56,18 +56,15 @@ class ActionRecorder:
                 steps.append(numbers)
         return decisions
 
+    @property
     def near_ties(self) -> Sequence[bool]:
-        """Return those of the policy."""
-        return self._policy.near_ties()
+        """Those of the policy."""
+        return getattr(self._policy, "near_ties", ())
 
     @property
     def modalities(self) -> tuple[str, ...]:
         """What the policy asks observations to hold."""
         return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
-
-    def explainer(self) -> Explainer:
-        """Return that of the policy."""
-        return self._policy.explainer()
 
 
 class ActionReplay:
@@ -86,14 +83,6 @@ class ActionReplay:
             None if observation is None else _next(steps)
             for steps, observation in zip(self._left, observations, strict=True)
         ]
-
-    def near_ties(self) -> Sequence[bool]:
-        """Return nothing: they depend on the policy's scores."""
-        return ()
-
-    def explainer(self) -> Explainer:
-        """Raise an error: the policy is not there."""
-        raise PolicyError("recorded actions have no explain(); run their policy.")
 
 
 def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]], *, control: str = PRIMITIVES) -> str:

@@ -20,9 +20,8 @@ frame … frame". It contains the answer, so this measures whether a policy repr
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
-from types import MappingProxyType
 
 import numpy as np
 
@@ -178,6 +177,7 @@ def _kinds(images: tuple[tuple[str, object], ...]) -> dict[str, type]:
     return {name: type(fill) for name, fill in images}
 
 
+IN_CONTEXT_TASKS = ("twist", "follow_motion", "follow_order")
 _MAX_SHOWN = 100  # characters of a prompt in an error
 _TEXTURE = re.compile(re.escape(twist.REQUEST).replace(r"\{twist_obj_texture\}", "(.+)"))
 
@@ -195,9 +195,20 @@ def in_context_prompt(prompt: RenderedPrompt, task: str) -> RenderedPrompt:
     """
     if problem := no_edited_prompt(task):
         raise ConfigError(problem)
-    names = tuple(prompt.images)
-    text, shown = _EDITS[task](prompt.text, names)
-    return RenderedPrompt(text, {name: prompt.images[name] for name in shown})
+    text, names = prompt.text, tuple(prompt.images)
+    if task == "twist":
+        found = _TEXTURE.search(text)
+        if found is None or len(names) < 2:
+            raise PromptError(f"{echo(repr(text), _MAX_SHOWN)} is no prompt of twist with a pair of images.")
+        names = names[:2]
+        text = f"Follow this motion: {_slots(names)} for all {found[1]} objects."
+    elif task == "follow_order":
+        text = MOTION_TEXT.format(frames=_slots(names))
+    return RenderedPrompt(text, {name: prompt.images[name] for name in names})
+
+
+def _slots(names: tuple[str, ...]) -> str:
+    return " ".join(f"{{{name}}}" for name in names)
 
 
 def no_edited_prompt(task: str) -> str:
@@ -205,31 +216,6 @@ def no_edited_prompt(task: str) -> str:
     if task in IN_CONTEXT_TASKS:
         return ""
     return unknown_name("in-context evaluation of task", task, IN_CONTEXT_TASKS)
-
-
-_Edited = tuple[str, tuple[str, ...]]  # text, and names of the images in it
-
-
-def _twist(text: str, names: tuple[str, ...]) -> _Edited:
-    found = _TEXTURE.search(text)
-    if found is None or len(names) < 2:
-        raise PromptError(f"{echo(repr(text), _MAX_SHOWN)} is no prompt of twist; it has no pair of images.")
-    before, after = names[:2]
-    return f"Follow this motion: {{{before}}} {{{after}}} for all {found[1]} objects.", (before, after)
-
-
-def _follow_motion(text: str, names: tuple[str, ...]) -> _Edited:
-    return text, names
-
-
-def _follow_order(text: str, names: tuple[str, ...]) -> _Edited:
-    return MOTION_TEXT.format(frames=" ".join(f"{{{name}}}" for name in names)), names
-
-
-_EDITS: Mapping[str, Callable[[str, tuple[str, ...]], _Edited]] = MappingProxyType(
-    {"twist": _twist, "follow_motion": _follow_motion, "follow_order": _follow_order}
-)
-IN_CONTEXT_TASKS = tuple(_EDITS)
 
 
 def demonstrated(env: TabletopEnv) -> RenderedPrompt:

@@ -13,7 +13,12 @@ from openvima.env.tabletop import TabletopEnv
 from openvima.errors import PolicyError
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import begin_episode, play
-from openvima.evaluation.rollout_policies import OracleRolloutPolicy, PromptedRolloutPolicy, RolloutPolicy
+from openvima.evaluation.rollout_policies import (
+    OracleRolloutPolicy,
+    PromptedRolloutPolicy,
+    RolloutPolicy,
+    explainer_of,
+)
 from openvima.input_files import as_path
 from openvima.policies.loading import load_policy
 from openvima.scene import Episode
@@ -65,7 +70,7 @@ def record_episode(
 
 def _explainer(policy: RolloutPolicy) -> Callable[[], Explanation]:
     """Return the function that explains the last action in the only episode of a policy."""
-    explain_all = policy.explainer()
+    explain_all = explainer_of(policy)
 
     def explain() -> Explanation:
         (explanation,) = explain_all()

@@ -182,7 +182,7 @@ def _play_together(
             if lacks_memory(error):
                 raise
             return error
-        near_ties = policy.near_ties() or [False] * len(slots)
+        near_ties = getattr(policy, "near_ties", ()) or [False] * len(slots)
         for slot, decision, is_near_tie in zip(slots, decisions, near_ties, strict=True):
             if slot.outcome is None:
                 slot.near_ties += is_near_tie

@@ -22,7 +22,7 @@ from openvima.errors import (
 )
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.chat import Said, said_in, shot_turns
-from openvima.evaluation.config import DEFAULT_DEVICE, Batch
+from openvima.evaluation.config import Batch
 from openvima.evaluation.sources import PolicySource
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, require_torch, torch_threads
 from openvima.policies.loading import checked_policy, reads_environments
@@ -41,7 +41,11 @@ Decision = Mapping[str, Any] | Action | np.ndarray | ToolCommand | OracleError |
 
 
 class RolloutPolicy(Protocol):
-    """Decides actions for a batch of environments."""
+    """Decides actions for a batch of environments.
+
+    It may have `modalities` and `near_ties` as a policy has them, and `explainer()`, which returns what
+    explains the last actions or raises a `PolicyError`.
+    """
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start a batch of episodes; every environment has been reset."""
@@ -52,18 +56,6 @@ class RolloutPolicy(Protocol):
 
         The answer is None where the episode is over, and an error where an oracle has no action, or where the
         words of a model hold none.
-        """
-        ...
-
-    def near_ties(self) -> Sequence[bool]:
-        """Say of each environment whether rounding may have chosen its last action; empty if not known."""
-        ...
-
-    def explainer(self) -> Explainer:
-        """Return what explains the last actions.
-
-        Raises:
-            PolicyError: Nothing does.
         """
         ...
 
@@ -83,13 +75,16 @@ class OracleRolloutPolicy:
         pairs = zip(self._envs, observations, strict=True)
         return [None if observation is None else _oracle(env) for env, observation in pairs]
 
-    def near_ties(self) -> Sequence[bool]:
-        """Return nothing: the oracle has no scores."""
-        return ()
 
-    def explainer(self) -> Explainer:
-        """Raise an error: the oracle reads the scene."""
-        raise PolicyError(f"the oracle has no explain(). {POLICIES_THAT_EXPLAIN}")
+def explainer_of(policy: RolloutPolicy) -> Explainer:
+    """Return what explains the last actions of a rollout policy.
+
+    Raises:
+        PolicyError: Nothing does.
+    """
+    if not hasattr(policy, "explainer"):
+        raise PolicyError(f"{type(policy).__name__} has no explain(). {POLICIES_THAT_EXPLAIN}")
+    return policy.explainer()  # type: ignore[attr-defined]
 
 
 def _read(action: object) -> None:
@@ -161,14 +156,11 @@ class PromptedRolloutPolicy:
             actions = self._policy.act(
                 [None if image is None else seen.observation(image) for seen, image in pairs]
             )
-        if not isinstance(actions, Sequence):
+        given = f"{len(actions)} actions" if isinstance(actions, Sequence) else f"a {type(actions).__name__}"
+        if given != f"{len(observations)} actions":
             raise PolicyError(
-                f"{self._name} gave a {type(actions).__name__}; act must return a list with an action for "
-                "each observation."
-            )
-        if len(actions) != len(observations):
-            raise PolicyError(
-                f"{self._name} gave {len(actions)} actions for {len(observations)} observations."
+                f"{self._name} gave {given} for {len(observations)} observations; act must return a list "
+                "with an action for each."
             )
         for env, seen, action in zip(self._envs, observations, actions, strict=True):
             if action is None and seen is not None:
@@ -216,8 +208,9 @@ class PromptedRolloutPolicy:
 
         return checked
 
+    @property
     def near_ties(self) -> Sequence[bool]:
-        """Return those of the policy, if it reports any, as `NetworkPolicy` does."""
+        """Those of the policy, if it reports any, as `NetworkPolicy` does."""
         return getattr(self._policy, "near_ties", ())
 
 
@@ -302,24 +295,17 @@ def one_thread(batch: Batch) -> Iterator[None]:
 
 
 def load_own_rollout_policy(
-    source: str,
-    *,
-    device: str = DEFAULT_DEVICE,
-    boxes: str = "",
-    trust_code: bool = False,
-    temperature: float = 0.0,
-    seed: int = 0,
+    source: str, *, boxes: str = "", trust_code: bool = False, temperature: float = 0.0, **options: Any
 ) -> RolloutPolicy:
     """Load a policy that nobody else has a reference to, with episodes of its own.
 
     Args:
         source: As for `openvima evaluate --policy`.
-        device: Where a network computes.
         boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
         trust_code: Run the code that a run folder names.
         temperature: 0 for greedy decoding. Above 0 actions of networks are sampled, with logits divided by
             it.
-        seed: Of the sampling.
+        **options: `device`, `precision` and `vlm`, as in `Batch`.
 
     Raises:
         UnknownPolicyError, InputFileError, ConfigError, ServerError: As for `load_rollout_policy`.
@@ -327,14 +313,12 @@ def load_own_rollout_policy(
     PolicySource(source, source, trust_code).check()
     if source == ORACLE:
         return OracleRolloutPolicy()
-    options: dict[str, Any] = {}
     if temperature and PolicyRef.parse(source).kind not in (RANDOM, "remote", "code", "vlm"):
         require_torch(f"policy {source!r}")
         import torch
 
-        options = {"temperature": temperature, "generator": torch.Generator().manual_seed(seed)}
-    policy = build_policy(source, device=device, boxes=boxes, trust_code=trust_code, **options)
-    return _rollout_policy(policy, "", source)
+        options |= {"temperature": temperature, "generator": torch.Generator().manual_seed(0)}
+    return _rollout_policy(build_policy(source, boxes=boxes, trust_code=trust_code, **options), "", source)
 
 
 @lru_cache(maxsize=1)

@@ -33,8 +33,7 @@ from openvima.evaluation.rollout_policies import (
 from openvima.evaluation.sources import object_record
 from openvima.input_files import names_of
 from openvima.multiprocess import Report, imap_with_engine
-from openvima.policies.base import Policy, require_torch
-from openvima.policies.loading import load_policy
+from openvima.policies.base import Policy
 from openvima.policies.naming import PolicyRef
 from openvima.scene.action import PRIMITIVES
 from openvima.serving.chat import VlmPolicy
@@ -150,7 +149,6 @@ def evaluate_range(config: EvaluationConfig, shards: Part, report: Report | None
         own, path = tuple(parts_in_range(prepared.batches, shards)), config.out / FILE_NAME
         with folder_lock(config.out, shards):
             if _earlier(path, prepared) is None:
-                _check_weights(served)
                 _play_all(replace(prepared, batches=own), report)
         if any(_kept(job, config.out) is None for job in _jobs(prepared)):
             return False
@@ -185,7 +183,6 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
     results = _earlier(path, prepared)
     if results is None:
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
-        _check_weights(config)
         started = time.perf_counter()
         played = _play_all(prepared, report)
         rows = rows_of(prepared.batches, {batch: rollouts.outcomes for batch, rollouts in played.items()})
@@ -230,18 +227,6 @@ def _answered(
     for name, of_policy in episodes.items():
         policies[name] = {**policies[name], _ANSWERS: summarise(of_policy)}
     return policies, write_answers(prepared.config.out, steps)
-
-
-def _check_weights(config: EvaluationConfig) -> None:
-    """Load each network once, so that a damaged one is named before episodes of the others."""
-    for source in config.sources:
-        if source.learner:
-            load_policy(source.source, trust_code=config.trust_code)
-        elif source.kind == "run":
-            require_torch(f"policy {source.name!r}")
-            from openvima.policies.checkpoint import load_network
-
-            load_network(source.source)
 
 
 def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:

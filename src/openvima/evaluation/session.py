@@ -21,16 +21,17 @@ from openvima.errors import (
     PolicyError,
     brief_repr,
 )
-from openvima.evaluation.config import DEFAULT_DEVICE, Batch
+from openvima.evaluation.config import DEFAULT_DEVICE
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import EpisodeSlot
 from openvima.evaluation.rollout_policies import (
     Decision,
     PromptedRolloutPolicy,
     RolloutPolicy,
-    load_rollout_policy,
+    explainer_of,
+    load_own_rollout_policy,
 )
-from openvima.evaluation.sources import ORACLE, PolicySource
+from openvima.evaluation.sources import ORACLE
 from openvima.input_files import as_path
 from openvima.policies.base import Policy
 from openvima.render.rasteriser import Rasteriser, front_above_top
@@ -269,7 +270,7 @@ class EpisodeSession:
     def _explanation(self) -> Explanation | None:
         assert self._policy is not None  # it has decided
         try:
-            explain = self._policy.explainer()
+            explain = explainer_of(self._policy)
         except PolicyError:  # it explains nothing
             return None
         (explanation,) = explain()
@@ -382,14 +383,18 @@ def play(
     video = None if video is None else as_path(video)
     if video is not None and video.suffix.lower() != ".mp4":
         raise ConfigError(f"video is {str(video)!r}; videos are MP4 files; give a name that ends in .mp4.")
-    rollout_policy = _load(policy, episode, device=device, boxes=boxes, trust_code=trust_code)
+    name = policy if isinstance(policy, str) else type(policy).__name__
+    player: Policy | RolloutPolicy = (
+        load_own_rollout_policy(policy, device=device, boxes=boxes, trust_code=trust_code)
+        if isinstance(policy, str)
+        else policy
+    )
     session = EpisodeSession(
-        episode, rollout_policy, assets=assets, compat=compat, record=video is not None, explain=False
+        episode, player, assets=assets, compat=compat, record=video is not None, explain=False
     )
     if video is None:
         outcome = _run(session)
     else:
-        name = policy if isinstance(policy, str) else type(policy).__name__
         title = f"{episode.task} · {Path(name).name}"
         with EpisodeRecorder(session.env, video, title=title) as recorder:
             outcome = _run(session, recorder)
@@ -415,15 +420,3 @@ def _run(session: EpisodeSession, recorder: EpisodeRecorder | None = None) -> Ep
         if session.step() is not None and recorder is not None:
             recorder.record_step(session.env)
     return session.outcome
-
-
-def _load(
-    policy: str | Policy, episode: Episode, *, device: str, boxes: str, trust_code: bool
-) -> RolloutPolicy:
-    """Load a policy by name, or take an object."""
-    if not isinstance(policy, str):
-        return PromptedRolloutPolicy(policy)
-    PolicySource(policy, policy, trust_code).check()
-    where = (episode.task, episode.level, episode.seed, 1)
-    batch = Batch(policy, policy, *where, device=device, boxes=boxes, trust_code=trust_code)
-    return load_rollout_policy(batch)

@@ -21,14 +21,7 @@ Fit = Callable[[float], list[tuple[float, float]]]
 
 _CONFIDENCE = 0.95
 _HALVINGS = 36  # of the range of multipliers; ends are then exact to about 1e-10
-
-
-def quantile(confidence: float) -> float:
-    """Standard normal quantile of a two-sided interval."""
-    return NormalDist().inv_cdf(0.5 + confidence / 2)
-
-
-_Z = quantile(_CONFIDENCE)
+_Z = NormalDist().inv_cdf(0.5 + _CONFIDENCE / 2)
 
 
 def _lower_end(estimate: float, least: float, played: Sequence[int], fit: Fit) -> float:
@@ -70,15 +63,14 @@ def _lower_end(estimate: float, least: float, played: Sequence[int], fit: Fit) -
     return constrained(outside)[0]
 
 
-def wilson_interval(successes: int, episodes: int, confidence: float = 0.95) -> Interval:
-    """Confidence interval of a success rate.
+def wilson_interval(successes: int, episodes: int) -> Interval:
+    """95 % confidence interval of a success rate.
 
     Unlike the normal approximation it stays inside [0, 1] and is valid at 0 and 100 % success.
 
     Args:
         successes: Solved episodes.
         episodes: All episodes, at least one.
-        confidence: Nominal coverage, between 0 and 1.
 
     Returns:
         Lower and upper end, as fractions.
@@ -89,7 +81,7 @@ def wilson_interval(successes: int, episodes: int, confidence: float = 0.95) -> 
 
     Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference", 1927.
     """
-    z = quantile(confidence)
+    z = _Z
     rate = successes / episodes
     shrink = 1 + z * z / episodes
     centre = (rate + z * z / (2 * episodes)) / shrink

@@ -13,7 +13,6 @@ from typing import Any
 
 from openvima.evaluation.statistics import Interval
 from openvima.html import render_page
-from openvima.report.table import Estimate, Line, Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,30 +23,17 @@ class RatePoint:
         x: Value of the quantity.
         rate: Success rate, as a fraction.
         interval: Its 95 % interval; None where it is not known.
-        mark: Put behind the number in tables.
         seeds: Rates of single training seeds, drawn as dashes.
     """
 
     x: float
     rate: float
     interval: Interval | None = None
-    mark: str = ""
     seeds: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class RateCurve:
-    """Success rates of one policy or model.
-
-    Args:
-        name: Its name; equal names share a colour.
-        points: In ascending order of the quantity.
-        published: Whether the numbers are from a paper, not measured here.
-    """
-
-    name: str
-    points: tuple[RatePoint, ...]
-    published: bool = False
+Curves = Mapping[tuple[str, bool], Sequence[RatePoint]]
+"""By name, and whether the numbers are from a paper, not measured here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,58 +41,24 @@ class RateFigure:
     """Panels over the same quantity, such as one of each level.
 
     Args:
-        label: Short name of letters, digits and hyphens, unique in a page.
         caption: What is shown.
         quantity: The quantity with its unit: label of the horizontal axis.
-        panels: Curves by the title of their chart; those of one name have one colour, and one row in the
-            table.
+        panels: Curves by the title of their chart; those of one name have one colour.
         ticks: Names of values of the quantity, where they are not plain numbers.
         logarithmic: Whether the horizontal axis is.
         named: Whether values are 0, 1, 2, … for the names in `ticks`, in any order: curves are not joined.
     """
 
-    label: str
     caption: str
     quantity: str
-    panels: Mapping[str, tuple[RateCurve, ...]]
+    panels: Mapping[str, Curves]
     ticks: Mapping[float, str] = field(default_factory=dict)
     logarithmic: bool = False
     named: bool = False
 
-    @property
-    def curves(self) -> dict[str, RateCurve]:
-        """One curve of each name, measured ones first."""
-        all_curves = [curve for curves in self.panels.values() for curve in curves]
-        return {curve.name: curve for curve in sorted(all_curves, key=lambda curve: curve.published)}
-
-    @property
-    def values(self) -> list[float]:
-        """All values of the quantity, ascending."""
-        return sorted({p.x for curves in self.panels.values() for curve in curves for p in curve.points})
-
     def tick(self, x: float) -> str:
         """Name of a value of the quantity."""
         return self.ticks.get(x, f"{x:g}")
-
-
-def rate_table(figure: RateFigure) -> Table:
-    """Write the numbers of a figure as a table: a row for each curve of each panel."""
-    lines, values = [], figure.values
-    for title, curves in figure.panels.items():
-        for index, (name, published) in enumerate({c.name: c.published for c in curves}.items()):
-            points = {point.x: point for curve in curves if curve.name == name for point in curve.points}
-            cells = [_cell(points[x]) if x in points else "–" for x in values]
-            shown = f"{name} (published)" if published else name
-            lines.append(Line(shown, (title, *cells), starts_group=index == 0 and bool(lines)))
-    columns = ("policy", "level", *map(figure.tick, values))
-    caption = f"{figure.caption} Columns: {figure.quantity}. Rates in %, with 95 % intervals."
-    return Table(figure.label, caption, columns, tuple(lines))
-
-
-def _cell(point: RatePoint) -> Estimate | str:
-    if point.interval is None:
-        return f"{100 * point.rate:.1f}{point.mark}"
-    return Estimate(point.rate, point.interval, mark=point.mark)
 
 
 # Stand-ins that matplotlib draws with; the page's colours replace them, see `_themed`.
@@ -148,29 +100,31 @@ def rate_chart(rates: RateFigure, title: str, name: str, colours: Mapping[str, s
     """
     curves = rates.panels[title]
     figure, axes = _panel(3.6 if rates.named else 2.6)
-    for number, curve in enumerate(curves):
-        colour = _series(colours[curve.name])
+    for number, ((policy, is_published), points) in enumerate(curves.items()):
+        colour = _series(colours[policy])
         shift = _DODGE * (number - (len(curves) - 1) / 2) if rates.named else 0.0
         style: dict[str, Any] = {"linewidth": 1.8, "markersize": 4.5}
-        if curve.published:
+        if is_published:
             style = {"linestyle": (0, (3, 2)), "linewidth": 1.2, "markerfacecolor": "none", "markersize": 4}
         if rates.named:
             style["linestyle"] = "none"
-        at = [point.x + shift for point in curve.points]
-        axes.plot(at, _percent(point.rate for point in curve.points), marker="o", color=colour, **style)
-        for x, point in zip(at, curve.points, strict=True):
+        at = [point.x + shift for point in points]
+        axes.plot(at, _percent(point.rate for point in points), marker="o", color=colour, **style)
+        for x, point in zip(at, points, strict=True):
             seeds = _percent(point.seeds)
             axes.plot([x] * len(seeds), seeds, "_", color=colour, markersize=8, markeredgewidth=1.2)
             axes.vlines(x, *_percent(point.interval or (0, 0)), color=colour, linewidth=2.4, alpha=0.4)
     if rates.logarithmic:
         axes.set_xscale("log")
     tilt: Any = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if rates.named else {}
-    axes.set_xticks(rates.values, list(map(rates.tick, rates.values)), **tilt)
+    panels = (points for panel in rates.panels.values() for points in panel.values())
+    values = sorted({point.x for points in panels for point in points})
+    axes.set_xticks(values, list(map(rates.tick, values)), **tilt)
     axes.set_xticks([], minor=True)
     axes.set_ylim(-3, 103)
     axes.set_yticks(*_PERCENT_TICKS)
     axes.set_xlabel(rates.quantity)
-    return _themed(figure, name, f"{rates.caption} {title}", [colours[curve.name] for curve in curves])
+    return _themed(figure, name, f"{rates.caption} {title}", [colours[policy] for policy, _ in curves])
 
 
 def curve_chart(
@@ -267,7 +221,7 @@ _COLOURS = tuple(f"--series-{name}" for name in (1, 2, 3, 4, 5, 6, "untrained", 
 
 
 def rate_figure_html(figure: RateFigure) -> str:
-    """Draw a figure: legend, one chart a panel, and its numbers in a table to unfold.
+    """Draw a figure: legend, and one chart a panel.
 
     Args:
         figure: The figure.
@@ -278,14 +232,16 @@ def rate_figure_html(figure: RateFigure) -> str:
     Raises:
         MissingExtraError: matplotlib or Jinja is not installed.
     """
-    colours = dict(zip(figure.curves, cycle(_COLOURS), strict=False))
+    curves = sorted((curve for panel in figure.panels.values() for curve in panel), key=lambda c: c[1])
+    legend = dict(reversed(curves))  # a name is published if all its curves are
+    colours = dict(zip(dict(curves), cycle(_COLOURS), strict=False))
     return render_page(
         "report/rate_figure",
         figure=figure,
+        legend=legend,
         colours=colours,
         charts=[
-            rate_chart(figure, title, f"{figure.label}-{number}", colours)
+            rate_chart(figure, title, f"rates-{number}", colours)
             for number, title in enumerate(figure.panels)
         ],
-        table=rate_table(figure),
     )

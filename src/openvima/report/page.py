@@ -3,34 +3,42 @@
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.config import DEFAULT_BATCH
-from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.results import DECLARED, EpisodeOutcome, Results, Row
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
 from openvima.input_files import as_path, names_of
 from openvima.policies.naming import UNTRAINED, VLM
 from openvima.report import figures, published, tables, text
 from openvima.report.curves import read_run_charts
-from openvima.report.text import Confirmation
 from openvima.video.encoder import Clip
 
-_OPTIONS = {  # settings that a command names where they are not these
-    "assets": "procedural",
-    "prompts": "multimodal",
-    "task_options": "",
-    "control": "primitives",
-    "batch": DEFAULT_BATCH,
-    "boxes": "",
-    "device": "cpu",
-    "precision": "",
-}
+_OPTIONS = (  # settings that results name as commands do
+    "tasks",
+    "levels",
+    "episodes",
+    "seed",
+    "batch",
+    "assets",
+    "compat",
+    "prompts",
+    "task_options",
+    "control",
+    "ablations",
+    "boxes",
+    "device",
+    "precision",
+)
+_USUAL = {"assets": "procedural", "batch": DEFAULT_BATCH, "compat": False}
 _PLACES = {"run": "RUN", "remote": "ws://HOST:PORT"}
 _VLM_OPTIONS = {"view": "view"} | {
-    name: f"vlm.{name}" for name in ("points", "enlarge", "boxes", "shots", "temperature")
+    name: f"vlm.{name.replace('_', '-')}"
+    for name in ("points", "enlarge", "boxes", "shots", "temperature", "free_text")
 }
 
 
@@ -44,7 +52,7 @@ def write_report(
     comparisons: Sequence[Comparison] | None = None,
     notes: Sequence[str] = (),
     with_published: bool = True,
-    confirmations: Sequence[Confirmation] = (),
+    confirmations: Mapping[str, bool] = MappingProxyType({}),
 ) -> Path:
     """Write the report of an evaluation.
 
@@ -57,7 +65,7 @@ def write_report(
         comparisons: Policies to compare; by default those of `comparison.default_pairs`.
         notes: Warnings to put at the top.
         with_published: Whether to show published numbers of the same tasks, unless prompts or tasks differ.
-        confirmations: For each evaluation whether its outcomes were confirmed by replay.
+        confirmations: For the folder of each evaluation whether its outcomes were confirmed by replay.
 
     Returns:
         The file.
@@ -72,30 +80,28 @@ def write_report(
     out = as_path(out)
     records = [as_path(run) for run in names_of(runs)]
     clips = list({clip.file_name: clip for clip in clips}.values())
-    videos = video_ids(clips)
-    listed, num_episodes = listed_episodes(results, videos)
+    listed, num_episodes = listed_episodes(results)
     page = render_page(
         "report",
         text=text,
         tables=tables,
         figures=figures,
         published=published,
-        published_column=with_published
-        and any(published.published_tasks(row.level).get(row.task) for row in results.rows),
+        published_column=with_published and published.has_published_tasks(results),
         results=results,
         means=results.means(),
         colours=text.series_colours(results),
         notes=notes,
         clips=clips,
-        videos=videos,
+        videos={(clip.policy, clip.task, clip.level, clip.seed) for clip in clips},
         episodes=listed,
         num_episodes=num_episodes,
         comparisons=comparisons,
-        confirmations=confirmations,
-        all_confirmed=bool(confirmations) and all(each.confirmed for each in confirmations),
+        confirmations={shlex.quote(folder): done for folder, done in confirmations.items()},
+        all_confirmed=bool(confirmations) and all(confirmations.values()),
+        declared=DECLARED,
         ablations=tables.ablations_by_policy(results),
         families=tables.family_table(results, published=with_published),
-        published_tasks=published.published_task_table(results) if with_published else None,
         published_results=published.published_rows(results, published.published_models())
         if with_published
         else [],
@@ -118,21 +124,21 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
     ]
     words = [
         f"openvima evaluate --policy {shlex.quote(','.join(policies))}",
-        f"--tasks {shlex.quote(','.join(config.get('tasks', ['all'])))}",
-        f"--levels {shlex.quote(','.join(config.get('levels', results.levels())))}",
-        *[f"--{name} {shlex.quote(str(config.get(name, 0)))}" for name in ("episodes", "seed")],
         *[
-            f"--{name.replace('_', '-')} {shlex.quote(str(config[name]))}"
-            for name, usual in _OPTIONS.items()
-            if config.get(name, usual) != usual
+            _option(name.replace("_", "-"), config[name])
+            for name in _OPTIONS
+            if name in config and config[name] != _USUAL.get(name)
         ],
-        *(["--compat"] if config.get("compat") else []),
         *(["--trust-code"] if any("code" in what for what in results.policies.values()) else []),
-        *([f"--ablations {shlex.quote(','.join(config['ablations']))}"] if config.get("ablations") else []),
         *[word for what in list(filter(_is_vlm, results.policies.values()))[:1] for word in _vlm_words(what)],
         "--out DIR",
     ]
     return " ".join(words)
+
+
+def _option(name: str, value: Any) -> str:
+    text = ",".join(map(str, value)) if isinstance(value, list) else str(value)
+    return f"--{name}" if value is True else f"--{name} {shlex.quote(text)}"
 
 
 def _is_vlm(what: Mapping[str, Any]) -> bool:
@@ -141,12 +147,8 @@ def _is_vlm(what: Mapping[str, Any]) -> bool:
 
 def _vlm_words(what: Mapping[str, Any]) -> list[str]:
     """Name the settings of a vision-language model; the address of its server is not in results."""
-    words = [
-        f"--{option} {shlex.quote(str(what[name]))}"
-        for name, option in _VLM_OPTIONS.items()
-        if what.get(name)
-    ]
-    return ["--base-url URL", *words, *(["--vlm.free-text"] if what.get("free_text") else [])]
+    words = [_option(option, what[name]) for name, option in _VLM_OPTIONS.items() if what.get(name)]
+    return ["--base-url URL", *words]
 
 
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:
@@ -163,30 +165,13 @@ def _policy_word(name: str, what: Mapping[str, Any]) -> str:
 MOST_EPISODES = 4000  # that are listed; of more, failures alone
 
 
-def video_ids(clips: Sequence[Clip]) -> dict[tuple[str, str, str, int], str]:
-    """Name each video of the page, by policy, task, level and seed."""
-    return {(c.policy, c.task, c.level, c.seed): f"video-{number}" for number, c in enumerate(clips, 1)}
-
-
-def listed_episodes(
-    results: Results, videos: Mapping[tuple[str, str, str, int], str]
-) -> tuple[list[tuple[Row, EpisodeOutcome, str]], int]:
+def listed_episodes(results: Results) -> tuple[list[tuple[Row, EpisodeOutcome]], int]:
     """List the episodes without input ablations, failures first.
 
-    Args:
-        results: The evaluation.
-        videos: Ids of the videos on the page.
-
     Returns:
-        At most `MOST_EPISODES` episodes, each with its row and the id of its video, or an empty one; and how
-        many there are.
+        At most `MOST_EPISODES` episodes, each with its row; and how many there are.
     """
-    episodes = [
-        (row, outcome, videos.get((row.policy, row.task, row.level, outcome.seed), ""))
-        for row in results.rows
-        if not row.ablation
-        for outcome in row.outcomes
-    ]
+    episodes = [(row, outcome) for row in results.rows if not row.ablation for outcome in row.outcomes]
     ranked = sorted(episodes, key=lambda episode: episode[1].success)
     if len(ranked) > MOST_EPISODES:
         ranked = [episode for episode in ranked if not episode[1].success][:MOST_EPISODES]

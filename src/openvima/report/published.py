@@ -7,7 +7,6 @@ from functools import cache
 from importlib import resources
 
 from openvima.evaluation.results import Results
-from openvima.report.table import Estimate, Line, Table
 from openvima.scene.action import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 
@@ -68,12 +67,12 @@ class PublishedModel:
         """Mark of a level's number, as `RELIABILITY` explains it."""
         return "~" if level in self.rough else _MARKS[self.grade]
 
-    def written(self, level: str, rate: float, keep_marks: bool = True) -> str:
+    def written(self, level: str, rate: float) -> str:
         """Write a rate (%), with the marks that `RELIABILITY` explains if it is that of the level."""
         if rate != self.levels.get(level):
             return f"{rate:.1f}"
         mark = self.mark(level)
-        return f"~{rate:.1f}" if mark == "~" else f"{rate:.1f}{mark if keep_marks else ''}"
+        return f"~{rate:.1f}" if mark == "~" else f"{rate:.1f}{mark}"
 
 
 @cache
@@ -98,6 +97,11 @@ def published_tasks(level: str, model: tuple[str, str] = BESIDE) -> Mapping[str,
 def models_by_task() -> list[tuple[str, str]]:
     """Name and size of the models with published rates by task."""
     return list(dict.fromkeys((record["model"], record["size"]) for record in _by_task()))
+
+
+def has_published_tasks(results: Results) -> bool:
+    """Whether the rate of an evaluated task was published."""
+    return any(row.task in published_tasks(row.level) for row in results.rows)
 
 
 def task_rate(model: tuple[str, str], level: str, task: str) -> str:
@@ -142,22 +146,17 @@ def unpublished_settings(results: Results) -> str:
     )
 
 
-def published_rows(
-    results: Results, models: Sequence[PublishedModel], *, keep_marks: bool = True
-) -> list[tuple[str, tuple[str, ...]]]:
+def published_rows(results: Results, models: Sequence[PublishedModel]) -> list[tuple[str, tuple[str, ...]]]:
     """Name of each model, and its mean at each level over the tasks that were evaluated there.
 
     Args:
         results: The evaluation to compare with.
         models: Models; those without any number are left out.
-        keep_marks: Whether to mark numbers that the authors printed.
     """
     rows = []
     for model in models:
         rates = ((level, published_rate(level, results.tasks(level), model)) for level in results.levels())
-        means = tuple(
-            "–" if rate is None else model.written(level, rate, keep_marks) for level, rate in rates
-        )
+        means = tuple("–" if rate is None else model.written(level, rate) for level, rate in rates)
         if set(means) != {"–"}:
             rows.append((model.name, means))
     return rows
@@ -171,21 +170,3 @@ def _by_task() -> list[dict]:
 def _content() -> dict[str, list[dict]]:
     file = resources.files("openvima.report").joinpath("published.json")
     return json.loads(file.read_text(encoding="utf-8"))
-
-
-def published_task_table(results: Results) -> Table | None:
-    """Rates by task of policies and published models, at the evaluated levels; None without any."""
-    models, policies = models_by_task(), results.policy_names()
-    lines = []
-    for level in results.levels():
-        of_level = published_tasks(level)
-        for index, task in enumerate(of_level if of_level.keys() & set(results.tasks(level)) else ()):
-            rows = [results.row(policy, task, level) for policy in policies]
-            own = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
-            elsewhere = [task_rate(model, level, task) for model in models]
-            lines.append(Line(task, (level, *own, *elsewhere), starts_group=index == 0 and bool(lines)))
-    if not lines:
-        return None
-    columns = ("task", "level", *policies, *(f"{model} {size} (published)" for model, size in models))
-    caption = f"Success rates (%) by task, measured ones with 95 % intervals. {BY_TASK}"
-    return Table("published-tasks", caption, columns, tuple(lines))

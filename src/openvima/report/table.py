@@ -17,14 +17,8 @@ _LATEX_TEXT = {
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
-    "–": "--",
     "−": "$-$",
     "≈": r"$\approx$",
-    "×": r"$\times$",
-    "†": r"\dag{}",
-    "“": "``",
-    "”": "''",
-    "’": "'",
 }
 
 
@@ -37,14 +31,12 @@ class Estimate:
         interval: Its 95 % interval.
         signed: Whether it is a difference.
         mark: Put behind it.
-        is_best: Whether the number is written in bold.
     """
 
     value: float
     interval: tuple[float, float]
     signed: bool = False
     mark: str = ""
-    is_best: bool = False
 
     @property
     def written(self) -> str:
@@ -126,8 +118,7 @@ def _markdown_table(table: Table) -> str:
 def _markdown_cell(cell: Estimate | str) -> str:
     if isinstance(cell, str):
         return _markdown_text(cell)
-    number = f"**{cell.written}**" if cell.is_best else cell.written
-    return f"{number} ({cell.written_interval}){f' {cell.mark}' if cell.mark else ''}"
+    return f"{cell.written} ({cell.written_interval}){f' {cell.mark}' if cell.mark else ''}"
 
 
 def _markdown_text(text: str) -> str:
@@ -155,9 +146,7 @@ def _latex_cell(cell: Estimate | str) -> str:
     if isinstance(cell, str):
         return latex_text(cell)
     mark = f" {latex_text(cell.mark)}" if cell.mark else ""
-    number = latex_text(cell.written)
-    number = f"\\textbf{{{number}}}" if cell.is_best else number
-    return f"{number} {{\\footnotesize({latex_text(cell.written_interval)})}}{mark}"
+    return f"{latex_text(cell.written)} {{\\footnotesize({latex_text(cell.written_interval)})}}{mark}"
 
 
 def _label(text: str) -> str:

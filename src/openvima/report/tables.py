@@ -3,20 +3,21 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 from openvima.errors import UnknownTaskError
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import Results
-from openvima.evaluation.statistics import Interval, mean_of_rates
-from openvima.policies.naming import ORACLE
+from openvima.evaluation.statistics import mean_of_rates
 from openvima.report.published import (
     BESIDE,
+    BY_TASK,
+    has_published_tasks,
     is_comparable,
     leading_models,
+    models_by_task,
     published_rate,
     published_rows,
-    published_task_table,
+    task_rate,
     unpublished_settings,
 )
 from openvima.report.table import Estimate, Line, Table
@@ -24,45 +25,14 @@ from openvima.report.text import ablation_name, counted
 from openvima.tasks.registry import task_spec
 
 
-class FailureCause(NamedTuple):
-    """A cause of failed episodes, with its fraction of all episodes and their number by task."""
-
-    kind: str
-    episodes: int
-    fraction: float
-    tasks: str
-
-
-def failure_causes(results: Results, policy: str) -> list[FailureCause]:
-    """Count why a policy did not solve episodes, most frequent causes first."""
+def failure_causes(results: Results, policy: str) -> dict[str, Counter[str]]:
+    """Count by task why a policy did not solve episodes, most frequent causes first."""
     tasks: dict[str, Counter[str]] = {}
-    rows = [row for row in results.rows if row.policy == policy and not row.ablation]
-    for row in rows:
-        for kind, count in row.failures.items():
-            tasks.setdefault(kind, Counter())[row.task] += count
-    episodes = sum(row.episodes for row in rows)
-    ranked = sorted(tasks.items(), key=lambda item: (-item[1].total(), item[0]))
-    return [
-        FailureCause(
-            kind,
-            counts.total(),
-            counts.total() / episodes,
-            ", ".join(f"{task} {count}" for task, count in counts.most_common()),
-        )
-        for kind, counts in ranked
-    ]
-
-
-def oracle_horizon_means(results: Results, level: str) -> list[tuple[float, Interval] | None]:
-    """Mean of each policy within the oracle's step limit; empty where it is that of the usual one."""
-    means: list[tuple[float, Interval] | None] = []
-    differs = False
-    for policy in results.policy_names():
-        rows = [r for r in results.rows if (r.policy, r.level, r.ablation) == (policy, level, "")]
-        counts = [(row.successes_oracle_horizon, row.episodes) for row in rows]
-        means.append(mean_of_rates(counts) if rows else None)
-        differs = differs or any(row.successes_oracle_horizon < row.successes for row in rows)
-    return means if differs else []
+    for row in results.rows:
+        if row.policy == policy and not row.ablation:
+            for kind, count in row.failures.items():
+                tasks.setdefault(kind, Counter())[row.task] += count
+    return dict(sorted(tasks.items(), key=lambda item: (-item[1].total(), item[0])))
 
 
 FAMILIES = (  # in the paper's order
@@ -160,33 +130,14 @@ def paper_tables(
         _mean_table(results, published=published),
         family_table(results, published=published),
         *[_task_table(results, policy) for policy in results.policy_names()],
-        published_task_table(results) if published else None,
+        *([result_table(results, published=True)] if has_published_tasks(results) and published else []),
         *ablation_tables(results),
         *map(_difference_table, comparisons),
     ]
-    tables = [table for table in chosen if table and table.lines]
+    tables = [table for table in chosen if table.lines]
     if confirmed:
         return [replace(table, caption=f"{table.caption} {_CONFIRMED}") for table in tables]
     return [replace(tables[0], caption=f"{tables[0].caption} {_UNCONFIRMED}"), *tables[1:]]
-
-
-def compact_tables(results: Results, *, published: bool = True) -> list[Table]:
-    """Means by level alone, the best policy of each level in bold; the oracle, an upper bound, is none."""
-    table = _mean_table(results, published=published and is_comparable(results))
-    rivals = [n for n in results.policy_names() if results.policies.get(n, {}).get("kind") != ORACLE]
-    best = [
-        max((cell.value for cell in column if isinstance(cell, Estimate)), default=None)
-        for column in zip(*(line.cells for line in table.lines if line.name in rivals), strict=True)
-    ]
-    lines = [
-        replace(line, cells=tuple(map(_emphasise, line.cells, best))) if line.name in rivals else line
-        for line in table.lines
-    ]
-    return [replace(table, lines=tuple(lines))]
-
-
-def _emphasise(cell: Estimate | str, best: float | None) -> Estimate | str:
-    return replace(cell, is_best=True) if isinstance(cell, Estimate) and cell.value == best else cell
 
 
 def _mean_table(results: Results, *, published: bool) -> Table:
@@ -200,35 +151,41 @@ def _mean_table(results: Results, *, published: bool) -> Table:
         f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
         f"{_made_of(results)}"
     )
-    elsewhere = published_rows(results, leading_models(), keep_marks=False) if published else []
+    elsewhere = published_rows(results, leading_models()) if published else []
     if elsewhere:
         for number, (name, cells) in enumerate(elsewhere):
             lines.append(Line(f"{name} (published)", cells, starts_group=number == 0))
         caption += (
             " Rows marked “published” were not measured here: they are those of the VIMA and MIDAS papers, "
             "in another simulator, over the same tasks. Means over all tasks of a level are mostly read off "
-            "figures, to about 0.2 points, those with ~ to about 0.5."
+            "figures, to about 0.2 points, those with ~ to about 0.5, or printed by the authors (*)."
         )
     return Table("levels", caption, ("policy", *levels), tuple(lines))
 
 
-def result_table(results: Results) -> Table:
-    """Success rates of all policies by level and task, with the mean of each level."""
-    policies = results.policy_names()
+def result_table(results: Results, *, published: bool = False) -> Table:
+    """Success rates of all policies by level and task, with the mean of each level.
+
+    Args:
+        results: The evaluation.
+        published: Whether to add the published rates by task.
+    """
+    policies, models = results.policy_names(), models_by_task() if published else []
     lines: list[Line] = []
     for level in results.levels():
         tasks = results.tasks(level)
         for task in tasks:
             rows = [results.row(policy, task, level) for policy in policies]
-            cells = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
-            lines.append(Line(level, (task, *cells), starts_group=bool(lines) and task == tasks[0]))
-        lines.append(Line(level, ("mean", *(_mean(results, policy, level) for policy in policies))))
-        if horizon := oracle_horizon_means(results, level):
-            cells = [Estimate(*mean) if mean else "–" for mean in horizon]
-            lines.append(Line(level, ("mean within the oracle's steps", *cells)))
+            own = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
+            elsewhere = [task_rate(model, level, task) for model in models]
+            starts = bool(lines) and task == tasks[0]
+            lines.append(Line(task, (level, *own, *elsewhere), starts_group=starts))
+        means = (_mean(results, policy, level) for policy in policies)
+        lines.append(Line("mean", (level, *means, *["–"] * len(models))))
     control = f", control {results.config['control']}" if "control" in results.config else ""
-    caption = f"success rates in % (95 % interval){control}"
-    return Table("results", caption, ("level", "task", *policies), tuple(lines))
+    about = f". {BY_TASK}" if published else ""
+    columns = ("task", "level", *policies, *(f"{model} {size} (published)" for model, size in models))
+    return Table("results", f"success rates in % (95 % interval){control}{about}", columns, tuple(lines))
 
 
 def ablations_by_policy(results: Results) -> dict[str, list[str]]:
@@ -242,7 +199,22 @@ def ablations_by_policy(results: Results) -> dict[str, list[str]]:
 
 def ablation_tables(results: Results) -> list[Table]:
     """Level means of each policy that was evaluated with input ablations, plain and under each of them."""
-    return [_ablation_table(results, *found) for found in ablations_by_policy(results).items()]
+    levels, tables = results.levels(), []
+    for policy, ablations in ablations_by_policy(results).items():
+        lines = [
+            Line(
+                ablation_name(ablation) if ablation else "none",
+                tuple(_mean(results, policy, level, ablation) for level in levels),
+            )
+            for ablation in ("", *ablations)
+        ]
+        caption = (
+            f"Success rates of {policy} (%) with input ablations, means over the tasks of each level, with "
+            "95 % intervals."
+        )
+        columns = ("ablation", *levels)
+        tables.append(Table(f"input-ablations-{policy}", caption, columns, tuple(lines)))
+    return tables
 
 
 def _task_table(results: Results, policy: str) -> Table:
@@ -256,22 +228,6 @@ def _task_table(results: Results, policy: str) -> Table:
     lines.append(Line("mean", tuple(means), starts_group=True))
     caption = f"Success rates of {policy} (%), with 95 % intervals. {_made_of(results, policy)}"
     return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
-
-
-def _ablation_table(results: Results, policy: str, ablations: Sequence[str]) -> Table:
-    levels = results.levels()
-    lines = [
-        Line(
-            ablation_name(ablation) if ablation else "none",
-            tuple(_mean(results, policy, level, ablation) for level in levels),
-        )
-        for ablation in ("", *ablations)
-    ]
-    caption = (
-        f"Success rates of {policy} (%) with input ablations, means over the tasks of each level, with "
-        "95 % intervals."
-    )
-    return Table(f"input-ablations-{policy}", caption, ("ablation", *levels), tuple(lines))
 
 
 def _difference_table(comparison: Comparison) -> Table:

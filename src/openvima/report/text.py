@@ -1,13 +1,11 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
-import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from openvima.evaluation.ablations import INPUT_ABLATIONS, names_in
 from openvima.evaluation.comparison import Comparison, Difference
-from openvima.evaluation.results import DECLARED, Results
+from openvima.evaluation.results import Results
 from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.report.published import unpublished_settings
 
@@ -222,28 +220,3 @@ def finding(comparison: Comparison, difference: Difference | None = None) -> str
         return f"On {where}, {a} − {b} is {size}: not significant."
     doubt = ", though not by the adjusted exact test" if difference.verdict == "unsure" else ""
     return f"On {where}, {a} is better than {b}: {size}{doubt}."
-
-
-@dataclass(frozen=True, slots=True)
-class Confirmation:
-    """Whether the outcomes of an evaluation were confirmed.
-
-    Args:
-        folder: Name of its folder, for the command that confirms it.
-        confirmed: Whether the folder holds the mark of `verify_results` for just these results.
-    """
-
-    folder: str
-    confirmed: bool
-
-    @property
-    def text(self) -> str:
-        """What is known, and how to check it, in two or three sentences."""
-        command = f"openvima verify-results {shlex.quote(self.folder)}"
-        if self.confirmed:
-            return (
-                "Confirmed by replay: with the recorded actions, every episode ends as stated. Declared, not "
-                f"proven: {DECLARED}. The mark is a file of the folder; if that came from elsewhere, it is a "
-                f"claim until {command} confirms it again."
-            )
-        return f"Not confirmed by replay. {command} plays the recorded actions again, without the policy."

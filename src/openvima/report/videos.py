@@ -18,7 +18,6 @@ from openvima.evaluation.verification import is_marked_verified
 from openvima.multiprocess import Report, imap_unordered
 from openvima.policies.naming import BUNDLED, METRICS_FILE, ORACLE, PolicyRef
 from openvima.report.page import default_command, write_report
-from openvima.report.text import Confirmation
 from openvima.video.encoder import Clip, load_clips, png, save_clips
 
 REPORT_NAME = "report.html"
@@ -103,9 +102,7 @@ def evaluate_and_report(
                 command=default_command(results, config.policies),
                 runs=find_metrics(served.sources),
                 clips=_recorded(recording_jobs(served, videos, results), served, note),
-                confirmations=[
-                    Confirmation("DIR", is_marked_verified(config.out)),
-                ],
+                confirmations={"DIR": is_marked_verified(config.out)},
             )
     return path
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -20,7 +19,6 @@ from openvima import __version__
 from openvima.errors import ConfigError, MessageError, OpenVimaError, echo
 from openvima.policies.base import Policy, PromptLimits
 from openvima.policies.loading import checked_policy
-from openvima.scene import RenderedPrompt
 from openvima.scene.action import CONTROLS, PRIMITIVES
 from openvima.serving.protocol import (
     DEFAULT_MODALITIES,
@@ -49,8 +47,6 @@ CLOSE_S = 2.0  # for the other side to say goodbye
 _LOG = logging.getLogger(__name__)
 _TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
 _TRANSPORT_LOG.setLevel(logging.CRITICAL)  # a traceback for every port scan; `serve_client` says what matters
-
-Answer = Callable[[], Any]  # calls the policy and returns the answer to one request
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +88,7 @@ class ServerConfig:
                 raise ConfigError(f"{name} is {value:g}; it must be a positive number.")
         if not self.token and not is_loopback(self.host):
             raise ConfigError(
-                f"host is {self.host!r}, which other machines may reach; give a token with --token or "
+                f"host is {self.host!r}, which other machines may reach; give a token in "
                 f"{TOKEN_VARIABLE}, or serve on 127.0.0.1 and let clients in through `ssh -L`."
             )
         check_prompts(self.prompts)
@@ -119,8 +115,9 @@ def check_can_listen(host: str, port: int) -> None:
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        with socket.create_server((host, port), family=family):
-            pass
+        with socket.socket(family) as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tried.bind((host, port))
     except (OSError, OverflowError) as error:
         raise ConfigError(f"cannot listen on {host}, port {port}: {error}; choose another one.") from error
 
@@ -128,9 +125,7 @@ def check_can_listen(host: str, port: int) -> None:
 class Session:
     """Answers the requests of one client.
 
-    A request is read and checked in one thread and answered in that of the policy, so one that is refused
-    delays other clients only briefly. No method raises: a refusal is a text, and the next request may be a
-    better one.
+    A refusal is a text, no exception: the next request may be a better one.
 
     Args:
         policy: Has no other user. Its `prompt_limits`, if any, bound the prompts.
@@ -146,40 +141,37 @@ class Session:
         self._prompts = prompts
         self._num_episodes = 0
 
-    def read(self, data: bytes | str) -> Answer | str:
-        """Read a request, whatever it is, and return what answers it; the policy is not called yet."""
+    def answer(self, data: bytes | str) -> bytes | str:
+        """Answer a request, whatever it is."""
         try:
-            return self._read(data)
+            return pack(self._answer(data))
         except OpenVimaError as error:
-            return _refusal(error)
-
-    def reply(self, answer: Answer) -> bytes | str:
-        """Call the policy for a request that `read` returned, and pack the answer."""
-        try:
-            return pack(answer())
-        except OpenVimaError as error:
-            return _refusal(error)
+            return echo(f"{type(error).__name__}: {error}", _MAX_REFUSAL)
         except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
             where = "\n".join(map(echo, traceback.format_exc().splitlines()))
             _LOG.error("the policy failed\n%s", where)
             return f"{POLICY_FAILED}{type(error).__name__}: {echo(str(error))}"
 
-    def _read(self, data: bytes | str) -> Answer:
+    def _answer(self, data: bytes | str) -> Any:
         if isinstance(data, str):
             raise MessageError("a text frame came in; requests are binary frames of MessagePack.")
         message = unpack(data)
-        if "type" not in check_form(message, dict, "the request"):
+        if "type" not in check_form(message, dict, "the request"):  # a step of a single episode
             prompt = message.pop("prompt", None)
-            sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
             observation = decode_observation(message, control=self._control)
-            return partial(self._infer, observation, self._decoded(sent))
+            if prompt is not None:
+                self._begin([{"text": prompt} if isinstance(prompt, str) else prompt])
+            return self._actions([observation])[0]
         if check_form(message["type"], ("reset", "act"), "type of the request") == "reset":
-            return partial(self._begin, self._decoded(self._listed(message, "prompts")))
+            self._begin(self._listed(message, "prompts"))
+            return {"type": "reset"}
         seen = self._listed(message, "observations")
-        observations = [
-            decode_observation(one, f"observation {n}", control=self._control) for n, one in enumerate(seen)
-        ]
-        return partial(self._act, observations)
+        actions = self._actions(
+            [decode_observation(one, f"observation {n}", control=self._control) for n, one in enumerate(seen)]
+        )
+        near_ties = getattr(self.policy, "near_ties", None)
+        extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
+        return {"type": "act", "actions": actions, **extra}
 
     def _listed(self, message: object, field: str) -> list:
         values = check_form(message, {"type": str, field: list}, "the request")[field]
@@ -190,25 +182,15 @@ class Session:
             )
         return values
 
-    def _decoded(self, sent: Sequence[object]) -> list[RenderedPrompt]:
+    def _begin(self, sent: Sequence[object]) -> None:
         prompts = [decode_prompt(prompt, f"prompt {n}") for n, prompt in enumerate(sent)]
         for prompt in prompts:
             self._limits.check(prompt)
-        return [describe(prompt, self._prompts) for prompt in prompts]
-
-    def _begin(self, prompts: Sequence[RenderedPrompt]) -> dict[str, Any]:
         if not prompts:
             raise MessageError("reset has no prompts; give one for each episode.")
         self._num_episodes = 0  # should the policy fail, there is nothing to go on with
-        self.policy.reset(prompts)
+        self.policy.reset([describe(prompt, self._prompts) for prompt in prompts])
         self._num_episodes = len(prompts)
-        return {"type": "reset"}
-
-    def _act(self, observations: Sequence[dict[str, Any] | None]) -> dict[str, Any]:
-        actions = self._actions(observations)
-        near_ties = getattr(self.policy, "near_ties", None)
-        extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
-        return {"type": "act", "actions": actions, **extra}
 
     def _actions(self, observations: Sequence[dict[str, Any] | None]) -> list[Any]:
         if not self._num_episodes:
@@ -224,16 +206,6 @@ class Session:
                 f"the policy gave {len(actions)} actions for {len(observations)} observations."
             )
         return actions
-
-    def _infer(self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]) -> Any:
-        """Act in a single episode, which an observation with a prompt begins."""
-        if prompts:
-            self._begin(prompts)
-        return self._actions([observation])[0]
-
-
-def _refusal(error: OpenVimaError) -> str:
-    return echo(f"{type(error).__name__}: {error}", _MAX_REFUSAL)
 
 
 def serve(
@@ -262,9 +234,10 @@ def serve(
         MissingExtraError: A package of the extra `serve` is missing.
         KeyboardInterrupt: By Ctrl-C, after all connections were closed.
     """
-    require_extra()
-    server = _PolicyServer(policy, ServerConfig(port=port, **settings), about or {})
-    asyncio.run(server.run(ready or (lambda url: None), asyncio.Event()))
+    with serve_in_thread(policy, port=port, about=about, **settings) as url:
+        if ready is not None:
+            ready(url)
+        threading.Event().wait()
 
 
 @contextmanager
@@ -292,7 +265,8 @@ def serve_in_thread(
         MissingExtraError: As for `serve`.
     """
     require_extra()
-    server = _PolicyServer(policy, ServerConfig(port=port, **settings), about or {})
+    server = _PolicyServer(policy, config := ServerConfig(port=port, **settings), about or {})
+    check_can_listen(config.host, config.port)
     started: Future[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
 
     async def run() -> None:
@@ -320,9 +294,8 @@ def serve_in_thread(
 class _PolicyServer:
     """A served policy.
 
-    Connections share one event loop, in which nothing takes long. Requests are read and checked in threads of
-    their own, and answered and packed in one other thread, so that policies need not be safe to use from
-    several.
+    Connections share one event loop, in which nothing takes long. Requests are answered in one other thread,
+    so that policies need not be safe to use from several.
     """
 
     def __init__(self, policy: Policy, config: ServerConfig, about: Mapping[str, Any]) -> None:
@@ -342,31 +315,20 @@ class _PolicyServer:
         from websockets.asyncio.server import serve
 
         config = self._config
-        threads = (config.num_threads,)
-        with (
-            ThreadPoolExecutor(2, "openvima-reading") as readers,
-            ThreadPoolExecutor(1, "openvima-policy", _set_threads, threads) as computing,
-        ):
-            self._readers, self._computing = readers, computing
-            try:
-                server = await serve(
-                    self._serve_client,
-                    config.host,
-                    config.port,
-                    process_request=self._admit,
-                    origins=[None],  # browsers name one: no page that somebody looks at may use the server
-                    compression=None,  # no message grows beyond the bytes that came in
-                    max_size=config.max_message_bytes,
-                    max_queue=1,
-                    ping_timeout=max(60.0, config.idle_s / 10),  # clients that compile code do not answer
-                    close_timeout=CLOSE_S,
-                    logger=_TRANSPORT_LOG,
-                )
-            except (OSError, OverflowError) as error:
-                raise ConfigError(
-                    f"cannot listen on {config.host}, port {config.port}: {error}; choose another one."
-                ) from error
-            async with server:
+        with ThreadPoolExecutor(1, "openvima-policy", _set_threads, (config.num_threads,)) as self._computing:
+            async with serve(
+                self._serve_client,
+                config.host,
+                config.port,
+                process_request=self._admit,
+                origins=[None],  # browsers name one: no page that somebody looks at may use the server
+                compression=None,  # no message grows beyond the bytes that came in
+                max_size=config.max_message_bytes,
+                max_queue=1,
+                ping_timeout=max(60.0, config.idle_s / 10),  # clients that compile code do not answer
+                close_timeout=CLOSE_S,
+                logger=_TRANSPORT_LOG,
+            ) as server:
                 ready(_address(server))
                 await stop.wait()
 
@@ -414,11 +376,7 @@ class _PolicyServer:
             async with asyncio.timeout(self._config.idle_s):
                 await connection.send(reply)
                 data = await connection.recv()
-            answer = await loop.run_in_executor(self._readers, session.read, data)
-            del data  # it may be large, and the policy may be busy with others
-            if not isinstance(answer, str):
-                answer = await loop.run_in_executor(self._computing, session.reply, answer)
-            reply = answer
+            reply = await loop.run_in_executor(self._computing, session.answer, data)
             if isinstance(reply, str):
                 _LOG.warning("%s: refused: %s", _name(connection), reply)
 

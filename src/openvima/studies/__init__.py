@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 from openvima.imports import lazy_names
 from openvima.studies.study import (
-    SCALES,
     Demonstrations,
     EvaluationSettings,
     PublishedPoint,
@@ -18,14 +17,12 @@ from openvima.studies.study import (
 
 if TYPE_CHECKING:
     from openvima.studies.library import STUDIES, check_options, make_study
-    from openvima.studies.runner import Execution, run_study
+    from openvima.studies.runner import run_study
 
 __all__ = [
-    "SCALES",
     "STUDIES",
     "Demonstrations",
     "EvaluationSettings",
-    "Execution",
     "PublishedPoint",
     "Run",
     "Scale",
@@ -41,7 +38,6 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "Execution": "runner",
         "run_study": "runner",
         "STUDIES": "library",
         "check_options": "library",

@@ -12,27 +12,18 @@ STUDY/study.json, report.html              results
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from openvima.data.subsets import SubsetConfig
 from openvima.errors import ConfigError
 from openvima.evaluation.config import EvaluationConfig
-from openvima.studies.study import Demonstrations, EvaluationSettings, Run, Settings, Study, StudyInputs
+from openvima.studies.study import Demonstrations, Run, Settings, Study, StudyInputs
 from openvima.training.config import TrainingConfig
 from openvima.training.recipes import override, recipe_settings
 
 COST_FILE = "cost.json"  # in the folder of a training that is done
-
-
-@dataclass(frozen=True, slots=True)
-class Subset:
-    """A fraction of a data set."""
-
-    source: Path
-    out: Path
-    fraction: float
-    seed: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,86 +54,63 @@ class Evaluation:
     config: EvaluationConfig
 
 
-@dataclass(frozen=True, slots=True)
+Subset = tuple[SubsetConfig, float]  # and the fraction
+
+
+@dataclass(slots=True)
 class Plan:
-    """All stages of a study, in order.
-
-    Args:
-        data: Folder of each data set.
-        subsets: Fractions of data sets.
-        initial: Trainings that others start from.
-        trainings: Trainings of the runs.
-        evaluations: Evaluations of the runs.
-    """
-
-    data: Mapping[Demonstrations, Path]
-    subsets: tuple[Subset, ...]
-    initial: tuple[Training, ...]
-    trainings: tuple[Training, ...]
-    evaluations: tuple[Evaluation, ...]
-
-    @property
-    def num_stages(self) -> int:
-        """Number of stages."""
-        return sum(map(len, (self.data, self.subsets, self.initial, self.trainings, self.evaluations)))
-
-
-def plan_study(
-    study: Study, inputs: StudyInputs, out: Path, *, seeds: int, device: str | None = None
-) -> Plan:
-    """Divide a study into stages; policies that exist have a single seed.
+    """All stages of a study, in order; what several runs share is planned once.
 
     Args:
         study: The study.
         inputs: What it was made from.
         out: Its folder.
-        seeds: Training seeds.
-        device: Where networks are trained and act; None trains on a GPU if there is one, and acts on a CPU.
-
-    Raises:
-        ConfigError: Settings are not allowed, or two labels give the same folder.
+        options: Settings of all evaluations, such as `device` and `workers`.
+        data: Folder of each data set.
+        subsets: Fractions of data sets, by folder.
+        initial: Trainings that others start from, by folder.
+        trainings: Trainings of the runs.
+        evaluations: Evaluations of the runs.
     """
-    if seeds < 1:
-        raise ConfigError(f"seeds is {seeds}; it must be at least 1.")
-    names = {run.label: _folder_name(run.label) for run in study.runs}
-    if len(set(names.values())) < len(names):
-        raise ConfigError(f"labels {', '.join(names)} give the same folders; choose others.")
-    planner = _Planner(study, inputs, out, device)
-    for run in study.runs:
-        for seed in range(seeds if run.policy is None else 1):
-            planner.add(run, names[run.label], seed)
-    return planner.plan()
 
+    study: Study
+    inputs: StudyInputs
+    out: Path
+    options: Mapping[str, Any]
+    data: dict[Demonstrations, Path] = field(default_factory=dict)
+    subsets: dict[Path, Subset] = field(default_factory=dict)
+    initial: dict[Path, Training] = field(default_factory=dict)
+    trainings: list[Training] = field(default_factory=list)
+    evaluations: list[Evaluation] = field(default_factory=list)
+    _kinds: list[tuple[Settings, Demonstrations]] = field(default_factory=list)  # of initial trainings
 
-class _Planner:
-    """Collects stages; what several runs share is planned once."""
+    @property
+    def all_trainings(self) -> list[Training]:
+        """Those that others start from, and those of the runs."""
+        return [*self.initial.values(), *self.trainings]
 
-    def __init__(self, study: Study, inputs: StudyInputs, out: Path, device: str | None) -> None:
-        self.study, self.inputs, self.out, self.device = study, inputs, out, device
-        self.data: dict[Demonstrations, Path] = {}
-        self.subsets: dict[Path, Subset] = {}
-        self.kinds: list[tuple[Settings, Demonstrations]] = []  # of initial trainings
-        self.initial: dict[Path, Training] = {}
-        self.trainings: list[Training] = []
-        self.evaluations: list[Evaluation] = []
-
-    def plan(self) -> Plan:
-        return Plan(
-            self.data,
-            tuple(self.subsets.values()),
-            tuple(self.initial.values()),
-            tuple(self.trainings),
-            tuple(self.evaluations),
-        )
+    @property
+    def num_stages(self) -> int:
+        """Number of stages."""
+        return sum(map(len, (self.data, self.subsets, self.all_trainings, self.evaluations)))
 
     def add(self, run: Run, name: str, seed: int) -> None:
-        """Plan a run and seed."""
+        """Plan a run and seed. Runs of one seed play the same episodes, each seed its own."""
         policy = run.policy
         if policy is None:
             policy = f"{name}={self._training(run, name, seed)}"
         settings = run.evaluation or self.study.evaluation
-        out = self.out / "evaluations" / name / f"seed-{seed}"
-        config = _evaluation_config(settings, policy, out, seed, self.device)
+        config = EvaluationConfig(
+            policies=(policy,),
+            tasks=settings.tasks,
+            levels=settings.levels,
+            episodes=settings.episodes,
+            seed=seed * settings.episodes,
+            out=self.out / "evaluations" / name / f"seed-{seed}",
+            env_config=settings.env_config,
+            ablations=settings.ablations,
+            **self.options,
+        )
         self.evaluations.append(Evaluation(run, seed, config))
 
     def _training(self, run: Run, name: str, seed: int) -> Path:
@@ -158,9 +126,9 @@ class _Planner:
 
     def _initial(self, settings: Settings, of: Demonstrations, data: Path, seed: int) -> Path:
         kind = (settings, of)
-        if kind not in self.kinds:
-            self.kinds.append(kind)
-        out = self.out / "initial" / str(1 + self.kinds.index(kind)) / f"seed-{seed}"
+        if kind not in self._kinds:
+            self._kinds.append(kind)
+        out = self.out / "initial" / str(1 + self._kinds.index(kind)) / f"seed-{seed}"
         self.initial[out] = Training(self._config(settings, data, out, seed))
         return out
 
@@ -169,7 +137,7 @@ class _Planner:
         if fraction == 1:
             return source
         out = source.with_name(f"{source.name}-{fraction:g}-seed-{seed}")
-        self.subsets[out] = Subset(source, out, fraction, seed)
+        self.subsets[out] = SubsetConfig(source, out, seed=seed), fraction
         return out
 
     def _config(self, settings: Settings, data: Path, out: Path, seed: int) -> TrainingConfig:
@@ -178,25 +146,36 @@ class _Planner:
         for others in (scale.settings, self.study.settings, settings):
             merged = override(merged, others)
         paths = {"data": data, "out": out, "seed": seed, "assets": inputs.assets}
-        device = {} if self.device is None else {"runtime.device": self.device}
+        device = {"runtime.device": self.options["device"]} if "device" in self.options else {}
         return TrainingConfig.of({**merged, **paths, **device})
 
 
-def _evaluation_config(
-    settings: EvaluationSettings, policy: str, out: Path, seed: int, device: str | None
-) -> EvaluationConfig:
-    """Each training seed is evaluated on episodes of its own; those of one seed are the same for all runs."""
-    return EvaluationConfig(
-        policies=(policy,),
-        tasks=settings.tasks,
-        levels=settings.levels,
-        episodes=settings.episodes,
-        seed=seed * settings.episodes,
-        out=out,
-        env_config=settings.env_config,
-        ablations=settings.ablations,
-        device=device or "cpu",
-    )
+def plan_study(
+    study: Study, inputs: StudyInputs, out: Path, *, seeds: int, device: str | None = None, **options: Any
+) -> Plan:
+    """Divide a study into stages; policies that exist have a single seed.
+
+    Args:
+        study: The study.
+        inputs: What it was made from.
+        out: Its folder.
+        seeds: Training seeds.
+        device: Where networks are trained and act; None trains on a GPU if there is one, and acts on a CPU.
+        **options: `workers`, `engine` and `address`, as for `run_study`.
+
+    Raises:
+        ConfigError: Settings are not allowed, or two labels give the same folder.
+    """
+    if seeds < 1:
+        raise ConfigError(f"seeds is {seeds}; it must be at least 1.")
+    names = {run.label: _folder_name(run.label) for run in study.runs}
+    if len(set(names.values())) < len(names):
+        raise ConfigError(f"labels {', '.join(names)} give the same folders; choose others.")
+    plan = Plan(study, inputs, out, options if device is None else {**options, "device": device})
+    for run in study.runs:
+        for seed in range(seeds if run.policy is None else 1):
+            plan.add(run, names[run.label], seed)
+    return plan
 
 
 def _folder_name(label: str) -> str:

@@ -16,11 +16,11 @@ from openvima.evaluation.statistics import (
 from openvima.html import render_page
 from openvima.input_files import read_json
 from openvima.report import text
-from openvima.report.figures import RateCurve, RateFigure, RatePoint, rate_figure_html
+from openvima.report.figures import RateFigure, RatePoint, rate_figure_html
 from openvima.report.published import RELIABILITY
 from openvima.report.text import ablation_name
 from openvima.studies.plan import COST_FILE, Plan
-from openvima.studies.study import Run, Study, StudyInputs
+from openvima.studies.study import PublishedPoint, Run, Study, StudyInputs
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +106,8 @@ def _position(study: Study, run: Run, level: str, ablation: str) -> float | str:
     if study.x_axis == "ablation":
         return ablation_name(ablation) or "as it is"
     if study.x_axis == "rate":
-        return _rate(ablation)
+        return sum(part.rate for part in ablation_parts(ablation))
     return run.label if run.x == "" else run.x
-
-
-def _rate(ablation: str) -> float:
-    """Return the number in the name of an ablation; 0 without one."""
-    return sum(part.rate for part in ablation_parts(ablation))
 
 
 def _difference(outcomes: Sequence[_Outcomes], others: Sequence[_Outcomes]) -> tuple[float, Interval] | None:
@@ -148,12 +143,9 @@ def _ablations(results: Sequence[Results]) -> list[str]:
 def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:
     """Read the costs of the trainings, by label; those that others start from under an empty one."""
     costs: dict[str, list[dict[str, Any]]] = {}
-    for training in (*plan.initial, *plan.trainings):
+    for training in plan.all_trainings:
         costs.setdefault(training.run, []).append(read_json(training.config.out / COST_FILE))
     return costs
-
-
-_MAX_NAMED = 6  # means in the first sentence
 
 
 def study_page(
@@ -176,23 +168,23 @@ def study_page(
         command: The command that repeats the study.
     """
     levels = list(dict.fromkeys(point.level for point in points))
+    figure = study_figure(study, points)
     return render_page(
         "study",
         study=study,
         scale=inputs.scale,
         num_seeds=max(len(point.score.seeds) for point in points),
         levels=levels,
-        figure=rate_figure_html(study_figure(study, points)),
+        figure=rate_figure_html(figure),
         rows=_rows(points),
+        published_rows=_published_rows(study, figure),
         tasks={level: max((p.tasks for p in points if p.level == level), key=len) for level in levels},
         points=points,
-        costs={label: _mean_costs(of_run) for label, of_run in costs.items()},
+        costs=costs,
         reliability=RELIABILITY if study.published else "",
         versions=versions,
         command=command,
-        summary=_summary(points),
         text=text,
-        duration=duration,
     )
 
 
@@ -203,9 +195,9 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
     """
     values = list(dict.fromkeys([p.x for p in points] + [p.x for p in study.published]))
     named = any(isinstance(value, str) for value in values)
-    panels = {}
+    panels: dict[str, dict[tuple[str, bool], list[RatePoint]]] = {}
     for level in [""] if study.x_axis == "level" else dict.fromkeys(point.level for point in points):
-        curves: dict[tuple[str, bool], list[RatePoint]] = {}
+        curves = panels.setdefault(level or "All levels", {})
         for point in points:
             if level in ("", point.level):
                 score, x = point.score, _number(point.x, values, named)
@@ -214,14 +206,11 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
                 curves.setdefault((point.series or "this study", False), []).append(found)
         for point in study.published:
             if level in ("", point.level):
-                found = RatePoint(_number(point.x, values, named), point.rate, mark=point.mark)
+                found = RatePoint(_number(point.x, values, named), point.rate)
                 curves.setdefault((point.series, True), []).append(found)
-        panels[level or "All levels"] = tuple(
-            RateCurve(name, tuple(sorted(of_name, key=lambda point: point.x)), published)
-            for (name, published), of_name in curves.items()
-        )
+        for of_name in curves.values():
+            of_name.sort(key=lambda point: point.x)
     return RateFigure(
-        label="study",
         caption=study.question,
         quantity=study.quantity,
         panels=panels,
@@ -243,32 +232,11 @@ def _rows(points: Sequence[Point]) -> dict[tuple[str, str], dict[str, Point]]:
     return rows
 
 
-def _mean_costs(costs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Costs of one run: of a training, on average over its seeds."""
-    seconds = [cost["cpu_seconds"] for cost in costs]
-    return {**costs[0], "cpu_seconds": sum(seconds) / len(seconds), "total": sum(seconds)}
-
-
-def _summary(points: Sequence[Point]) -> str:
-    """The first means of the first level as a sentence."""
-    first = points[0].level
-    means = [
-        f"{' · '.join(filter(None, (p.run, text.ablation_name(p.ablation))))}: {text.percent(p.score.mean)}"
-        for p in points
-        if p.level == first
-    ]
-    more = f", and {len(means) - _MAX_NAMED} more" if len(means) > _MAX_NAMED else ""
-    return f"Solved episodes on {first}: {', '.join(means[:_MAX_NAMED])}{more}."
-
-
-def duration(seconds: float) -> str:
-    """Write a time with a fitting unit.
-
-    Example:
-        >>> duration(95), duration(7300)
-        ('1.6 min', '2.0 h')
-    """
-    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds:.0f} s"
+def _published_rows(study: Study, figure: RateFigure) -> dict[str, dict[str, PublishedPoint]]:
+    """Published numbers by the name of their row, then by level."""
+    rows: dict[str, dict[str, PublishedPoint]] = {}
+    for point in study.published:
+        x = point.x if isinstance(point.x, str) else figure.tick(point.x)
+        name = point.series if x == point.level else f"{point.series} · {x}"
+        rows.setdefault(name, {})[point.level] = point
+    return rows

@@ -1,24 +1,25 @@
 """Running a study: stage after stage, each of which resumes after any kill."""
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from openvima.atomic_io import atomic_write_file, folder_lock, is_lock_file
 from openvima.catalog.packs import load_assets
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.manifest import is_finished
-from openvima.data.subsets import SubsetConfig, sample
+from openvima.data.subsets import sample
 from openvima.errors import ConfigError, InputFileError, differences
+from openvima.evaluation.config import Engine
 from openvima.evaluation.results import Results
 from openvima.evaluation.runner import evaluate, prepare
 from openvima.input_files import as_path, read_json
-from openvima.multiprocess import Report, check_workers, engine_problems, imap_with_engine
+from openvima.multiprocess import Report, imap_with_engine
 from openvima.policies.base import require_torch
 from openvima.report.videos import require_extra
-from openvima.studies.plan import COST_FILE, Evaluation, Plan, Subset, Training, plan_study, record_of
+from openvima.studies.plan import COST_FILE, Plan, Training, plan_study, record_of
 from openvima.studies.results import study_costs, study_page, study_points
 from openvima.studies.study import Demonstrations, Study, StudyInputs
 from openvima.training.validation import flatten
@@ -31,36 +32,6 @@ _MAX_DIFFERENCES = 3  # in a message
 _MAX_SETTINGS_BYTES = 1 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class Execution:
-    """How a study is run; nothing of it changes the results.
-
-    Args:
-        workers: Trainings at a time, of one thread each, and processes of generating and evaluating; None is
-            one, or all CPUs of the Ray cluster at `address`.
-        engine: "processes" of this machine, or "ray".
-        address: Ray cluster, whose machines share the folder; None starts Ray on this machine.
-    """
-
-    workers: int | None = None
-    engine: Literal["processes", "ray"] = "processes"
-    address: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.workers is not None:
-            check_workers(self.workers)
-        for problem in engine_problems(self.engine, self.address):
-            raise ConfigError(problem)
-
-    @property
-    def is_serial(self) -> bool:
-        """Whether all work is done in this process."""
-        return self.engine == "processes" and self.workers in (None, 1)
-
-
-DEFAULT_EXECUTION = Execution()
-
-
 def run_study(
     study: Study,
     inputs: StudyInputs,
@@ -68,7 +39,9 @@ def run_study(
     *,
     seeds: int = 1,
     device: str | None = None,
-    execution: Execution = DEFAULT_EXECUTION,
+    workers: int | None = None,
+    engine: Engine = "processes",
+    address: str | None = None,
     command: str = "",
     report: Report | None = None,
 ) -> Path:
@@ -80,7 +53,10 @@ def run_study(
         out: Its folder.
         seeds: Training seeds; more can be added later.
         device: As for `plan_study`.
-        execution: Processes, or Ray.
+        workers: Trainings at a time, of one thread each, and processes of generating and evaluating; None is
+            one, or all CPUs of the Ray cluster at `address`.
+        engine: "processes" of this machine, or "ray".
+        address: Ray cluster, whose machines share the folder; None starts Ray on this machine.
         command: The command, for the page.
         report: Called with stages done, stages in all and a note.
 
@@ -94,12 +70,13 @@ def run_study(
         OpenVimaError: As for `generate`, `train` and `evaluate`.
     """
     out = as_path(out).absolute()
-    plan = plan_study(study, inputs, out, seeds=seeds, device=device)
+    how: dict[str, Any] = {"workers": workers, "engine": engine, "address": address}
+    plan = plan_study(study, inputs, out, seeds=seeds, device=device, **how)
     check_plan(plan, inputs)
     with folder_lock(out):
         record = record_of(study, inputs, device)
         _claim(out, record)
-        _Runner(plan, execution, report or (lambda *_: None)).run()
+        _Runner(plan, how, report or (lambda *_: None)).run()
         return _write(study, inputs, plan, out, record, command)
 
 
@@ -136,7 +113,7 @@ def check_plan(plan: Plan, inputs: StudyInputs) -> None:
         require_torch("training")
         from openvima.training.building import resolve
 
-        for training in (*plan.initial, *plan.trainings):
+        for training in plan.all_trainings:
             resolve(training.config)
     for evaluation in plan.evaluations:
         if evaluation.run.policy is not None:
@@ -169,22 +146,29 @@ def _claim(out: Path, record: dict[str, Any]) -> None:
 class _Runner:
     """Runs the stages that are not done."""
 
-    def __init__(self, plan: Plan, execution: Execution, report: Report) -> None:
-        self.plan, self.execution, self.report = plan, execution, report
+    def __init__(self, plan: Plan, how: Mapping[str, Any], report: Report) -> None:
+        self.plan, self.how, self.report = plan, how, report
         self.done = 0
 
     def run(self) -> None:
         for demonstrations, out in self.plan.data.items():
-            self._generate(demonstrations, out)
+            if not is_finished(out):
+                config = replace(_generate_config(demonstrations, out), **self.how)
+                generate(config, lambda done, total, _: self._say(f"generating, {done:,} of {total:,}"))
             self._finish(f"demonstrations in {out.name}")
-        for subset in self.plan.subsets:
-            self._sample(subset)
-            self._finish(f"{subset.out.name}")
-        self._train(self.plan.initial)
+        for out, subset in self.plan.subsets.items():
+            if not is_finished(out):
+                sample(*subset, report=lambda d, t, _: self._say(f"sampling, {d:,} of {t:,}"))
+            self._finish(out.name)
+        self._train(list(self.plan.initial.values()))
         self._train(self.plan.trainings)
         for evaluation in self.plan.evaluations:
-            self._evaluate(evaluation)
-            self._finish(f"evaluated {evaluation.run.label}, seed {evaluation.seed}")
+            name = f"{evaluation.run.label}, seed {evaluation.seed}"
+            evaluate(
+                evaluation.config,
+                lambda d, t, _, of=name: self._say(f"evaluating {of}: {d:,} of {t:,} episodes"),
+            )
+            self._finish(f"evaluated {name}")
 
     def _finish(self, note: str) -> None:
         self.done += 1
@@ -193,18 +177,6 @@ class _Runner:
     def _say(self, note: str) -> None:
         self.report(self.done, self.plan.num_stages, note)
 
-    def _generate(self, demonstrations: Demonstrations, out: Path) -> None:
-        if is_finished(out):
-            return
-        config = replace(_generate_config(demonstrations, out), **asdict(self.execution))
-        generate(config, lambda done, total, _: self._say(f"generating, {done:,} of {total:,}"))
-
-    def _sample(self, subset: Subset) -> None:
-        if is_finished(subset.out):
-            return
-        config = SubsetConfig(subset.source, subset.out, seed=subset.seed)
-        sample(config, subset.fraction, report=lambda d, t, _: self._say(f"sampling, {d:,} of {t:,}"))
-
     def _train(self, trainings: Sequence[Training]) -> None:
         missing = []
         for training in trainings:
@@ -212,7 +184,7 @@ class _Runner:
                 self._finish(_described(training))
             else:
                 missing.append(training)
-        if self.execution.is_serial:
+        if self.how["engine"] == "processes" and self.how["workers"] in (None, 1):
             for training in missing:  # with its progress
                 _train(
                     training,
@@ -220,14 +192,9 @@ class _Runner:
                 )
                 self._finish(_described(training))
             return
-        how = self.execution
-        for training, _ in imap_with_engine(how.engine, train_one, missing, how.workers, address=how.address):
+        engine, workers, address = (self.how[name] for name in ("engine", "workers", "address"))
+        for training, _ in imap_with_engine(engine, train_one, missing, workers, address=address):
             self._finish(_described(training))
-
-    def _evaluate(self, evaluation: Evaluation) -> None:
-        config = replace(evaluation.config, **asdict(self.execution))
-        name = f"evaluating {evaluation.run.label}, seed {evaluation.seed}"
-        evaluate(config, lambda d, t, _: self._say(f"{name}: {d:,} of {t:,} episodes"))
 
 
 def train_one(training: Training, count: Callable[[int], None]) -> None:

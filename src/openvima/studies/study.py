@@ -77,32 +77,24 @@ _NANO = Scale(
 )
 
 
-def _published(size: str) -> Scale:
-    """Everything as in the papers, save the size of the network."""
+def scale_named(name: str) -> Scale:
+    """Return a scale: nano, or everything as in the papers, save the size of the network.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    if name == NANO:
+        return _NANO
+    if name not in SIZE_NAMES:
+        raise ConfigError(unknown_name("scale", name, SIZE_NAMES))
     return Scale(
-        name=size,
+        name=name,
         recipe="paper",
         settings=MappingProxyType({"schedule.steps": 47_000}),  # 10 epochs of 600,000, in batches of 128
         tasks=TRAINING_TASKS,
         new_tasks=L4_TASKS,
         demonstrations=50_000,
     )
-
-
-SCALES: Mapping[str, Scale] = MappingProxyType(
-    {NANO: _NANO, **{size: _published(size) for size in SIZE_NAMES if size != NANO}}
-)
-
-
-def scale_named(name: str) -> Scale:
-    """Return a scale.
-
-    Raises:
-        ConfigError: There is none of that name.
-    """
-    if name not in SCALES:
-        raise ConfigError(unknown_name("scale", name, SCALES))
-    return SCALES[name]
 
 
 Settings = Mapping[str, Any]  # of `TrainingConfig`, by dotted name
