@@ -15,7 +15,7 @@ from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter
 from openvima.data.encoding import ShardInfo
 from openvima.data.lerobot import LerobotConfig, export_lerobot
 from openvima.data.manifest import MANIFEST_NAME, finish_folder, manifest_checksum
-from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
+from openvima.data.subsets import MergeConfig, SubsetConfig, merge, sample, split
 from openvima.errors import DatasetError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.perception.preprocessing import ObjectTable
@@ -70,7 +70,7 @@ def folder_writers(source: Path, out: Path) -> tuple[Callable[[], object], ...]:
     return (
         lambda: merge(MergeConfig((source,), out)),
         lambda: sample(SubsetConfig(source, out), 1.0),
-        lambda: split(SubsetConfig(source, out), Splits({"a": 0.5, "b": 0.5})),
+        lambda: split(SubsetConfig(source, out), {"a": 0.5, "b": 0.5}),
         lambda: export_lerobot(LerobotConfig(source, out)),
     )
 

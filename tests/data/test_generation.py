@@ -55,9 +55,9 @@ def test_a_finished_folder_is_left_alone(whole: Path) -> None:
         ({"level": "L2"}, "level is train, asked for is L2"),
         ({"start_seed": 5}, "first_seed is 0, asked for is 5"),
         ({"env_config": EnvConfig(prompts="mixed")}, "prompts is multimodal, asked for is mixed"),
-        ({"episodes": 2}, "it has episodes beyond the 2 a task that are asked for"),
-        ({"episodes": 1}, "it has 2 episodes, asked for are 1"),
-        ({"tasks": ("rotate",)}, "its task sweep_without_exceeding is not asked for"),
+        ({"episodes": 2}, "of its 1 episodes 0 are asked for"),
+        ({"episodes": 1}, "of its 2 episodes 1 are asked for"),
+        ({"tasks": ("rotate",)}, "of its 2 episodes 0 are asked for"),
         ({"images": False}, "images is True, asked for is False"),
     ],
 )
@@ -151,7 +151,7 @@ def test_a_dataset_can_be_narrowed_to_tasks(whole: Path) -> None:
     assert dataset.index.num_rows == 3
     with pytest.raises(DatasetError, match="Did you mean 'rotate'"):
         Dataset(whole, tasks=["rotat"])
-    with pytest.raises(DatasetError, match=r"no task is named; .* has rotate, sweep_without_exceeding\."):
+    with pytest.raises(DatasetError, match=r"no task is named; in .* are rotate, sweep_without_exceeding\."):
         Dataset(whole, tasks=[])
 
 

@@ -17,7 +17,6 @@ from openvima.data.manifest import finish_folder
 from openvima.data.reader import DemonstrationQuery, find_demonstrations
 from openvima.data.subsets import (
     MergeConfig,
-    Splits,
     SubsetConfig,
     assign_splits,
     merge,
@@ -31,7 +30,7 @@ from small_data_sets import contents, flip_bit
 
 MadeUp = Callable[..., Demonstration]
 WriteFolder = Callable[..., Path]
-HALVES = Splits({"a": 0.5, "b": 0.5})
+HALVES = {"a": 0.5, "b": 0.5}
 
 
 @pytest.fixture
@@ -119,7 +118,7 @@ def test_the_episodes_of_a_sample_are_these() -> None:
 
 def test_parts_are_disjoint_complete_and_nearly_of_their_shares() -> None:
     index = index_of(5000)
-    chosen = assign_splits(index, Splits({"training": 0.9, "validation": 0.07, "test": 0.03}), 0)
+    chosen = assign_splits(index, {"training": 0.9, "validation": 0.07, "test": 0.03}, 0)
     assert (sum(mask.astype(int) for mask in chosen.values()) == 1).all()
     fractions = [mask.mean() for mask in chosen.values()]
     assert np.allclose(fractions, (0.9, 0.07, 0.03), atol=0.01)
@@ -196,7 +195,7 @@ def test_a_merge_holds_all_episodes_in_either_order_of_the_sources(
     first, second = write_folder(tmp_path / "1"), write_folder(tmp_path / "2", range(6, 9))
     folder = merge(MergeConfig((first, second), tmp_path / "all"))
     assert episodes(folder) == sorted(episodes(first) + episodes(second))
-    assert [demo.seed for demo in Dataset(folder, tasks=["rotate"])] == list(range(9))
+    assert sorted(demo.seed for demo in Dataset(folder, tasks=["rotate"])) == list(range(9))
     other = merge(MergeConfig((second, first), tmp_path / "again"))
     assert contents(other) == contents(folder)
 
@@ -302,7 +301,9 @@ def test_the_command_line_samples_splits_and_merges(
     assert main(["data", "sample", str(source), str(tmp_path / "t"), "--fraction", "1", "--tasks", ","]) == 2
     assert capsys.readouterr().err.startswith("openvima: DatasetError: no task is named; ")
     assert main(["data", "merge", str(source), str(tmp_path / "t"), "--tasks", ","]) == 2
-    assert capsys.readouterr().err.startswith("openvima: DatasetError: no task is named; the sources have ")
+    assert capsys.readouterr().err.startswith(
+        "openvima: DatasetError: no task is named; in the sources are rotate, stack."
+    )
 
 
 @pytest.fixture(scope="module")

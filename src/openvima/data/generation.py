@@ -1,14 +1,15 @@
 """Generating demonstrations: what a folder holds already, the rollouts, the finished data set."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 from openvima.atomic_io import FINISH_S, folder_lock, parts_in_range
-from openvima.data.encoding import ShardInfo, SkipKind, Skipped
+from openvima.data.encoding import SkipKind, Skipped
 from openvima.data.manifest import (
     MANIFEST_NAME,
+    check_shards,
     clear,
     finish_folder,
     is_finished,
@@ -40,30 +41,6 @@ def is_done(block: Block) -> bool:
     return block.path.is_file() and len(Shard(block.path)) == block.episodes
 
 
-def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
-    """Refuse a folder whose shards do not belong to the data set that is asked for.
-
-    Raises:
-        DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
-        DatasetError: A shard is damaged.
-    """
-    _check_origin(config.out)
-    wanted = {block.path.name: block for block in blocks}
-    for path in sorted(config.out.glob("*.arrow")):
-        shard = Shard(path)
-        problems = shard.info.differences(blocks[0].info)
-        block = wanted.get(path.name)
-        if block is None and not problems:
-            problems = [_explain_surplus(shard.info, config)]
-        if block is not None and len(shard) > block.episodes:
-            problems.append(f"it has {len(shard)} episodes, asked for are {block.episodes}")
-        if problems:
-            raise DatasetError(
-                f"{path} belongs to another data set, or to a larger one: {'; '.join(problems)}. "
-                "Give its settings, another --out, or --force to delete it."
-            )
-
-
 def _check_origin(folder: Path) -> None:
     """Refuse what other commands made: shards of a sample say the same of themselves, with other episodes."""
     if not (folder / MANIFEST_NAME).is_file():
@@ -74,12 +51,6 @@ def _check_origin(folder: Path) -> None:
             f"{folder} belongs to another data set: `{manifest['command']}` made it. "
             "Give another --out, or --force to delete it."
         )
-
-
-def _explain_surplus(found: ShardInfo, config: GenerateConfig) -> str:
-    if found.task in config.resolved_tasks():
-        return f"it has episodes beyond the {config.episodes} a task that are asked for"
-    return f"its task {found.task} is not asked for"
 
 
 def write_block(block: Block, count: Callable[[int], None]) -> None:
@@ -93,21 +64,26 @@ def write_block(block: Block, count: Callable[[int], None]) -> None:
         OracleError: The oracle solved too few of the block's episodes.
         DatasetError: A record that is to be copied is damaged.
     """
-    num_kept, skipped = 0, []
+    num_kept, next_seed, skipped, reason = 0, block.seeds.start, [], ""
+    env = _env(block.info.task, block.info.level, block.env_config)
     with ShardWriter(block.path, block.info) as kept:
         if block.path.is_file():
             num_kept, next_seed = _copy_records(block.path, kept)
-            rest = range(next_seed, block.seeds.stop)
-            block = replace(block, episodes=block.episodes - num_kept, seeds=rest)
-        for rollout in rollouts(block):
+        for seed in range(next_seed, block.seeds.stop):
+            rollout = attempt(env, seed)
             if isinstance(rollout, Skipped):
                 skipped.append(rollout)
-            elif rollout.outcome.success:
+                reason = rollout.reason
+            else:
                 kept.write(rollout, skipped)
                 num_kept, skipped = num_kept + 1, []
-            else:
-                skipped.append(explain_skip(rollout))
             count(num_kept)
+            if num_kept == block.episodes:
+                return
+        raise OracleError(
+            f"the oracle solved {num_kept} of {len(block.seeds)} episodes of {block.info.task!r} at level "
+            f"{block.info.level}, {block.episodes} were needed; the last one failed: {reason}."
+        )
 
 
 def _copy_records(path: Path, writer: ShardWriter) -> tuple[int, int]:
@@ -126,49 +102,18 @@ def _copy_records(path: Path, writer: ShardWriter) -> tuple[int, int]:
     return len(shard), next_seed
 
 
-def rollouts(block: Block) -> Iterator[Demonstration | Skipped]:
-    """Roll out seeds until enough of them are solved.
-
-    Args:
-        block: Its seeds and number of episodes.
-
-    Yields:
-        The result of `attempt` for each seed; the last one is solved.
-
-    Raises:
-        OracleError: The seeds ran out.
-    """
-    env = _env(block.info.task, block.info.level, block.env_config)
-    num_solved, reason = 0, ""
-    for seed in block.seeds:
-        rollout = attempt(env, seed)
-        yield rollout
-        if isinstance(rollout, Skipped) or not rollout.outcome.success:
-            reason = (rollout if isinstance(rollout, Skipped) else explain_skip(rollout)).reason
-            continue
-        num_solved += 1
-        if num_solved == block.episodes:
-            return
-    raise OracleError(
-        f"the oracle solved {num_solved} of {len(block.seeds)} episodes of {block.info.task!r} at level "
-        f"{block.info.level}, {block.episodes} were needed; the last one failed: {reason}."
-    )
-
-
 def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
-    """Roll out one episode, solved or not; return the reason if there is none."""
+    """Roll out one episode; return the reason if it gives no demonstration."""
     try:
-        return rollout_oracle(env, seed)
+        demo = rollout_oracle(env, seed)
     except SamplingError as error:
         return Skipped(seed, "not_sampled", str(error))
     except OracleError as error:
         return Skipped(seed, "no_action", str(error))
-
-
-def explain_skip(demo: Demonstration) -> Skipped:
-    """Return the reason why an unsolved episode is skipped."""
+    if demo.outcome.success:
+        return demo
     kind: SkipKind = "failed" if demo.outcome.failure else "unsolved"
-    return Skipped(demo.seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
+    return Skipped(seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
 
 
 @lru_cache(maxsize=4)
@@ -207,7 +152,8 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
         with folder_lock(config.out, config.shard_range):
             if config.force:
                 clear(config.out)
-            check_folder(config, blocks)
+            _check_origin(config.out)
+            check_shards(config.out, {block.path.name: (block.info, block.episodes) for block in blocks})
             _write_missing(config, own, report)
             if config.shard_range is None and not is_finished(config.out):
                 finish(config, blocks)

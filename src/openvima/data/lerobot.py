@@ -35,12 +35,10 @@ from openvima.input_files import settle
 from openvima.multiprocess import Report
 from openvima.render import channels_last
 from openvima.scene.action import CONTROL_HZ, END_EFFECTOR, PRIMITIVES
-from openvima.video.encoder import import_av, open_video
+from openvima.video.encoder import VideoWriter, import_av
 
 CODEBASE_VERSION = "v3.0"
-FILES_PER_CHUNK = 1000
-EPISODES_PER_FILE = 1000  # of both tables: tens of MB
-VIDEO_FILE_MB = 200
+EPISODES_PER_FILE = 1000  # of tables and videos
 
 INFO_PATH = "meta/info.json"
 STATISTICS_PATH = "meta/stats.json"
@@ -59,23 +57,22 @@ def numbered_path(folder: Path, pattern: str, number: int, **names: str) -> Path
 
     Args:
         folder: The data set.
-        pattern: One of the patterns above.
-        number: From 0; chunks of `FILES_PER_CHUNK` files share a folder.
+        pattern: One of the patterns above; all files are in the first chunk.
+        number: From 0.
         **names: What else the pattern asks for.
     """
-    chunk, file = divmod(number, FILES_PER_CHUNK)
-    path = folder / pattern.format(chunk_index=chunk, file_index=file, **names)
+    path = folder / pattern.format(chunk_index=0, file_index=number, **names)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
 def _place(prefix: str, number: int) -> dict[str, int]:
     """Return the entries of an episode that say in which file it is."""
-    chunk, file = divmod(number, FILES_PER_CHUNK)
-    return {f"{prefix}/chunk_index": chunk, f"{prefix}/file_index": file}
+    return {f"{prefix}/chunk_index": 0, f"{prefix}/file_index": number}
 
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_BRIGHTNESS = np.arange(256) / 255
 
 Statistics = dict[str, np.ndarray]
 
@@ -90,17 +87,9 @@ def value_statistics(values: np.ndarray) -> Statistics:
         "min" and "max" in the dtype of the values, "mean", "std" and the quantiles in float64, all of shape
         (D,), and "count", shape (1,).
     """
-    table = values.reshape(len(values), -1)
-    ordered = np.sort(table, axis=0)
-    ranks = {name: _rank(share, len(table)) for name, share in QUANTILES.items()}
-    return {
-        "min": ordered[0],
-        "max": ordered[-1],
-        "mean": table.mean(axis=0, dtype=np.float64),
-        "std": table.std(axis=0, dtype=np.float64),
-        "count": np.array([len(table)]),
-        **{name: ordered[rank].astype(np.float64) for name, rank in ranks.items()},
-    }
+    columns = values.reshape(len(values), -1).T
+    counted = [np.unique(column, return_counts=True) for column in columns]
+    return _statistics(counted, len(values), (len(columns),))
 
 
 def count_pixels(pictures: np.ndarray, num_frames: int) -> np.ndarray:
@@ -113,39 +102,38 @@ def count_pixels(pictures: np.ndarray, num_frames: int) -> np.ndarray:
     Returns:
         Shape (3, 256), int64.
     """
-    counts = np.zeros((3, 256), np.int64)
-    if not pictures.any():  # most prompts have fewer images than the longest
-        counts[:, 0] = num_frames * pictures[0, 0].size
-        return counts
-    for channel in range(3):
-        counts[channel] = np.bincount(pictures[:, channel].reshape(-1), minlength=256)
-    return counts * (num_frames // len(pictures))
+    channels = pictures.swapaxes(0, 1)
+    counts = [np.bincount(channel.reshape(-1), minlength=256) for channel in channels]
+    return np.stack(counts) * (num_frames // len(pictures))
 
 
 def pixel_statistics(counts: np.ndarray, num_frames: int) -> Statistics:
     """Return the statistics of brightness from 0 to 1: shape (3, 1, 1), "count" is that of frames."""
-    levels = np.arange(256) / 255
-    num_pixels = counts[0].sum()
-    mean = counts @ levels / num_pixels
-    squares = counts @ levels**2 / num_pixels
-    below = counts.cumsum(axis=1)
-    found = {
-        "min": levels[(counts > 0).argmax(axis=1)],
-        "max": levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)],
+    counted = [(_BRIGHTNESS[channel > 0], channel[channel > 0]) for channel in counts]
+    return _statistics(counted, num_frames, (3, 1, 1))
+
+
+def _statistics(
+    columns: Sequence[tuple[np.ndarray, np.ndarray]], num_frames: int, shape: tuple[int, ...]
+) -> Statistics:
+    """Return the statistics of columns of numbers, each given by its different values and their counts."""
+    parts = [_column_statistics(*column) for column in columns]
+    joined = {name: np.array([part[name] for part in parts]).reshape(shape) for name in parts[0]}
+    return {**joined, "count": np.array([num_frames])}
+
+
+def _column_statistics(values: np.ndarray, counts: np.ndarray) -> dict[str, np.generic]:
+    """Return the statistics of ascending values, of which each occurs so often."""
+    numbers, total = values.astype(np.float64), counts.sum()
+    mean = counts @ numbers / total
+    ranks = np.ceil(np.array([*QUANTILES.values()]) * total - 1e-9)
+    return {
+        "min": values[0],
+        "max": values[-1],
         "mean": mean,
-        "std": np.sqrt(np.maximum(squares - mean**2, 0)),
-        "count": np.array([num_frames]),
-        **{
-            name: levels[(below > _rank(share, num_pixels)).argmax(axis=1)]
-            for name, share in QUANTILES.items()
-        },
+        "std": np.sqrt(counts @ (numbers - mean) ** 2 / total),
+        **dict(zip(QUANTILES, numbers[counts.cumsum().searchsorted(ranks)], strict=True)),
     }
-    return {name: row if name == "count" else row.reshape(3, 1, 1) for name, row in found.items()}
-
-
-def _rank(share: float, count: int) -> int:
-    """Place of a quantile among `count` sorted values, from 0."""
-    return max(int(np.ceil(share * count - 1e-9)) - 1, 0)
 
 
 _COMPRESSION = "snappy"  # as LeRobot writes
@@ -154,136 +142,23 @@ _COMPRESSION = "snappy"  # as LeRobot writes
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Write the list of prompts; LeRobot reads it with pandas and expects the texts as its index."""
     columns = {"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())}
-    table = pa.table(columns)
-    notes = {
-        "index_columns": ["task"],
-        "column_indexes": [_pandas_column(None, "unicode", "object")],
-        "columns": [
-            _pandas_column("task_index", "int64", "int64"),
-            _pandas_column("task", "unicode", "object"),
-        ],
-    }
-    table = table.replace_schema_metadata({"pandas": json.dumps(notes)})
+    kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    described = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
+        for name, kind, numpy_type in kinds
+    ]
+    notes = {"index_columns": ["task"], "column_indexes": [], "columns": described}
+    table = pa.table(columns).replace_schema_metadata({"pandas": json.dumps(notes)})
     pq.write_table(table, path, compression=_COMPRESSION)
-
-
-def _pandas_column(name: str | None, pandas_type: str, numpy_type: str) -> dict[str, object]:
-    metadata = {"encoding": "UTF-8"} if name is None else None
-    return {
-        "name": name,
-        "field_name": name,
-        "pandas_type": pandas_type,
-        "numpy_type": numpy_type,
-        "metadata": metadata,
-    }
 
 
 PixelFormat = Literal["yuv444p", "yuv420p"]
 PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
 
+# Each episode begins with a frame that needs no other, and no frames are out of order, so reading one never
+# decodes those before.
+_ENCODING = {"preset": "superfast", "tune": "zerolatency", "forced-idr": "1"}
 _QUALITY = {"yuv444p": {"qp": "0"}, "yuv420p": {"crf": "12"}}
-MAX_FRAMES = 100_000  # in a file: of each one about 70 bytes stay in memory until it is closed
-
-
-class NumberedVideo:
-    """The videos of one feature; a context manager.
-
-    Each episode begins with a frame that needs no other, so reading one never decodes those before. There are
-    no frames out of order, and encoders have one thread: the same pictures give the same bytes.
-
-    Args:
-        folder: The data set.
-        key: Name of the feature.
-        fps: Frames a second.
-        pixels: Pixel format.
-        limit_bytes: An episode begins a new file if the last one has so many bytes.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        key: str,
-        *,
-        fps: int,
-        pixels: PixelFormat,
-        limit_bytes: int = VIDEO_FILE_MB * 2**20,
-    ) -> None:
-        self._av = import_av()
-        self._folder, self._key = folder, key
-        self._fps, self._pixels, self._limit_bytes = fps, pixels, limit_bytes
-        self._container: Any = None
-        self._stream: Any = None
-        self._number = -1
-        self._num_frames = self._num_bytes = 0
-
-    def write(self, pictures: np.ndarray, *, num_frames: int) -> tuple[int, int]:
-        """Append an episode.
-
-        Args:
-            pictures: Shape (num_frames or 1, 3, height, width), uint8; one picture is shown all the time.
-            num_frames: Frames of the episode.
-
-        Returns:
-            The number of the file, and the place of the first frame in it.
-        """
-        is_full = self._num_bytes >= self._limit_bytes or self._num_frames >= MAX_FRAMES
-        if self._container is None or is_full:
-            self._begin()
-        place = self._number, self._num_frames
-        kinds = self._av.video.frame.PictureType
-        frame: Any = None
-        for index in range(num_frames):
-            if index < len(pictures):
-                picture = np.ascontiguousarray(channels_last(pictures[index]))
-                frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.pict_type = self._num_frames, kinds.NONE if index else kinds.I
-            self._mux(self._stream.encode(frame))
-            self._num_frames += 1
-        return place
-
-    def close(self) -> None:
-        """Finish the present file."""
-        if self._container is not None:
-            self._mux(self._stream.encode(None))
-            self._container.close()
-            self._container = self._stream = None
-
-    def __enter__(self) -> "NumberedVideo":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-        elif self._container is not None:
-            with contextlib.suppress(OSError):  # the first error is the one to report
-                self._container.close()
-
-    def _begin(self) -> None:
-        self.close()
-        self._number += 1
-        self._num_frames = self._num_bytes = 0
-        path = numbered_path(self._folder, VIDEO_PATH, self._number, video_key=self._key)
-        self._container, self._stream = open_video(path, self._fps)
-        self._stream.height, self._stream.width = IMAGE_SHAPE
-        self._stream.pix_fmt = self._pixels
-        # Without look-ahead a frame's bytes come at once, which the limit on files needs. The faster preset
-        # costs 6 % in bytes and saves a third of the time.
-        self._stream.options = {
-            "preset": "superfast",
-            "tune": "zerolatency",
-            "threads": "1",
-            "forced-idr": "1",
-            **_QUALITY[self._pixels],
-        }
-
-    def _mux(self, packets: list[Any]) -> None:
-        self._num_bytes += sum(packet.size for packet in packets)
-        self._container.mux(packets)
 
 
 ROBOT_TYPE = "ur5"
@@ -307,15 +182,13 @@ class LerobotWriter:
         self._schema = _schema(frames)
         self._tasks: dict[str, int] = {}
         self._num_episodes = self._num_frames = 0
+        self._first_frame = 0  # of the present files
         self._row_schema: pa.Schema | None = None  # of the list of episodes; its first row gives it
-        self._tables: list[pa.Table] = []  # frames of each episode of the present file
+        self._tables: list[pa.Table] = []  # frames of each episode of the present files
         self._rows: list[dict[str, Any]] = []  # and its entry in the list of episodes
         self._pixel_counts = {key: np.zeros((3, 256), np.int64) for key in frames.video_keys}
         self._closing = contextlib.ExitStack()
-        self._videos = {
-            key: self._closing.enter_context(NumberedVideo(folder, key, fps=fps, pixels=pixels))
-            for key in frames.video_keys
-        }
+        self._videos: dict[str, VideoWriter] = {}
 
     def write(self, demo: Demonstration | DenseTrajectory) -> None:
         """Append an episode.
@@ -323,31 +196,33 @@ class LerobotWriter:
         Args:
             demo: At least one step, with no more prompt images than the layout has.
         """
+        number = self._num_episodes // EPISODES_PER_FILE
+        if not self._rows:
+            self._begin_files(number)
         values = {**self._frames.values(demo), **self._counters(demo)}  # type: ignore[arg-type]  # of the layout
         self._tables.append(_table(values, self._schema))
-        number = self._num_episodes // EPISODES_PER_FILE
-        places, statistics = self._write_pictures(demo)
-        statistics |= {name: value_statistics(column) for name, column in values.items()}
+        statistics = {**self._write_pictures(demo), **{k: value_statistics(v) for k, v in values.items()}}
+        start, end = self._num_frames, self._num_frames + demo.num_steps
         row = {
             "episode_index": self._num_episodes,
             "tasks": [demo.prompt.text],
             "length": demo.num_steps,
             **_place("data", number),
-            "dataset_from_index": self._num_frames,
-            "dataset_to_index": self._num_frames + demo.num_steps,
-            **places,
-            **{
-                f"stats/{name}/{kind}": value.tolist()
-                for name, entry in statistics.items()
-                for kind, value in entry.items()
-            },
+            "dataset_from_index": start,
+            "dataset_to_index": end,
             **_place("meta/episodes", number),
         }
+        for key in self._frames.video_keys:
+            row |= _place(f"videos/{key}", number)
+            row[f"videos/{key}/from_timestamp"] = (start - self._first_frame) / self._fps
+            row[f"videos/{key}/to_timestamp"] = (end - self._first_frame) / self._fps
+        for name, entry in statistics.items():
+            row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in entry.items()}
         self._rows.append(row)
         self._num_episodes += 1
-        self._num_frames += demo.num_steps
-        if self._num_episodes % EPISODES_PER_FILE == 0:
-            self._write_tables()
+        self._num_frames = end
+        if len(self._rows) == EPISODES_PER_FILE:
+            self._finish_files(number)
 
     def __enter__(self) -> "LerobotWriter":
         return self
@@ -355,10 +230,12 @@ class LerobotWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._closing.__exit__(kind, error, trace)
-        if kind is None:
-            self._write_tables()
-            self._write_metadata()
+        if kind is not None:
+            self._closing.__exit__(kind, error, trace)
+            return
+        if self._rows:
+            self._finish_files(self._num_episodes // EPISODES_PER_FILE)
+        self._write_metadata()
 
     def _counters(self, demo: Demonstration | DenseTrajectory) -> dict[str, np.ndarray]:
         steps = np.arange(demo.num_steps)
@@ -371,28 +248,34 @@ class LerobotWriter:
             "task_index": np.full_like(steps, task_index),
         }
 
-    def _write_pictures(
-        self, demo: Demonstration | DenseTrajectory
-    ) -> tuple[dict[str, Any], dict[str, Statistics]]:
-        places: dict[str, Any] = {}
+    def _write_pictures(self, demo: Demonstration | DenseTrajectory) -> dict[str, Statistics]:
         statistics = {}
         for key, pictures in self._frames.pictures(demo).items():  # type: ignore[arg-type]  # as above
-            number, first_frame = self._videos[key].write(pictures, num_frames=demo.num_steps)
+            for index, picture in enumerate(pictures):
+                repeat = demo.num_steps // len(pictures)
+                self._videos[key].write(channels_last(picture), repeat=repeat, is_key=index == 0)
             counts = count_pixels(pictures, demo.num_steps)
             self._pixel_counts[key] += counts
             statistics[key] = pixel_statistics(counts, demo.num_steps)
-            places |= {
-                **_place(f"videos/{key}", number),
-                f"videos/{key}/from_timestamp": first_frame / self._fps,
-                f"videos/{key}/to_timestamp": (first_frame + demo.num_steps) / self._fps,
-            }
-        return places, statistics
+        return statistics
 
-    def _write_tables(self) -> None:
-        """Write the files of the episodes that wait for it."""
-        if not self._rows:
-            return
-        number = (self._num_episodes - 1) // EPISODES_PER_FILE
+    def _begin_files(self, number: int) -> None:
+        self._first_frame = self._num_frames
+        height, width = IMAGE_SHAPE
+        for key in self._frames.video_keys:
+            video = VideoWriter(
+                numbered_path(self._folder, VIDEO_PATH, number, video_key=key),
+                width,
+                height,
+                frames_per_second=self._fps,
+                pixels=self._pixels,
+                options={**_ENCODING, **_QUALITY[self._pixels]},
+            )
+            self._videos[key] = self._closing.enter_context(video)
+
+    def _finish_files(self, number: int) -> None:
+        """Close the videos, and write the tables of their episodes."""
+        self._closing.close()
         rows = pa.Table.from_pylist(self._rows, schema=self._row_schema)
         self._row_schema = rows.schema
         for pattern, table in ((DATA_PATH, pa.concat_tables(self._tables)), (EPISODES_PATH, rows)):
@@ -407,9 +290,9 @@ class LerobotWriter:
             "total_episodes": self._num_episodes,
             "total_frames": self._num_frames,
             "total_tasks": len(self._tasks),
-            "chunks_size": FILES_PER_CHUNK,
+            "chunks_size": 1000,
             "data_files_size_in_mb": 100,
-            "video_files_size_in_mb": VIDEO_FILE_MB,
+            "video_files_size_in_mb": 200,
             "fps": self._fps,
             "splits": {"train": f"0:{self._num_episodes}"},
             "data_path": DATA_PATH,
@@ -428,12 +311,9 @@ class LerobotWriter:
         write_tasks(self._folder / TASKS_PATH, list(self._tasks))
 
     def _overall(self, name: str) -> Statistics:
-        """Statistics of a column over all frames, read back from the files: a component at a time."""
+        """Statistics of a column over all frames, read back from the files."""
         paths = sorted((self._folder / "data").rglob("*.parquet"))
-        column = np.concatenate([_read(path, name) for path in paths])
-        parts = [value_statistics(component) for component in column.T]
-        joined = {kind: np.concatenate([part[kind] for part in parts]) for kind in parts[0]}
-        return {**joined, "count": parts[0]["count"]}
+        return value_statistics(np.concatenate([_read(path, name) for path in paths]))
 
 
 def write_json(path: Path, content: object) -> None:

@@ -6,7 +6,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima.atomic_io import NO_SPACE, atomic_write_file
+from openvima.data.encoding import ShardInfo
 from openvima.data.schema import SCHEMA_VERSION
 from openvima.data.shard import Shard, Span, measure
 from openvima.errors import DatasetError, StorageError
@@ -52,21 +53,6 @@ _NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
 _COLUMNS = [name for name in INDEX_SCHEMA.names if name not in _NOT_IN_SHARDS] + ["redraws", "skipped"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ShardSummary:
-    """What index and manifest hold of a shard.
-
-    Args:
-        name: Of the file.
-        entry: Its entry in the manifest: counts, size and checksums.
-        index: Its part of the index.
-    """
-
-    name: str
-    entry: dict[str, Any]
-    index: pa.Table
-
-
 def finish_folder(
     folder: Path,
     shards: Sequence[Path],
@@ -89,12 +75,34 @@ def finish_folder(
     Raises:
         DatasetError: A shard is damaged.
     """
-    summaries = [summarise_shard(path) for path in shards]
-    origin = {"command": command, "config": dict(config), "versions": dict(versions), "licence": licence}
-    index, manifest = compose_manifest(summaries, origin)
-    sink = BytesIO()
+    entries: dict[str, dict[str, Any]] = {}
+    of_tasks: dict[str, list[dict[str, Any]]] = {}
+    parts = [INDEX_SCHEMA.empty_table()]
+    for path in shards:
+        entry, part = _summarise_shard(path)
+        entries[path.name] = entry
+        for task in part.column("task").unique().to_pylist():  # a shard has one
+            of_tasks.setdefault(task, []).append(entry)
+        parts.append(part)
+    index, sink = pa.concat_tables(parts).combine_chunks(), BytesIO()
     pq.write_table(index, sink, compression="zstd")
-    manifest["index"] = {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()}
+    manifest = {
+        "schema": SCHEMA_VERSION,
+        "command": command,
+        "config": dict(config),
+        "versions": dict(versions),
+        "licence": licence,
+        "content_hash": joint_hash(index.column("content_hash").to_pylist()),
+        "counts": {
+            "episodes": index.num_rows,
+            "steps": sum(entry["steps"] for entry in entries.values()),
+            "shards": len(entries),
+            "bytes": sum(entry["bytes"] for entry in entries.values()),
+        },
+        "tasks": {task: _add_up(of_tasks[task]) for task in sorted(of_tasks)},
+        "shards": entries,
+        "index": {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()},
+    }
     manifest["checksum"] = manifest_checksum(manifest)
     atomic_write_file(folder / INDEX_NAME, sink.getvalue())
     text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False)
@@ -111,8 +119,8 @@ def split_index(index: pa.Table) -> dict[str, pa.Table]:
     }
 
 
-def summarise_shard(path: Path) -> ShardSummary:
-    """Read what index and manifest hold of a shard.
+def _summarise_shard(path: Path) -> tuple[dict[str, Any], pa.Table]:
+    """Read a shard's entry in the manifest, and its part of the index.
 
     Raises:
         DatasetError: It is damaged.
@@ -122,45 +130,17 @@ def summarise_shard(path: Path) -> ShardSummary:
     skipped = Counter(entry["kind"] for row in table.column("skipped").to_pylist() for entry in row)
     counts = {
         "episodes": table.num_rows,
-        "steps": _sum(table, "steps"),
-        "redraws": _sum(table, "redraws"),
+        "steps": sum(table.column("steps").to_pylist()),
+        "redraws": sum(table.column("redraws").to_pylist()),
         "skipped": dict(sorted(skipped.items())),
     }
-    entry = {**counts, **fingerprint(path), **asdict(envelope)}
-    return ShardSummary(path.name, entry, _make_index_part(table, path.name, spans))
-
-
-def compose_manifest(
-    summaries: Sequence[ShardSummary], origin: Mapping[str, Any]
-) -> tuple[pa.Table, dict[str, Any]]:
-    """Put index and manifest together.
-
-    Args:
-        summaries: Of all shards, in the order of the data set.
-        origin: `command`, `config`, `versions` and `licence`.
-
-    Returns:
-        The index, and the manifest without the checksums of the index and of itself.
-    """
-    index = pa.concat_tables([INDEX_SCHEMA.empty_table(), *(summary.index for summary in summaries)])
-    entries: dict[str, list[Mapping[str, Any]]] = {}  # of the shards of each task
-    for summary in summaries:
-        for task in summary.index.column("task").unique().to_pylist():  # a shard has one
-            entries.setdefault(task, []).append(summary.entry)
-    manifest = {
-        "schema": SCHEMA_VERSION,
-        **origin,
-        "content_hash": joint_hash(index.column("content_hash").to_pylist()),
-        "counts": {
-            "episodes": index.num_rows,
-            "steps": sum(summary.entry["steps"] for summary in summaries),
-            "shards": len(summaries),
-            "bytes": sum(summary.entry["bytes"] for summary in summaries),
-        },
-        "tasks": {task: _add_up(entries[task]) for task in sorted(entries)},
-        "shards": {summary.name: summary.entry for summary in summaries},
+    columns = {
+        **{name: table.column(name) for name in table.column_names},
+        "shard": [path.name] * table.num_rows,
+        "row": range(table.num_rows),
+        **{name: [getattr(span, name) for span in spans] for name in Span.__slots__},
     }
-    return index.combine_chunks(), manifest
+    return {**counts, **fingerprint(path), **asdict(envelope)}, pa.table(columns, schema=INDEX_SCHEMA)
 
 
 def _add_up(entries: Sequence[Mapping[str, Any]]) -> dict[str, object]:
@@ -237,26 +217,34 @@ def joint_hash(content_hashes: Iterable[str]) -> str:
     return hashlib.sha256("".join(content_hashes).encode()).hexdigest()[:32]
 
 
-def _make_index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
-    columns = {
-        **{column: table.column(column) for column in table.column_names},
-        "shard": pa.array([name] * table.num_rows, pa.string()),
-        "row": pa.array(range(table.num_rows), pa.int32()),
-        "offset": pa.array([span.offset for span in spans], pa.int64()),
-        "num_bytes": pa.array([span.num_bytes for span in spans], pa.int32()),
-        "crc32": pa.array([span.crc32 for span in spans], pa.uint32()),
-    }
-    rows = pa.table([columns[column] for column in INDEX_SCHEMA.names], schema=INDEX_SCHEMA)
-    return rows.combine_chunks()  # of one row each, which take several kB more
-
-
-def _sum(table: pa.Table, column: str) -> int:
-    return int(table.column(column).to_numpy().sum())
-
-
 def is_finished(folder: Path) -> bool:
     """Say whether a folder has its manifest and index, which are written last."""
     return (folder / MANIFEST_NAME).is_file() and (folder / INDEX_NAME).is_file()
+
+
+def check_shards(folder: Path, wanted: Mapping[str, tuple[ShardInfo, int]]) -> None:
+    """Refuse a folder whose shards do not belong to the data set that is asked for.
+
+    Args:
+        folder: The folder.
+        wanted: File name of each shard that is asked for, to what its rows have in common and their number.
+
+    Raises:
+        DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
+        DatasetError: A shard is damaged.
+    """
+    (any_info, _), *_ = wanted.values()
+    for path in sorted(folder.glob("*.arrow")):
+        shard = Shard(path)
+        info, num_episodes = wanted.get(path.name, (any_info, 0))
+        problems = shard.info.differences(info)
+        if not problems and len(shard) > num_episodes:
+            problems = [f"of its {len(shard)} episodes {num_episodes} are asked for"]
+        if problems:
+            raise DatasetError(
+                f"{path} belongs to another data set, or to a larger one: {'; '.join(problems)}. "
+                "Give its settings, another folder, or --force to delete it."
+            )
 
 
 def clear(folder: Path) -> None:

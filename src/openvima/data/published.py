@@ -13,6 +13,7 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
     BROKEN_NAME,
     MANIFEST_NAME,
+    check_shards,
     clear,
     finish_folder,
     is_finished,
@@ -326,7 +327,7 @@ def _import(
 ) -> None:
     if config.force:
         clear(config.out)
-    _check_folder(config.out, blocks)
+    check_shards(config.out, {block.path.name: (block.info, len(block.places)) for block in blocks})
     broken = {block.path: _find_broken(block) for block in blocks}
     missing = [block for block in blocks if broken[block.path] is None]
     try:
@@ -411,21 +412,6 @@ def _find_broken(block: Block) -> list[Broken] | None:
     found = [read_place(source, place) for place in block.places if place.folder not in present]
     broken = [entry for entry in found if isinstance(entry, Broken)]
     return broken if len(broken) == len(found) else None
-
-
-def _check_folder(folder: Path, blocks: Sequence[Block]) -> None:
-    """Refuse a folder with shards that do not belong to this import."""
-    wanted = {block.path.name: block for block in blocks}
-    for path in sorted(folder.glob("*.arrow")):
-        if path.name not in wanted:
-            problem = f"it is not among the {len(blocks)} shards that were asked for"
-        else:
-            problem = "; ".join(Shard(path).info.differences(wanted[path.name].info))
-        if problem:
-            raise DatasetError(
-                f"{path} belongs to another data set: {problem}. "
-                "Give its settings, another folder, or --force to delete it."
-            )
 
 
 def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], broken: list[Broken]) -> None:

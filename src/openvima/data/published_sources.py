@@ -1,13 +1,14 @@
 """What the files of one episode are called, and how large they may be."""
 
 import hashlib
+import io
 import mmap
 import os
 import re
 import struct
+import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -125,19 +126,19 @@ def _list_numbered(folder: Path) -> list[str]:
 
 
 # Layouts from the specification of the format (APPNOTE 6.3.9): end record, its 64-bit form and the pointer to
-# that, entry of the directory, head of a member.
+# that, and what a directory's entry has before its name.
 _END = struct.Struct("<4s4H2LH")
 _END_64 = struct.Struct("<4sQ2H2L4Q")
 _POINTER_64 = struct.Struct("<4sLQL")
-_ENTRY = struct.Struct("<4s4B4H3L5H2L")
+_ENTRY_BYTES, _LENGTHS_AT = 46, 28
 _LENGTHS = struct.Struct("<3H")  # of name, extra fields and comment
-_LENGTHS_AT = 28
-_HEAD = struct.Struct("<4s2B4HL2L2H")
 _LONGEST_COMMENT = 0xFFFF
-_IN_EXTRA = 0xFFFFFFFF  # "the number is too large for this field"
-_EXTRA_64 = 1
-_ENCRYPTED = 1
-_STORED, _DEFLATED = 0, 8
+_MAX_TEXT = 200  # characters of a reason
+# What the standard library raises for damaged archives, and for members that it cannot read.
+_DAMAGE_ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, OSError, ValueError),
+    ArithmeticError,
+)
 
 _EPISODE = re.compile(rb"(?!__MACOSX/)(.*/)?([^/]+)/(\d+)/")
 
@@ -145,17 +146,44 @@ _EPISODE = re.compile(rb"(?!__MACOSX/)(.*/)?([^/]+)/(\d+)/")
 Place = tuple[tuple[int, int], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Member:
-    """One entry of the directory."""
+class _Excerpt(io.RawIOBase):
+    """An archive in whose directory are the entries of one episode; those of all would take gigabytes.
 
-    name: str
-    offset: int
-    packed_bytes: int
-    num_bytes: int
-    checksum: int
-    method: int
-    is_encrypted: bool
+    Args:
+        file: The archive.
+        start: Where its directory begins.
+        offset: Where the archive says that it begins.
+        entries: Those of the episode.
+    """
+
+    def __init__(self, file: BinaryIO, start: int, offset: int, entries: bytes) -> None:
+        size, end = len(entries), start + len(entries)
+        self._file, self._start, self._place = file, start, 0
+        self._tail = (
+            entries
+            + _END_64.pack(b"PK\6\6", _END_64.size - 12, 45, 45, 0, 0, 0, 0, size, offset)
+            + _POINTER_64.pack(b"PK\6\7", 0, end, 1)
+            + _END.pack(b"PK\5\6", 0, 0, 0, 0, 0, 0, 0)
+        )
+
+    def seekable(self) -> bool:
+        """Whether it can be read in any order."""
+        return True
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Move to a place and return it."""
+        self._place = (0, self._place, self._start + len(self._tail))[whence] + offset
+        return self._place
+
+    def read(self, size: int = -1) -> bytes:
+        """Read at most so many bytes; -1: all."""
+        source, place = self._file, self._place
+        if place >= self._start:
+            source, place = io.BytesIO(self._tail), place - self._start
+        source.seek(place)
+        content = source.read(size)
+        self._place += len(content)
+        return content
 
 
 class ZipArchive:
@@ -209,18 +237,26 @@ class ZipArchive:
             DatasetError: A member is damaged, too large or beyond the end.
         """
         with open(self.path, "rb") as file:
-            members = {}
+            entries = b""
             for start, end in place:
                 file.seek(start)
-                found = _list_members(file.read(end - start))
-                members |= {member.name: member for member in found if is_episode_file(member.name)}
-            for member in members.values():
-                if member.offset + self._shift >= self._end:
-                    raise DatasetError(f"{member.name} is not where the archive's directory says.")
-            total = sum(max(member.num_bytes, member.packed_bytes) for member in members.values())
+                entries += file.read(end - start)
+            try:
+                archive = zipfile.ZipFile(_Excerpt(file, self._start, self._start - self._shift, entries))
+            except _DAMAGE_ERRORS as error:
+                raise DatasetError(f"the archive's directory is damaged here ({error}).") from None
+            members = {_EPISODE.sub(b"", m.filename.encode()).decode(): m for m in archive.infolist()}
+            members = {name: member for name, member in members.items() if is_episode_file(name)}
+            total = sum(max(member.file_size, member.compress_size) for member in members.values())
             if total > MAX_EPISODE_BYTES:
                 raise DatasetError(f"it claims {total:,} bytes; episodes have at most {MAX_EPISODE_BYTES:,}.")
-            return {name: self._content(file, member) for name, member in members.items()}
+            contents = {}
+            for name, member in members.items():
+                try:
+                    contents[name] = archive.read(member)
+                except _DAMAGE_ERRORS as error:
+                    raise DatasetError(f"{name} cannot be read: {str(error)[:_MAX_TEXT]}.") from None
+            return contents
 
     def _runs(self) -> Iterator[tuple[bytes, int, int]]:
         """Folder, start and end of each run of entries that lie in the same episode's folder."""
@@ -235,7 +271,7 @@ class ZipArchive:
                     raise DatasetError(
                         f"{self.path}: its directory is damaged at byte {position:,}."
                     ) from None
-                name_start = position + _ENTRY.size
+                name_start = position + _ENTRY_BYTES
                 if folder is None or content[name_start : name_start + len(folder)] != folder:
                     if folder is not None:
                         yield folder, run_start, position
@@ -246,29 +282,6 @@ class ZipArchive:
                 raise DatasetError(f"{self.path}: its directory is damaged; copy or download it again.")
             if folder is not None:
                 yield folder, run_start, position
-
-    def _content(self, file: BinaryIO, member: _Member) -> bytes:
-        if member.is_encrypted or member.method not in (_STORED, _DEFLATED):
-            how = "encrypted" if member.is_encrypted else f"packed by method {member.method}"
-            raise DatasetError(f"{member.name} is {how}; only stored and deflated members are read.")
-        file.seek(member.offset + self._shift)
-        head = file.read(_HEAD.size)
-        if len(head) < _HEAD.size or not head.startswith(b"PK\3\4"):
-            raise DatasetError(f"{member.name} is not where the archive's directory says.")
-        file.seek(sum(_HEAD.unpack(head)[-2:]), 1)  # name and extra fields again
-        packed = file.read(member.packed_bytes)
-        content = packed if member.method == _STORED else _inflate(packed, member)
-        if len(content) != member.num_bytes or zlib.crc32(content) != member.checksum:
-            raise DatasetError(f"{member.name} is damaged: its checksum differs.")
-        return content
-
-
-def _inflate(packed: bytes, member: _Member) -> bytes:
-    """Unpack as many bytes as were promised, and no more."""
-    try:
-        return zlib.decompressobj(-zlib.MAX_WBITS).decompress(packed, member.num_bytes + 1)
-    except zlib.error:
-        raise DatasetError(f"{member.name} is damaged: it cannot be unpacked.") from None
 
 
 def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
@@ -307,48 +320,3 @@ def _find_end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] |
         raise DatasetError(f"{path}: its end record is damaged.")
     *_, num_bytes, offset = _END_64.unpack(record)
     return at, num_bytes, offset
-
-
-def _list_members(directory: bytes) -> Iterator[_Member]:
-    """The files among some entries of the directory, named relative to their episode's folder."""
-    position = 0
-    while position < len(directory):
-        if len(directory) < position + _ENTRY.size or not directory.startswith(b"PK\1\2", position):
-            raise DatasetError("the archive's directory is damaged here.")
-        fields = _ENTRY.unpack_from(directory, position)
-        flags, method, (checksum, packed, unpacked) = fields[5], fields[6], fields[9:12]
-        name_bytes, extra_bytes, comment_bytes, offset = *fields[12:15], fields[18]
-        position += _ENTRY.size
-        name = directory[position : position + name_bytes]
-        extra = directory[position + name_bytes : position + name_bytes + extra_bytes]
-        position += name_bytes + extra_bytes + comment_bytes
-        if name.endswith(b"/"):
-            continue
-        unpacked, packed, offset = _read_large_numbers(extra, (unpacked, packed, offset))
-        folder = _EPISODE.match(name)
-        yield _Member(
-            name=name[folder.end() if folder else 0 :].decode("utf-8", "replace"),
-            offset=offset,
-            packed_bytes=packed,
-            num_bytes=unpacked,
-            checksum=checksum,
-            method=method,
-            is_encrypted=bool(flags & _ENCRYPTED),
-        )
-
-
-def _read_large_numbers(extra: bytes, numbers: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Replace numbers that did not fit into four bytes by those of the 64-bit extra field."""
-    if _IN_EXTRA not in numbers:
-        return numbers
-    position = 0
-    while position + 4 <= len(extra):
-        kind, length = struct.unpack_from("<2H", extra, position)
-        position += 4
-        if kind == _EXTRA_64:
-            field = extra[position : position + length]
-            large = iter(struct.unpack_from(f"<{len(field) // 8}Q", field))
-            size, packed, offset = (next(large, n) if n == _IN_EXTRA else n for n in numbers)
-            return size, packed, offset
-        position += length
-    return numbers

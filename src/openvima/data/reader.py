@@ -2,8 +2,9 @@
 
 import hashlib
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ class Dataset:
         self.manifest = read_manifest(self.path)
         index = _read_index(self.path, self.manifest)
         if self.tasks is not None:
-            index = index.filter(select_tasks(index, self.tasks, self.path))
+            index = index.filter(select_tasks(index, self.tasks, str(self.path)))
         self.index = index
         names = self.index.column("shard").combine_chunks().dictionary_encode()
         self._names = names.dictionary.to_pylist()
@@ -126,7 +127,7 @@ class Dataset:
         return self._shards[name]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _reopen, (self.path, self.tasks)
+        return partial(Dataset, tasks=self.tasks), (self.path,)
 
     def _checked(self, episode_index: int) -> tuple[Shard, int]:
         """The shard and row of an episode whose bytes are what the index says."""
@@ -136,10 +137,6 @@ class Dataset:
         shard = self.shard(name)
         shard.check(row, Span(*(int(numbers[episode_index]) for numbers in self._spans)))
         return shard, row
-
-
-def _reopen(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
-    return Dataset(path, tasks=tasks)
 
 
 def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:
@@ -189,13 +186,13 @@ def explain_missing(folder: Path) -> str:
     return f"{folder} holds no data set ({MANIFEST_NAME} is missing){hint}."
 
 
-def select_tasks(index: pa.Table, tasks: Sequence[str] | None, folder: Path) -> np.ndarray:
+def select_tasks(index: pa.Table, tasks: Sequence[str] | None, where: str) -> np.ndarray:
     """Tell which episodes are of some tasks.
 
     Args:
         index: The episodes.
         tasks: Names of tasks; None means all.
-        folder: Where they are, for the message.
+        where: Where they are, for the message.
 
     Returns:
         Shape (N,), bool.
@@ -208,10 +205,10 @@ def select_tasks(index: pa.Table, tasks: Sequence[str] | None, folder: Path) -> 
         return np.ones(len(present), bool)
     known = sorted(set(present.tolist()))
     if not tasks:
-        raise DatasetError(f"no task is named; {folder} has {', '.join(known)}.")
+        raise DatasetError(f"no task is named; in {where} are {', '.join(known)}.")
     for task in tasks:
         if task not in known:
-            raise DatasetError(unknown_name(f"task in {folder} called", task, known))
+            raise DatasetError(unknown_name(f"task in {where} called", task, known))
     return np.isin(present, tasks)
 
 
@@ -260,12 +257,13 @@ def split_hashes(index: pa.Table, purpose: str = "") -> np.ndarray:
         purpose: Other purposes have other numbers.
     """
     names = zip(index.column("task").to_pylist(), index.column("seed").to_pylist(), strict=True)
-    return np.array([_hash(f"{purpose}{task}/{seed}") for task, seed in names], np.float64)
+    return hash_names(f"{purpose}{task}/{seed}" for task, seed in names) / 2.0**64
 
 
-def _hash(name: str) -> float:
-    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "little") / 2**64
+def hash_names(names: Iterable[str]) -> np.ndarray:
+    """Hash names to 64 bits each, shape (N,), uint64."""
+    digests = (hashlib.blake2b(name.encode(), digest_size=8).digest() for name in names)
+    return np.frombuffer(b"".join(digests), "<u8")
 
 
 @dataclass(frozen=True, slots=True)

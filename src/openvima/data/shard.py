@@ -13,11 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any
 
 import pyarrow as pa
 
-from openvima.atomic_io import NO_SPACE, atomic_write
+from openvima.atomic_io import NO_SPACE, atomic_path
 from openvima.data.encoding import ShardInfo, Skipped, decode, decode_columns, encode
 from openvima.data.records import Demonstration, make_columns
 from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION
@@ -311,9 +311,8 @@ class ShardWriter:
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
         self._closing = contextlib.ExitStack()
-        sink = _Sink(self._closing.enter_context(atomic_write(path)))
-        stream = pa.BufferedOutputStream(pa.PythonFile(sink, "w"), _BUFFER_BYTES)
-        self._closing.callback(stream.flush)
+        file = pa.OSFile(str(self._closing.enter_context(atomic_path(path))), "wb")
+        stream = self._closing.enter_context(pa.BufferedOutputStream(file, _BUFFER_BYTES))
         self._writer = self._closing.enter_context(pa.ipc.new_file(stream, self._schema, options=options))
 
     def write(self, demo: Demonstration, skipped: Sequence[Skipped] = ()) -> None:
@@ -340,27 +339,3 @@ class ShardWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._closing.__exit__(kind, error, traceback)
-
-
-class _Sink:
-    """A file that raises only once: what Arrow could not write, it tries again as it ends, and complains."""
-
-    closed = False  # `atomic_write` closes the file
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self._has_failed = file, False
-
-    def write(self, data: bytes) -> int:
-        if self._has_failed:
-            return len(data)
-        try:
-            return self._file.write(data)
-        except BaseException:
-            self._has_failed = True
-            raise
-
-    def flush(self) -> None:
-        """Nothing: `atomic_write` does it."""
-
-    def close(self) -> None:
-        """Nothing, likewise."""

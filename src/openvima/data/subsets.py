@@ -4,11 +4,10 @@ Episodes are selected by a hash of their identity, never by their position: the 
 order of the episodes, on every machine, and with or without images.
 """
 
-import hashlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,12 +24,13 @@ from openvima.data.manifest import (
     INDEX_NAME,
     MANIFEST_NAME,
     finish_folder,
+    split_index,
 )
 from openvima.data.planning import LARGEST_SHARD
-from openvima.data.reader import Dataset, select_tasks
+from openvima.data.reader import Dataset, hash_names, select_tasks
 from openvima.data.shard import ShardWriter
 from openvima.env.config import EnvConfig
-from openvima.errors import ConfigError, DatasetError, unknown_name
+from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import as_path, names_of, settle
 from openvima.multiprocess import Report, imap_unordered
 from openvima.tasks.prompts import MULTIMODAL
@@ -91,41 +91,33 @@ def identify_source(manifest: Mapping[str, Any]) -> dict[str, Any]:
     return {key: manifest[key] for key in ("content_hash", "command", "config", "versions")}
 
 
-@dataclass(frozen=True, slots=True)
-class Splits:
-    """Splits of a data set.
-
-    Args:
-        fractions: Name to fraction; the fractions add up to 1.
+def check_fractions(fractions: Mapping[str, float]) -> None:
+    """Check the splits of a data set: names, and fractions that add up to 1.
 
     Raises:
         ConfigError: They do not, or a name cannot be that of a folder.
     """
-
-    fractions: Mapping[str, float]
-
-    def __post_init__(self) -> None:
-        problems = []
-        for name, fraction in self.fractions.items():
-            if not _SPLIT_NAME.fullmatch(name):
-                problems.append(f"split {name!r} needs a name of letters, digits, '_' and '-'.")
-            if not 0 < fraction < 1:
-                problems.append(f"split {name!r} has the fraction {fraction}; it must lie between 0 and 1.")
-        total = sum(self.fractions.values())
-        if not problems and abs(total - 1) > _ROUNDING:
-            problems.append(f"the fractions add up to {total:g}; they must add up to 1.")
-        if problems:
-            raise ConfigError(" ".join(problems))
+    problems = []
+    for name, fraction in fractions.items():
+        if not _SPLIT_NAME.fullmatch(name):
+            problems.append(f"split {name!r} needs a name of letters, digits, '_' and '-'.")
+        if not 0 < fraction < 1:
+            problems.append(f"split {name!r} has the fraction {fraction}; it must lie between 0 and 1.")
+    total = sum(fractions.values())
+    if not problems and abs(total - 1) > _ROUNDING:
+        problems.append(f"the fractions add up to {total:g}; they must add up to 1.")
+    if problems:
+        raise ConfigError(" ".join(problems))
 
 
-def parse_splits(text: str) -> Splits:
-    """Parse splits from the command line.
+def parse_splits(text: str) -> dict[str, float]:
+    """Parse splits from the command line: name to fraction.
 
     Args:
         text: Such as "training=0.923,validation=0.077".
 
     Raises:
-        ConfigError: It is not of that form.
+        ConfigError: It is not of that form, or the fractions do not add up to 1.
     """
     fractions: dict[str, float] = {}
     for entry in text.split(","):
@@ -139,7 +131,8 @@ def parse_splits(text: str) -> Splits:
         if name in fractions:
             raise ConfigError(f"split {name!r} is named twice.")
         fractions[name] = number
-    return Splits(fractions)
+    check_fractions(fractions)
+    return fractions
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,18 +195,16 @@ def sample(
     """
     if (fraction is None) == (episodes is None):
         raise ConfigError("give either a fraction or a number of episodes.")
-    check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
     chosen = select_sample(dataset.index, config.seed, fraction=fraction, episodes=episodes)
-    chosen &= select_tasks(dataset.index, config.tasks, dataset.path)
+    chosen &= select_tasks(dataset.index, config.tasks, str(dataset.path))
     size = {"fraction": fraction} if episodes is None else {"episodes": episodes}
-    settings = {**config.settings(dataset), **size}
-    with folder_lock(config.out), atomic_folder(config.out) as folder:
-        _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
-    return config.out
+    parts = _group(dataset, chosen)
+    sets = {"": (parts, {**config.settings(dataset), **size})}
+    return _write(config, [dataset], sets, "openvima data sample", report)
 
 
-def split(config: SubsetConfig, splits: Splits, *, report: Report | None = None) -> Path:
+def split(config: SubsetConfig, fractions: Mapping[str, float], *, report: Report | None = None) -> Path:
     """Split a data set: each episode goes to exactly one split.
 
     Which one follows from the episode and the seed alone, so it stays there when episodes are added. The
@@ -221,34 +212,31 @@ def split(config: SubsetConfig, splits: Splits, *, report: Report | None = None)
 
     Args:
         config: What to read and write.
-        splits: Names and fractions.
+        fractions: Name of each split to its fraction; they add up to 1.
         report: Called with episodes written, episodes in all, and a note.
 
     Returns:
         The folder, with one data set per split.
 
     Raises:
+        ConfigError: The fractions do not add up to 1, or a name cannot be that of a folder.
         DatasetError: The source is not finished, a split would be empty, or the folder cannot be used.
         DatasetError: The source is damaged.
     """
-    check_out(config.out, [config.source], force=config.force)
+    check_fractions(fractions)
     dataset = Dataset(config.source)
-    wanted = select_tasks(dataset.index, config.tasks, dataset.path)
-    chosen = {name: mask & wanted for name, mask in assign_splits(dataset.index, splits, config.seed).items()}
-    empty = [name for name, mask in chosen.items() if not mask.any()]
-    if empty:
-        raise DatasetError(
-            f"of {wanted.sum()} episodes none would fall into split {', '.join(empty)}. "
-            "Give it a larger fraction, or another --seed."
-        )
-    settings = {**config.settings(dataset), "splits": dict(splits.fractions)}
-    with folder_lock(config.out), atomic_folder(config.out) as folder:
-        subsets = [
-            _Subset(folder / name, mask, "openvima data split", {**settings, "split": name})
-            for name, mask in chosen.items()
-        ]
-        _write(subsets, dataset, config, report)
-    return config.out
+    wanted = select_tasks(dataset.index, config.tasks, str(dataset.path))
+    settings = {**config.settings(dataset), "splits": dict(fractions)}
+    sets = {}
+    for name, mask in assign_splits(dataset.index, fractions, config.seed).items():
+        parts = _group(dataset, mask & wanted)
+        if not parts:
+            raise DatasetError(
+                f"of {wanted.sum()} episodes none would fall into split {name}. "
+                "Give it a larger fraction, or another --seed."
+            )
+        sets[name] = parts, {**settings, "split": name}
+    return _write(config, [dataset], sets, "openvima data split", report)
 
 
 def select_sample(
@@ -285,7 +273,7 @@ def select_sample(
     return chosen
 
 
-def assign_splits(index: pa.Table, splits: Splits, seed: int) -> dict[str, np.ndarray]:
+def assign_splits(index: pa.Table, fractions: Mapping[str, float], seed: int) -> dict[str, np.ndarray]:
     """Assign each episode to a split.
 
     The assignment is independent of other episodes: it stays when episodes are added, and sizes match the
@@ -293,7 +281,7 @@ def assign_splits(index: pa.Table, splits: Splits, seed: int) -> dict[str, np.nd
 
     Args:
         index: The episodes.
-        splits: Names and fractions.
+        fractions: Name of each split to its fraction.
         seed: Seed of the assignment.
 
     Returns:
@@ -301,22 +289,19 @@ def assign_splits(index: pa.Table, splits: Splits, seed: int) -> dict[str, np.nd
     """
     # Unrelated to the hash of samples; otherwise small samples would all be in the first split.
     places = _hash_episodes(index, "split", seed) / 2.0**64
-    bounds = [0.0, *itertools.accumulate(splits.fractions.values())]
+    bounds = [0.0, *itertools.accumulate(fractions.values())]
     bounds[-1] = np.inf
     return {
         name: (low <= places) & (places < high)
-        for name, (low, high) in zip(splits.fractions, itertools.pairwise(bounds), strict=True)
+        for name, (low, high) in zip(fractions, itertools.pairwise(bounds), strict=True)
     }
 
 
 def _hash_episodes(index: pa.Table, purpose: str, seed: int) -> np.ndarray:
     """Hash each episode to 64 bits, shape (N,), uint64."""
     columns = [index.column(name).to_pylist() for name in ("task", "level", "domain", "seed")]
-    digests = b"".join(
-        hashlib.blake2b("\n".join(map(str, (purpose, seed, *key))).encode(), digest_size=8).digest()
-        for key in zip(*columns, strict=True)
-    )
-    return np.frombuffer(digests, dtype="<u8")
+    keys = zip(*columns, strict=True)
+    return hash_names("\n".join(map(str, (purpose, seed, *key))) for key in keys)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -324,7 +309,7 @@ class ShardPart:
     """Episodes of one data set that become a shard.
 
     Args:
-        info: What all its rows have in common; `number_shards` gives it its number.
+        info: What all its rows have in common; it gets its number when it is written.
         source: Folder of the data set that holds the rows.
         checksum: Of that data set's manifest.
         episodes: Numbers of the rows in the data set, in order.
@@ -338,8 +323,43 @@ class ShardPart:
     path: Path = Path()
 
 
-def number_shards(folder: Path, parts: Iterable[ShardPart]) -> list[ShardPart]:
-    """Give shards their files in a folder; those of each task and level are numbered from 0."""
+def _write(
+    config: "SubsetConfig | MergeConfig",
+    sources: Sequence[Dataset],
+    sets: Mapping[str, tuple[Sequence[ShardPart], dict[str, Any]]],
+    command: str,
+    report: Report | None,
+) -> Path:
+    """Write data sets into the folder, each by its name there: its parts, and the settings of its manifest.
+
+    Raises:
+        DatasetError: The folder cannot be used, or what is read is damaged.
+    """
+    check_out(config.out, [dataset.path for dataset in sources], force=config.force)
+    manifests = [dataset.manifest for dataset in sources]
+    packages = sorted({name for manifest in manifests for name in manifest["versions"]})
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
+        shards = {name: _number_shards(folder / name, parts) for name, (parts, _) in sets.items()}
+        todo = list(itertools.chain.from_iterable(shards.values()))
+        total = sum(len(shard.episodes) for shard in todo)
+        count = None if report is None else (lambda done: report(done, total, ""))
+        for _ in imap_unordered(write_shard, todo, config.workers, report=count):
+            pass  # a shard's result is its file
+        for name, (_, settings) in sets.items():
+            finish_folder(
+                folder / name,
+                [shard.path for shard in shards[name]],
+                command=command,
+                config=settings,
+                versions={p: _join([m["versions"].get(p) for m in manifests], ", ") for p in packages},
+                licence=_join([m["licence"] for m in manifests], " AND "),  # an SPDX expression
+            )
+    return config.out
+
+
+def _number_shards(folder: Path, parts: Sequence[ShardPart]) -> list[ShardPart]:
+    """Give shards their files in a new folder; those of each task and level are numbered from 0."""
+    folder.mkdir(exist_ok=True)
     numbers, shards = Counter[tuple[str, str]](), []
     for part in parts:
         key = part.info.task, part.info.level
@@ -347,23 +367,6 @@ def number_shards(folder: Path, parts: Iterable[ShardPart]) -> list[ShardPart]:
         numbers[key] += 1
         shards.append(replace(part, info=info, path=folder / info.file_name))
     return shards
-
-
-def write_shards(shards: Sequence[ShardPart], num_workers: int, report: Report | None) -> None:
-    """Write shards in several processes.
-
-    Args:
-        shards: What to write.
-        num_workers: Number of processes.
-        report: Called with episodes done, episodes in all, and a note.
-
-    Raises:
-        DatasetError: What is read is damaged.
-    """
-    total = sum(len(shard.episodes) for shard in shards)
-    count = None if report is None else (lambda done: report(done, total, ""))
-    for _ in imap_unordered(write_shard, shards, num_workers, report=count):
-        pass  # a shard's result is its file
 
 
 def write_shard(shard: ShardPart, count: Callable[[int], None]) -> None:
@@ -391,46 +394,17 @@ def _open_unchanged(folder: Path, checksum: str) -> Dataset:
     return dataset
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Subset:
-    """One data set to write: its folder, which episodes it has, and what its manifest says."""
-
-    folder: Path
-    mask: np.ndarray
-    command: str
-    settings: dict[str, Any]
-
-
-def _write(subsets: Sequence[_Subset], dataset: Dataset, config: SubsetConfig, report: Report | None) -> None:
-    plans = []
-    for subset in subsets:
-        subset.folder.mkdir(exist_ok=True)
-        parts = _group(dataset, np.flatnonzero(subset.mask).tolist())
-        plans.append(number_shards(subset.folder, parts))
-    write_shards([shard for plan in plans for shard in plan], config.workers, report)
-    for subset, plan in zip(subsets, plans, strict=True):
-        finish_folder(
-            subset.folder,
-            [shard.path for shard in plan],
-            command=subset.command,
-            config=subset.settings,
-            versions=dataset.manifest["versions"],
-            licence=dataset.manifest["licence"],
-        )
-
-
-def _group(dataset: Dataset, episodes: Sequence[int]) -> list[ShardPart]:
-    """Divide chosen episodes, ascending, into shards of equal settings."""
-    commons: dict[str, tuple[tuple[str | bytes, ...], ShardInfo]] = {}  # of each source shard
+def _group(dataset: Dataset, chosen: np.ndarray) -> list[ShardPart]:
+    """Divide chosen episodes into shards of equal settings."""
     groups: dict[tuple[str | bytes, ...], tuple[ShardInfo, list[int]]] = {}
-    for episode_index in episodes:
-        name, _ = dataset.locate(episode_index)
-        if name not in commons:
-            info = dataset.shard(name).info
-            common = replace(info, number=0, shard_size=0, first_seed=0)
-            commons[name] = (info.task, info.level, *common.to_metadata().values()), common
-        key, common = commons[name]
-        groups.setdefault(key, (common, []))[1].append(episode_index)
+    end = 0
+    for name, rows in split_index(dataset.index).items():
+        start, end = end, end + rows.num_rows
+        if chosen[start:end].any():
+            common = replace(dataset.shard(name).info, number=0, shard_size=0, first_seed=0)
+            key = common.task, common.level, *common.to_metadata().values()
+            members = start + np.flatnonzero(chosen[start:end])
+            groups.setdefault(key, (common, []))[1].extend(members.tolist())
     return [
         ShardPart(info, dataset.path, dataset.manifest["checksum"], members[start : start + LARGEST_SHARD])
         for _, (info, members) in sorted(groups.items())
@@ -466,8 +440,6 @@ class MergeConfig:
 def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
     """Put data sets together, of whatever tasks, levels, settings and versions.
 
-    Each shard says what its rows have in common, and stays one under a new number.
-
     Args:
         config: What to read and write.
         report: Called with episodes written, episodes in all, and a note.
@@ -480,15 +452,15 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
             be used.
         DatasetError: A source is damaged.
     """
-    if not config.sources:
-        raise DatasetError("there is nothing to merge; name at least one data set.")
-    check_out(config.out, config.sources, force=config.force)
     datasets = sorted(map(Dataset, config.sources), key=lambda dataset: dataset.manifest["checksum"])
-    if config.tasks is not None:
-        _check_tasks(datasets, config.tasks)
-    parts = _find_shards(datasets, config.tasks)
-    if not parts:
-        raise DatasetError("the sources hold no episodes, so there is nothing to merge.")
+    if not any(map(len, datasets)):
+        raise DatasetError("there is nothing to merge; name data sets that hold episodes.")
+    index = pa.concat_tables([dataset.index for dataset in datasets])
+    wanted = select_tasks(index, config.tasks, "the sources")
+    masks = np.split(wanted, np.cumsum([len(dataset) for dataset in datasets])[:-1])
+    parts = [part for dataset, mask in zip(datasets, masks, strict=True) for part in _group(dataset, mask)]
+    # Of duplicates the first is kept: rather one with images than one without.
+    parts.sort(key=lambda part: (part.info.task, part.info.level, part.info.domain, not part.info.images))
     indices = {dataset.path: dataset.index for dataset in datasets}
     parts = _skip_duplicates(parts, indices, refuse=config.duplicates == "refuse")
     settings = {
@@ -496,49 +468,7 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
         "tasks": None if config.tasks is None else sorted(config.tasks),
         "duplicates": config.duplicates,
     }
-    manifests = [dataset.manifest for dataset in datasets]
-    packages = sorted({name for manifest in manifests for name in manifest["versions"]})
-    with folder_lock(config.out), atomic_folder(config.out) as folder:
-        shards = number_shards(folder, parts)
-        write_shards(shards, config.workers, report)
-        finish_folder(
-            folder,
-            [shard.path for shard in shards],
-            command="openvima data merge",
-            config=settings,
-            versions={name: _join([m["versions"].get(name) for m in manifests], ", ") for name in packages},
-            licence=_join([manifest["licence"] for manifest in manifests], " AND "),  # an SPDX expression
-        )
-    return config.out
-
-
-def _check_tasks(datasets: Sequence[Dataset], tasks: Sequence[str]) -> None:
-    present = sorted({task for dataset in datasets for task in dataset.manifest["tasks"]})
-    if not tasks:
-        raise DatasetError(f"no task is named; the sources have {', '.join(present)}.")
-    for task in tasks:
-        if task not in present:
-            raise DatasetError(unknown_name("task in the sources called", task, present))
-
-
-def _find_shards(datasets: Sequence[Dataset], tasks: Sequence[str] | None) -> list[ShardPart]:
-    """Return the shards of the sources with their episodes, in the order of the merged data set."""
-    found = []
-    for dataset in datasets:
-        names, shard_of = np.unique(dataset.index.column("shard").to_pylist(), return_inverse=True)
-        seeds = dataset.index.column("seed").to_numpy()
-        task_of = np.array(dataset.index.column("task").to_pylist(), dtype=str)
-        wanted = np.ones(len(task_of), bool) if tasks is None else np.isin(task_of, tasks)
-        for number, name in enumerate(names.tolist()):
-            episodes = np.flatnonzero((shard_of == number) & wanted)
-            if len(episodes):
-                info, sha256 = dataset.shard(name).info, dataset.manifest["shards"][name]["sha256"]
-                # Of duplicates the first is kept: rather one with images than one without.
-                first_seed = int(seeds[episodes[0]])
-                order = (info.task, info.level, info.domain, first_seed, not info.images, sha256)
-                checksum = dataset.manifest["checksum"]
-                found.append((order, ShardPart(info, dataset.path, checksum, episodes.tolist())))
-    return [part for _, part in sorted(found, key=lambda entry: entry[0])]
+    return _write(config, datasets, {"": (parts, settings)}, "openvima data merge", report)
 
 
 def _skip_duplicates(

@@ -1,12 +1,11 @@
 """Summary of a folder of demonstrations: counts, sizes and histograms."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from openvima.data.manifest import CACHE_FOLDER, INDEX_NAME, MANIFEST_NAME
@@ -17,62 +16,23 @@ from openvima.multiprocess import Report
 
 
 @dataclass(frozen=True, slots=True)
-class Histogram:
-    """Counts of values.
-
-    Args:
-        title: What is counted, such as "steps in an episode".
-        counts: Value, as it is shown, to how often; in the order in which to show them.
-    """
-
-    title: str
-    counts: dict[str, int]
-
-    def rows(self) -> list[tuple[str, int, float, float]]:
-        """Return value, count, and its fraction of all and of the largest."""
-        total, most = sum(self.counts.values()), max(self.counts.values())
-        return [(label, count, count / total, count / most) for label, count in self.counts.items()]
-
-
-@dataclass(frozen=True, slots=True)
-class TaskSummary:
-    """Summary of one task.
-
-    Args:
-        task: Its name.
-        episodes: Number of episodes.
-        steps: Number of steps.
-        bytes: Size of their records.
-        seeds_tried: Seeds that were tried for them.
-        success_rate: Fraction of these seeds that gave an episode.
-        redraws: Unlucky draws that the sampler threw away.
-    """
-
-    task: str
-    episodes: int
-    steps: int
-    bytes: int
-    seeds_tried: int
-    success_rate: float
-    redraws: int
-
-
-@dataclass(frozen=True, slots=True)
 class Summary:
     """Summary of a finished folder.
 
     Args:
         folder: The folder.
         manifest: Its manifest.
-        tasks: One entry a task, by name.
-        histograms: Of levels, steps, tools and, with details, of objects, textures and prompt images.
+        tasks: Name of each task to its entry in the manifest, and "bytes", the size of its records.
+        histograms: What is counted, such as "steps in an episode", to how often each value occurs, in the
+            order in which to show them: of levels, steps, tools and, with details, of objects, textures and
+            prompt images.
         object_caches: Name of each object cache to its size in bytes.
     """
 
     folder: Path
     manifest: dict[str, Any]
-    tasks: tuple[TaskSummary, ...]
-    histograms: tuple[Histogram, ...]
+    tasks: dict[str, dict[str, Any]]
+    histograms: dict[str, dict[str, int]]
     object_caches: dict[str, int]
 
     @property
@@ -83,15 +43,11 @@ class Summary:
 
     def to_record(self) -> dict[str, Any]:
         """Return everything as plain values: the entries of the manifest, and an entry "summary"."""
-        tasks = {
-            task.task: {name: getattr(task, name) for name in task.__slots__ if name != "task"}
-            for task in self.tasks
-        }
         summary = {
             "finished": True,
             "file_bytes": self.file_bytes,
-            "tasks": tasks,
-            "histograms": {histogram.title: histogram.counts for histogram in self.histograms},
+            "tasks": self.tasks,
+            "histograms": self.histograms,
             "object_caches": self.object_caches,
         }
         return {**self.manifest, "summary": summary}
@@ -114,36 +70,22 @@ def summarise_folder(folder: str | Path, *, details: bool = False, report: Repor
     index_only = dataset_name(folder) is not None and not details
     folder = data_folder(folder, shards=not index_only)
     dataset = Dataset(folder, index_only=index_only)  # which also finds missing files
-    task_of = np.array(dataset.index.column("task").to_pylist(), dtype=str)
-    histograms = [*_index_histograms(dataset.index)]
+    index = dataset.index
+    sizes = index.group_by("task").aggregate([("num_bytes", "sum")])
+    num_bytes = dict(zip(*(sizes[name].to_pylist() for name in ("task", "num_bytes_sum")), strict=True))
+    tasks = {}
+    for task, entry in dataset.manifest["tasks"].items():
+        if task not in num_bytes:
+            raise DatasetError(f"{dataset.path} lists the task {echo(task)}, of which it holds no episode.")
+        tasks[task] = {**entry, "bytes": num_bytes[task]}
+    shown = {"level": "level", "steps in an episode": "steps", "end effector": "end_effector"}
+    histograms = {title: _in_order(_value_counts(index.column(name))) for title, name in shown.items()}
     if details:
-        histograms += _shard_histograms(dataset, report or (lambda done, total, note: None))
-    return Summary(
-        folder,
-        dataset.manifest,
-        tuple(_task_summary(dataset, task, task_of == task) for task in dataset.manifest["tasks"]),
-        tuple(histograms),
-        _measure_caches(folder),
-    )
+        histograms |= _shard_histograms(dataset, report or (lambda done, total, note: None))
+    return Summary(folder, dataset.manifest, tasks, histograms, _measure_caches(folder))
 
 
-def _task_summary(dataset: Dataset, task: str, chosen: np.ndarray) -> TaskSummary:
-    rows = np.flatnonzero(chosen)
-    if not len(rows):
-        raise DatasetError(f"{dataset.path} lists the task {echo(task)}, of which it holds no episode.")
-    num_bytes = int(dataset.index.column("num_bytes").to_numpy()[rows].sum())
-    entry = dataset.manifest["tasks"][task]
-    counts = {name: entry[name] for name in ("episodes", "steps", "seeds_tried", "success_rate", "redraws")}
-    return TaskSummary(task, bytes=num_bytes, **counts)
-
-
-def _index_histograms(index: pa.Table) -> Iterable[Histogram]:
-    yield Histogram("level", _in_order(_value_counts(index.column("level"))))
-    yield Histogram("steps in an episode", _in_order(_value_counts(index.column("steps"))))
-    yield Histogram("end effector", _in_order(_value_counts(index.column("end_effector"))))
-
-
-def _shard_histograms(dataset: Dataset, report: Report) -> list[Histogram]:
+def _shard_histograms(dataset: Dataset, report: Report) -> dict[str, dict[str, int]]:
     names = dataset.shard_names()
     numbers = {"objects on the table": Counter[int](), "images in the prompt": Counter[int]()}
     kinds = {
@@ -159,18 +101,17 @@ def _shard_histograms(dataset: Dataset, report: Report) -> list[Histogram]:
         for counter, field in zip(kinds.values(), ("object", "texture"), strict=True):
             counter.update(_value_counts(objects.flatten().field(field)))
         report(done, len(names), "")
-    return [
-        *(Histogram(title, _in_order(counts)) for title, counts in numbers.items()),
-        *(Histogram(title, _most_first(counts)) for title, counts in kinds.items()),
-    ]
+    return {
+        **{title: _in_order(counts) for title, counts in numbers.items()},
+        **{
+            title: dict(sorted(counts.items(), key=lambda e: (-e[1], e[0])))
+            for title, counts in kinds.items()
+        },
+    }
 
 
 def _in_order(counts: Mapping[Any, int]) -> dict[str, int]:
     return {str(value): counts[value] for value in sorted(counts)}
-
-
-def _most_first(counts: Counter[str]) -> dict[str, int]:
-    return dict(sorted(counts.items(), key=lambda entry: (-entry[1], entry[0])))
 
 
 def _value_counts(values: pa.Array | pa.ChunkedArray) -> dict[Any, int]:

@@ -32,7 +32,6 @@ from openvima.tasks.oracle import TIED_TO_TABLE
 
 COMMAND = "openvima studio"  # what manifests name as their maker
 DOMAIN, LEVEL = "user", "train"
-SHARD_SIZE = 50  # episodes; the last shard is written anew for each demonstration, 2 MB at most
 _MOVED_M = 0.002
 _LOCK_S = 10.0  # to wait for another session that records
 
@@ -154,41 +153,32 @@ def record_demonstration(
 
 
 def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
+    """Write a shard with one episode, so that those before stay as they are."""
     shards = _open_own_shards(folder)
-    settings = {**env_config.record(), "assets": load_assets(env_config.assets).name}
-    info = ShardInfo(demo.task, LEVEL, DOMAIN, 0, SHARD_SIZE, 0, versions=package_versions(), **settings)
     same = [shard for shard in shards if shard.info.task == demo.task]
+    settings = {**env_config.record(), "assets": load_assets(env_config.assets).name}
+    info = ShardInfo(demo.task, LEVEL, DOMAIN, len(same), 1, 0, versions=package_versions(), **settings)
     is_complete = (folder / MANIFEST_NAME).is_file()
     for shard in same:
         seeds = _seeds(shard) if shard.info.env_config == info.env_config else []
         if demo.seed in seeds:
             if not is_complete and shard[seeds.index(demo.seed)].content_hash() == demo.content_hash():
-                return _finish(folder, shards)  # recording it was interrupted
+                return _finish(folder)  # recording it was interrupted
             raise DatasetError(
                 f"{folder} holds a demonstration of this episode already ({demo.task}, seed {demo.seed}); "
                 "go on with another seed or scene."
             )
-    last = same[-1] if same and len(same[-1]) < SHARD_SIZE else None
-    if last is None or replace(last.info, number=0) != info:  # other settings or versions
-        last, info = None, replace(info, number=len(same))
-    else:
-        info = last.info
     (folder / MANIFEST_NAME).unlink(missing_ok=True)
     with ShardWriter(folder / info.file_name, info) as writer:
-        for row in range(0 if last is None else len(last)):
-            assert last is not None  # or there are no rows
-            writer.copy(last.batch(row))
         writer.write(demo)
-    others = [shard for shard in shards if shard is not last]
-    return _finish(folder, [*others, Shard(folder / info.file_name)])
+    return _finish(folder)
 
 
-def _finish(folder: Path, shards: Sequence[Shard]) -> int:
+def _finish(folder: Path) -> int:
     """Write index and manifest; return the number of demonstrations."""
-    config = {"level": LEVEL, "domain": DOMAIN}
-    paths = sorted(shard.path for shard in shards)
+    config, paths = {"level": LEVEL, "domain": DOMAIN}, sorted(folder.glob("*.arrow"))
     finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions())
-    return sum(map(len, shards))
+    return read_manifest(folder)["counts"]["episodes"]
 
 
 def _open_own_shards(folder: Path) -> list[Shard]:

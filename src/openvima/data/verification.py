@@ -304,12 +304,15 @@ class _Verifier:
             return 0
         self.notes += _notes_on_origin(checked)
         tasks = []
-        for task in self._replay_tasks(checked):
+        for name, rows in self._choose(checked):
+            info = checked[name].info
+            assert info is not None  # or its episodes are not chosen
+            asked = None if info.assets == "procedural" else self.config.assets
             try:
-                recorded = task.assets == task.info.assets
-                tasks.append(replace(task, assets=recorded_assets(task.assets)) if recorded else task)
+                assets = asked or recorded_assets(info.assets)
+                tasks.append(ReplayTask(self.folder / name, info, rows, assets))
             except AssetError as error:
-                self.notes.append(f"{task.path.name} cannot be replayed: {error}")
+                self.notes.append(f"{name} cannot be replayed: {error}")
         num_replayed, total = 0, sum(len(task.rows) for task in tasks)
         for task, found in self._map(replay_shard, tasks, total, "replaying"):
             name = task.path.name
@@ -324,8 +327,8 @@ class _Verifier:
                     self._add(name, f"replayed, {cause}", _NOT_AGAIN)
         return num_replayed
 
-    def _replay_tasks(self, checked: Mapping[str, _Checked]) -> Iterator[ReplayTask]:
-        """Choose a pseudorandom sample of each task by hashes of content and seed."""
+    def _choose(self, checked: Mapping[str, _Checked]) -> Iterator[tuple[str, tuple[int, ...]]]:
+        """Choose a pseudorandom sample of each task by hashes of content and seed: shards and their rows."""
         ranked: dict[str, list[tuple[bytes, str, int]]] = {}
         for name, found in checked.items():
             if found.info is None or found.info.domain == _PUBLISHED:
@@ -335,11 +338,7 @@ class _Verifier:
                 ranked.setdefault(found.info.task, []).append((rank, name, row))
         chosen = [place for places in ranked.values() for place in sorted(places)[: self.config.replay]]
         for name, places in itertools.groupby(sorted(chosen, key=lambda c: c[1:]), key=lambda c: c[1]):
-            info = checked[name].info
-            assert info is not None  # see above
-            asked = self.config.assets
-            assets = info.assets if asked is None or info.assets == "procedural" else asked
-            yield ReplayTask(self.folder / name, info, tuple(row for *_, row in places), assets)
+            yield name, tuple(row for *_, row in places)
 
 
 def check_shard(task: _ShardTask, count: Callable[[int], None]) -> _Checked:

@@ -7,7 +7,7 @@ import base64
 import contextlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
@@ -22,7 +22,8 @@ from openvima.errors import DatasetError, ShapeError, echo
 from openvima.imports import import_extra
 
 FRAMES_PER_SECOND = 30
-_CRF = "21"  # keeps textures clear at about 100 kB for 5 s
+# Every browser plays 4:2:0 chroma subsampling; the rest keeps textures clear at about 100 kB for 5 s.
+_PIXELS, _OPTIONS = "yuv420p", {"crf": "21", "preset": "medium"}
 
 
 def import_av() -> Any:
@@ -34,35 +35,19 @@ def import_av() -> Any:
     return import_extra("av", "videos need PyAV; install it with: pip install 'openvima[report]'")
 
 
-def open_video(path: Path, frames_per_second: int) -> tuple[Any, Any]:
-    """Open an MP4 file for writing, with its index at the front.
-
-    Args:
-        path: The file.
-        frames_per_second: Frame rate.
-
-    Returns:
-        The container and its stream, whose size, pixel format and quality are still to be set.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-    """
-    options = {"movflags": "+faststart", "fflags": "+bitexact"}
-    container = import_av().open(str(path), "w", format="mp4", options=options)
-    return container, container.add_stream("libx264", rate=frames_per_second)
-
-
 class VideoWriter:
     """Writes one video, frame by frame; a context manager.
 
-    The file is H.264 with 4:2:0 chroma subsampling, which every browser plays. It appears under its name
-    once it is complete; if the block raises, a file of that name is left as it was.
+    The file is H.264 with its index at the front. It appears under its name once it is complete; if the block
+    raises, a file of that name is left as it was.
 
     Args:
         path: The file; its folder is made.
         width: Width of the frames, even.
         height: Height of the frames, even.
         frames_per_second: Frame rate.
+        pixels: Pixel format.
+        options: Options of x264, such as quality.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -74,7 +59,14 @@ class VideoWriter:
     """
 
     def __init__(
-        self, path: Path, width: int, height: int, *, frames_per_second: int = FRAMES_PER_SECOND
+        self,
+        path: Path,
+        width: int,
+        height: int,
+        *,
+        frames_per_second: int = FRAMES_PER_SECOND,
+        pixels: str = _PIXELS,
+        options: Mapping[str, str] = _OPTIONS,
     ) -> None:
         if width % 2 or height % 2:
             raise ShapeError(f"a video of {width} × {height} pixels cannot be encoded; both must be even.")
@@ -83,18 +75,21 @@ class VideoWriter:
         self._shape = (height, width, 3)
         with contextlib.ExitStack() as closing:
             partial = closing.enter_context(atomic_path(path))
-            self._container, self._stream = open_video(partial, frames_per_second)
+            flags = {"movflags": "+faststart", "fflags": "+bitexact"}
+            self._container = self._av.open(str(partial), "w", format="mp4", options=flags)
+            self._stream = self._container.add_stream("libx264", rate=frames_per_second)
             self._closing = closing.pop_all()
-        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, pixels
         # x264's macroblock tree gave other bytes in about 1 of 200 equal runs, in one thread as well
-        self._stream.options = {"crf": _CRF, "preset": "medium", "threads": "1", "x264-params": "mbtree=0"}
+        self._stream.options = {**options, "threads": "1", "x264-params": "mbtree=0"}
 
-    def write(self, frame: np.ndarray, *, repeat: int = 1) -> None:
+    def write(self, frame: np.ndarray, *, repeat: int = 1, is_key: bool = False) -> None:
         """Append a frame.
 
         Args:
             frame: Shape (height, width, 3), uint8.
             repeat: How many times to append it.
+            is_key: Whether to encode the first of these without others.
 
         Raises:
             ShapeError: The frame has another size or dtype.
@@ -103,8 +98,10 @@ class VideoWriter:
             raise ShapeError(
                 f"got a frame of {frame.shape} {frame.dtype}; the video takes {self._shape} uint8."
             )
-        for _ in range(repeat):
+        for number in range(repeat):
             encoded = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            if is_key and not number:
+                encoded.pict_type = self._av.video.frame.PictureType.I
             self._container.mux(self._stream.encode(encoded))
 
     def __enter__(self) -> "VideoWriter":

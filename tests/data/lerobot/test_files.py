@@ -8,12 +8,8 @@ import pytest
 
 from openvima.data import Demonstration
 from openvima.data.lerobot import (
-    DATA_PATH,
     QUANTILES,
-    NumberedVideo,
-    PixelFormat,
     count_pixels,
-    numbered_path,
     pixel_statistics,
     value_statistics,
 )
@@ -21,6 +17,7 @@ from openvima.data.lerobot_frames import FrameLayout, action_from_row, frame_lay
 from openvima.errors import ActionError
 from openvima.scene import END_EFFECTORS, Action
 from openvima.scene.action import ToolCommand
+from openvima.video.encoder import VideoWriter
 
 
 @pytest.mark.parametrize("has_joints", [True, False])
@@ -73,11 +70,6 @@ def test_a_row_of_commands_is_one_for_the_environment() -> None:
     assert frame_layout("primitives", 0, False).state_names == ("end_effector",)
 
 
-def test_a_chunk_is_full_after_a_thousand_files(tmp_path: Path) -> None:
-    shown = [numbered_path(tmp_path, DATA_PATH, number).relative_to(tmp_path) for number in (999, 1000)]
-    assert [*map(str, shown)] == ["data/chunk-000/file-999.parquet", "data/chunk-001/file-000.parquet"]
-
-
 def smallest_not_exceeded_by(values: np.ndarray, share: float) -> float:
     """The definition of a quantile, taken literally."""
     return min(v for v in values if np.mean(values <= v) >= share)
@@ -108,9 +100,6 @@ def test_pictures_get_the_statistics_of_their_pixels_by_channel() -> None:
     assert found["count"].tolist() == [3]
 
 
-LARGE = 10**9
-
-
 def pictures(number: int, seed: int = 0) -> np.ndarray:
     """Pictures of coloured blocks with noise on them, shape (number, 3, 128, 256), uint8."""
     rng = np.random.default_rng(seed)
@@ -118,18 +107,21 @@ def pictures(number: int, seed: int = 0) -> np.ndarray:
     return blocks + rng.integers(0, 16, blocks.shape, dtype=np.uint8)
 
 
-def write(folder: Path, episodes: list[np.ndarray], *, fps: int = 1, pixels: PixelFormat = "yuv444p") -> Path:
-    with NumberedVideo(folder, "eye", fps=fps, pixels=pixels, limit_bytes=LARGE) as video:
+def write(path: Path, episodes: list[np.ndarray], *, fps: int) -> Path:
+    height, width = episodes[0].shape[2:]
+    with VideoWriter(path, width, height, frames_per_second=fps, pixels="yuv444p") as video:
         for episode in episodes:
-            video.write(episode, num_frames=len(episode))
-    return folder / "videos/eye/chunk-000/file-000.mp4"
+            for step, picture in enumerate(episode):
+                video.write(np.moveaxis(picture, 0, -1), is_key=step == 0)
+    return path
 
 
 @pytest.mark.parametrize(("fps", "lengths"), [(1, [1]), (16, [2, 1, 4])])
 def test_frames_lie_at_exact_times_and_an_episode_begins_with_a_key_frame(
     tmp_path: Path, fps: int, lengths: list[int]
 ) -> None:
-    path = write(tmp_path, [pictures(n, seed) for seed, n in enumerate(lengths)], fps=fps)
+    episodes = [pictures(n, seed) for seed, n in enumerate(lengths)]
+    path = write(tmp_path / "film.mp4", episodes, fps=fps)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         frames = list(container.decode(stream))
@@ -141,20 +133,3 @@ def test_frames_lie_at_exact_times_and_an_episode_begins_with_a_key_frame(
         assert stream.average_rate == fps
     starts = np.cumsum([0, *lengths[:-1]])
     assert all(frames[start].key_frame for start in starts)
-
-
-def test_a_file_that_has_reached_its_limit_is_followed_by_another(tmp_path: Path) -> None:
-    limit, places = 400_000, []
-    with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=limit) as video:
-        for seed in range(9):
-            places.append(video.write(pictures(2, seed), num_frames=2))
-    files = sorted(tmp_path.rglob("*.mp4"))
-    assert len(files) > 2
-    assert all(file.stat().st_size > limit for file in files[:-1])
-    numbers = [number for number, _ in places]
-    assert numbers == sorted(numbers)
-    for file_index, file in enumerate(files):
-        firsts = [first for number, first in places if number == file_index]
-        with av.open(str(file)) as container:
-            assert container.streams.video[0].frames == 2 * len(firsts)
-        assert firsts == list(range(0, 2 * len(firsts), 2))

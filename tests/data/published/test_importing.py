@@ -96,7 +96,7 @@ def test_an_import_can_be_extended_but_not_cut(source: Path, imported: Path, tmp
     assert [demo.seed for demo in Dataset(tmp_path)] == [0]
     import_published(config(source, tmp_path))
     assert contents(tmp_path) == contents(imported)
-    with pytest.raises(DatasetError, match=r"00001\.arrow holds episodes that were not asked for"):
+    with pytest.raises(DatasetError, match=r"00001\.arrow .* of its 2 episodes 1 are asked for"):
         import_published(config(source, tmp_path, episodes=4))
     assert contents(tmp_path).keys() >= {"dataset.json"}
 
@@ -105,7 +105,7 @@ def test_an_import_of_another_source_needs_force(source: Path, imported: Path, t
     other = write_zip(tmp_path / "other.zip", {"rotate/000001": MadeEpisode().files()})
     out = tmp_path / "out"
     import_published(config(other, out))
-    with pytest.raises(DatasetError, match=r"00000\.arrow belongs to another data set: vima is"):
+    with pytest.raises(DatasetError, match=r"00000\.arrow belongs to another data set, .*: vima is"):
         import_published(config(source, out))
     import_published(config(source, out, force=True))
     assert contents(out) == contents(imported)

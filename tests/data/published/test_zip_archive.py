@@ -96,7 +96,7 @@ def test_a_member_beyond_the_end_is_named(tmp_path: Path, offset: int) -> None:
     end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 1, 1, len(entry + name + extra), len(head), 0)
     (tmp_path / "a.zip").write_bytes(head + entry + name + extra + end)
     archive = ZipArchive(tmp_path / "a.zip")
-    with pytest.raises(DatasetError, match=r"obs\.pkl is not where the archive's directory says"):
+    with pytest.raises(DatasetError, match=r"(obs\.pkl cannot be read|directory is damaged)"):
         archive.files(archive.episodes()["rotate/000001"])
 
 
@@ -107,7 +107,7 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     name = "rotate/000001/obs.pkl"
     path = patched(tmp_path / "a.zip", name, local=22, central=24, layout="<L", value=1000)
     archive = ZipArchive(path)
-    with pytest.raises(DatasetError, match="checksum differs"):
+    with pytest.raises(DatasetError, match=r"obs\.pkl cannot be read: Bad CRC-32"):
         archive.files(archive.episodes()["rotate/000001"])
 
 

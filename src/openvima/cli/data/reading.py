@@ -14,7 +14,7 @@ from openvima.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from openvima.data.summary import Histogram, Summary
+    from openvima.data.summary import Summary
 
 _BAR_WIDTH = 40
 
@@ -81,10 +81,11 @@ def _summary(summary: "Summary", name: str) -> "Iterator[str | Table]":
         yield f"object cache {name}: {size / 1e6:,.1f} MB"
     yield ""
     yield _task_table(summary)
-    for histogram in summary.histograms:
-        if len(histogram.counts) > 1:
+    for title, counts in summary.histograms.items():
+        if len(counts) > 1:
             yield ""
-            yield from _bars(histogram)
+            yield title
+            yield from _bars(counts)
 
 
 def _settings(config: dict[str, Any]) -> str:
@@ -105,24 +106,23 @@ def _task_table(summary: "Summary") -> "Table":
     for name in ("episodes", "steps", "kB/episode", "seeds tried", "oracle success", "resamples"):
         table.add_column(name, justify="right", no_wrap=True)
     table.columns[0].no_wrap = True
-    for task in summary.tasks:
+    for task, entry in summary.tasks.items():
         table.add_row(
-            escape(_printable(task.task)),
-            f"{task.episodes:,}",
-            f"{task.steps:,}",
-            f"{task.bytes / task.episodes / 1e3:.1f}",
-            f"{task.seeds_tried:,}",
-            f"{task.success_rate:.1%}",
-            f"{task.redraws:,}",
+            escape(_printable(task)),
+            f"{entry['episodes']:,}",
+            f"{entry['steps']:,}",
+            f"{entry['bytes'] / entry['episodes'] / 1e3:.1f}",
+            f"{entry['seeds_tried']:,}",
+            f"{entry['success_rate']:.1%}",
+            f"{entry['redraws']:,}",
         )
     return table
 
 
-def _bars(histogram: "Histogram") -> Iterator[str]:
-    yield histogram.title
-    width = max(map(len, histogram.counts))
-    for label, count, share, length in histogram.rows():
-        bar = f"{'█' * max(1, round(_BAR_WIDTH * length))} {count:,} ({share:.1%})"
+def _bars(counts: dict[str, int]) -> Iterator[str]:
+    width, total, most = max(map(len, counts)), sum(counts.values()), max(counts.values())
+    for label, count in counts.items():
+        bar = f"{'█' * max(1, round(_BAR_WIDTH * count / most))} {count:,} ({count / total:.1%})"
         yield f"  {label:>{width}}  {bar}".rstrip()
 
 

@@ -87,7 +87,7 @@ def split(
     fractions = parse_splits(splits)
     with progress_bar("demonstrations") as report:
         written = write_split(config, fractions, report=report)
-    for name in fractions.fractions:
+    for name in fractions:
         print(written / name)
     return 0
 
