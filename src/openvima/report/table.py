@@ -91,7 +91,7 @@ def markdown(tables: Sequence[Table]) -> str:
 
 def latex(tables: Sequence[Table]) -> str:
     r"""Write tables in LaTeX; they need `\usepackage{booktabs}`."""
-    head = "% Needs \\usepackage{booktabs} and UTF-8 input; made with `openvima report --latex`.\n"
+    head = "% Needs \\usepackage{booktabs} and UTF-8 input; made with `openvima report`.\n"
     return head + "\n".join(_latex_table(table) for table in tables)
 
 
