@@ -121,6 +121,12 @@ def test_fine_tuning_compares_attributes_as_the_checkpoint_does(
     assert fresh.network.config.attributes.exclusive
 
 
+def test_weights_of_another_architecture_are_refused_without_a_list_of_all_sizes(settings) -> None:
+    config = TrainingConfig.of({**settings, "preset": "vima-nano", "init_from": "openvima-small"})
+    with pytest.raises(ConfigError, match=r"sizes: architecture is 'pointer' there and 'vima' here\. Give"):
+        build_learner(resolve(config), ["put it there"])
+
+
 def test_words_of_the_augmentation_are_in_the_vocabulary(data: Path, settings) -> None:
     config = TrainingConfig.of(settings)
     dataset = Dataset(data)

@@ -225,6 +225,8 @@ def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")
+    if here["architecture"] != there["architecture"]:
+        here, there = ({"architecture": sizes["architecture"]} for sizes in (here, there))  # says it all
     if differing := differences(there, here):
         raise ConfigError(
             f"init_from is {source}, a network of other sizes: {'; '.join(differing)}. Give the preset that "
