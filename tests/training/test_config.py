@@ -60,6 +60,11 @@ def test_values_out_of_range_are_all_named_in_one_message_with_what_is_allowed()
         assert "\n" not in message
 
 
+def test_bundled_weights_given_as_a_preset_are_pointed_to_init_from() -> None:
+    with pytest.raises(ConfigError, match=r"preset is 'openvima-vima', which are weights; init_from takes"):
+        TrainingConfig.of({**FOLDERS, "preset": "openvima-vima"})
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

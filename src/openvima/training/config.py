@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from openvima.errors import ConfigError, echo, unknown_name
 from openvima.input_files import settle
 from openvima.policies.config_fields import Range, problems_of
+from openvima.policies.naming import BUNDLED
 from openvima.policies.presets import PRESETS, own_policies
 from openvima.training.validation import (
     Count,
@@ -422,6 +423,8 @@ class TrainingConfig(RunConfig):
     def _unknown(self) -> Iterator[str]:
         if not isinstance(self.preset, str) or self.preset in PRESETS or ":" in self.preset:
             return
-        if self.preset not in own_policies():
+        if self.preset in BUNDLED:
+            yield f"preset is {self.preset!r}, which are weights; init_from takes them, beside their preset."
+        elif self.preset not in own_policies():
             names = (*PRESETS, *own_policies())
             yield unknown_name("preset", self.preset, names, "`openvima policies` lists all.")
