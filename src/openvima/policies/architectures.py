@@ -128,8 +128,9 @@ def vima(of: Size) -> TokenPolicyConfig:
 
     Source: VIMA (Jiang et al. 2023), section 4.
     """
+    images = ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width)
     head = BinsConfig(of.hidden_width, of.action_width)
-    return TokenPolicyConfig("vima", of.object_encoder(), of.prompt, of.decoder(), head)
+    return TokenPolicyConfig("vima", images, of.prompt, of.decoder(), head)
 
 
 def nano_bins() -> TokenPolicyConfig:
@@ -207,7 +208,7 @@ def midas(of: Size) -> TokenPolicyConfig:
     """
     return TokenPolicyConfig(
         "midas",
-        of.object_encoder(),
+        ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width),
         replace(of.prompt, visual_residual=True),
         of.prefix_decoder(),
         AutoregressiveConfig(of.hidden_width, of.initial_std, of.action_width),

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from openvima.errors import UnknownPolicyError, unknown_name
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.image_encoders import ResamplerConfig, VitConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
 
 T5_VOCABULARY_SIZE = 32128
@@ -31,8 +30,6 @@ class Size:
         image_width: Width of the image encoder.
         image_layers: Layers of the image encoder.
         image_heads: Heads of the image encoder.
-        rotation_bins: Classes of the rotation between two crops that contrastive pretraining tells apart; 0
-            pretrains appearance alone.
         resampler_layers: Self-attention layers of the resampler, and the number of passes.
         hidden_width: Hidden width of the action heads.
         action_width: Width of the features of each part of a past action.
@@ -47,7 +44,6 @@ class Size:
     image_width: int = 768
     image_layers: int = 4
     image_heads: int = 24
-    rotation_bins: int = 0
     resampler_layers: int = 4
     hidden_width: int = 512
     action_width: int = 256
@@ -71,11 +67,6 @@ class Size:
     def crop_encoder(self) -> VitConfig:
         """Return the encoder of object crops: 16 × 16 patches of 32 × 32 pixels."""
         return VitConfig(self.image_width, self.image_layers, self.image_heads, output_width=self.image_width)
-
-    def object_encoder(self) -> ObjectEncoderConfig:
-        """Return the encoder of objects, with a token for each view."""
-        crop = self.crop_encoder()
-        return ObjectEncoderConfig(crop, self.image_width, self.width, rotation_bins=self.rotation_bins)
 
     def frame_encoder(self, *, class_token: bool) -> VitConfig:
         """Return the encoder of whole frames: eight 32 × 32 patches of 64 × 128 pixels."""
@@ -132,7 +123,6 @@ def _nano() -> Size:
         image_width=96,
         image_layers=2,
         image_heads=4,
-        rotation_bins=72,
         resampler_layers=2,
         hidden_width=256,
         action_width=64,

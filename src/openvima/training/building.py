@@ -220,9 +220,8 @@ def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     """Check that a network can begin with the weights of another, whose vocabulary may have another size."""
     here, there = flatten(config_to_dict(ours)), flatten(config_to_dict(theirs))
-    for sizes in (here, there):  # two vectors and a layer of pretraining, which may begin anew
-        sizes.pop("points", None)
-        sizes.pop("images.rotation_bins", None)
+    for sizes in (here, there):
+        sizes.pop("points", None)  # its two vectors may begin anew
     if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
         here.pop("prompt.vocabulary_size")
         there.pop("prompt.vocabulary_size")

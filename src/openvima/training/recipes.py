@@ -75,7 +75,7 @@ _PAPERS_FRAMES: Mapping[str, Any] = {
     "loader.rerendered_prob": 0.4,
     # Of the tasks that take longest to learn; larger shares hold up the others. See
     # results/2026-11-28_papers.md.
-    "loader.repeat_tasks": "novel_adj=3,pick_in_order_then_restore=4,twist=2",
+    "loader.repeat_tasks": "novel_adj=3,pick_in_order_then_restore=4",
     "optimizer.learning_rate": 5e-4,
     "optimizer.weight_decay": 0.0,
     "schedule.warmup_steps": 200,
