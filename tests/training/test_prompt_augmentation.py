@@ -302,12 +302,13 @@ def test_unused_definitions_are_inserted_in_training_only_with_their_probability
     source = source_of_episodes([episodes["novel_adj"], episodes["visual_manipulation"]])
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
 
-    def lengths(prob: float) -> list[int]:
-        make = BatchMaker(source, collate, 0, 99, definers=np.array([0]), unused_definitions_prob=prob)
+    def lengths(prob: float, definers=(0,)) -> list[int]:
+        make = BatchMaker(source, collate, 0, 99, definers=definers, unused_definitions_prob=prob)
         return torch.cat([batch.prompts.mask_BL.sum(dim=1) for batch, _ in make(np.arange(2), 4)]).tolist()
 
     plain = lengths(0.0)
     assert all(more > few for more, few in zip(lengths(1.0), plain, strict=True))
+    assert lengths(1.0, definers=()) == plain
 
 
 @pytest.fixture(scope="module")

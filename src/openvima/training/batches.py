@@ -1,7 +1,7 @@
 """Batches of a training: which demonstrations each takes, from which cache, and in which parts."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -96,7 +96,7 @@ class BatchMaker:
             where it has the demonstration; see `training.source.alternative_source`.
         distractor_prob: Probability of inserting distractors from another demonstration, for those that allow
             it; see `with_distractors`.
-        definers: Demonstrations, by their index in the cache, whose prompts define words, shape (D,).
+        definers: Demonstrations, by their index in the cache, whose prompts define words.
         unused_definitions_prob: Probability of inserting such sentences of one of them, see
             `with_unused_definitions`.
         first_batches: Number of batches, the first ones, whose demonstrations keep their prompts.
@@ -108,7 +108,7 @@ class BatchMaker:
     largest: int
     alternatives: tuple[tuple[ExampleSource, float], ...] = ()
     distractor_prob: float = 0.0
-    definers: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    definers: Sequence[int] = ()
     unused_definitions_prob: float = 0.0
     first_batches: int = 0
 
@@ -135,8 +135,9 @@ class BatchMaker:
         example, prob = source.example(row), self.distractor_prob
         if prob and allows_distractors(example.episode.task) and rng.random() < prob:
             example = replace(example, other=self.source[int(rng.integers(len(self.source)))])
-        if len(self.definers) and rng.random() < self.unused_definitions_prob:
-            example = replace(example, definer=self.source.example(int(rng.choice(self.definers))))
+        if self.definers and rng.random() < self.unused_definitions_prob:
+            row = self.definers[int(rng.integers(len(self.definers)))]
+            example = replace(example, definer=self.source.example(row))
         return example
 
     def _divide(self, indices: np.ndarray) -> list[np.ndarray]:

@@ -115,6 +115,7 @@ class BehaviourCloning:
 
     def _from(self, step: int) -> Iterator[list[tuple[Any, int]]]:
         config, parts = self._config, self._config.optimizer.grad_accum_steps
+        unused_definitions_prob = config.augmentation.unused_definitions_prob
         ours = self._order.batch_size // self._parallel.num_ranks
         make = BatchMaker(
             self._training,
@@ -123,8 +124,8 @@ class BehaviourCloning:
             largest=-(-ours // parts),
             alternatives=self._alternatives,
             distractor_prob=config.augmentation.distractor_prob,
-            definers=find_definers(self._training),
-            unused_definitions_prob=config.augmentation.unused_definitions_prob,
+            definers=find_definers(self._training) if unused_definitions_prob else (),
+            unused_definitions_prob=unused_definitions_prob,
             first_batches=self._order.first_batches,
         )
         workers = min(config.loader.num_workers, num_cpus())

@@ -128,10 +128,10 @@ def show_first(order: BatchOrder, source: ExampleSource, tasks: Sequence[str], s
     return replace(order, first_batches=steps, first_episodes=places)
 
 
-def find_definers(source: ExampleSource) -> np.ndarray:
-    """Return the demonstrations whose prompts define words, by their index in the cache, shape (D,)."""
+def find_definers(source: ExampleSource) -> list[int]:
+    """Return the demonstrations whose prompts define words, by their index in the cache."""
     defining = [name for name in list_tasks() if "{novel_" in task_spec(name).template]
-    return np.unique(source.rows[np.isin(_tasks_of(source), defining)])
+    return np.unique(source.rows[np.isin(_tasks_of(source), defining)]).tolist()
 
 
 def _tasks_of(source: ExampleSource) -> np.ndarray:
