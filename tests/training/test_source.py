@@ -3,8 +3,10 @@
 from collections import Counter
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 
@@ -29,6 +31,7 @@ from openvima.training.policy import scene_tasks
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
     check_words,
+    find_definers,
     make_order,
     open_demonstrations,
     repeat_tasks,
@@ -159,6 +162,14 @@ def test_the_first_steps_show_some_tasks_alone_and_all_of_their_demonstrations(d
     assert show_first(plain, source, ["twist"], steps=5) is plain  # there are none of these
     everything = [*{example.episode.task for example in training}, "twist"]
     assert show_first(plain, source, everything, steps=5) is plain
+
+
+def test_demonstrations_whose_prompts_define_words_are_found_once():
+    index = pa.table({"task": ["rotate", "novel_noun", "twist", "novel_adj"]})
+    cache = SimpleNamespace(dataset=SimpleNamespace(index=index))
+    nothing = np.zeros(0, np.int64)
+    assert find_definers(ExampleSource(cache, np.array([0, 1, 2, 3, 3]), nothing, nothing)) == [1, 3]
+    assert find_definers(ExampleSource(cache, np.array([0, 2]), nothing, nothing)) == []
 
 
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):
