@@ -162,7 +162,7 @@ def test_bundled_vima_picks_what_the_prompt_shows_and_places_it_at_an_object_in_
     explanation, goal_id = explain_bundled("openvima-vima")
     picked = max(explanation.objects, key=lambda each: each.probability)
     assert picked.object_id == goal_id
-    assert explanation.distinct_places()[0].kind in ("in view", "first step")
+    assert explanation.distinct_places()[0].kind == "in view"
 
 
 def test_the_bundled_policy_attends_to_what_it_picks_and_to_where_it_goes() -> None:

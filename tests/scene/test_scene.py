@@ -1,6 +1,7 @@
 """Scenes, poses, prompts, goals and actions."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -201,6 +202,11 @@ def test_candidates_at_one_place_count_together() -> None:
     places = explained([1.0], [(0.3, 0.3), (0.5, 0.4), (0.31, 0.3)]).distinct_places()
     assert [round(place.probability, 6) for place in places] == [0.6, 0.4]
     assert places[0].position == (0.3, 0.0)
+    at_start, in_view = (
+        PlaceProbability(k, (0.3, 0.0), p) for k, p in (("first step", 0.7), ("in view", 0.3))
+    )
+    (place,) = replace(explained([1.0], []), places=(at_start, in_view)).distinct_places()
+    assert (place.kind, place.probability) == ("in view", 1.0)
 
 
 def test_the_second_choice_is_another_place_or_another_object() -> None:

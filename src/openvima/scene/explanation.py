@@ -80,13 +80,17 @@ class Explanation:
     words: str = ""
 
     def distinct_places(self) -> list[PlaceProbability]:
-        """Join candidates at one place under the most probable one's kind, the most probable first."""
+        """Join candidates at one place, the most probable first.
+
+        What is in view is called so, also where it stood at the start; else the most probable kind counts.
+        """
         joined: list[PlaceProbability] = []
         for each in sorted(self.places, key=lambda each: -each.probability):
             for index, other in enumerate(joined):
                 if math.dist(each.position, other.position) < SAME_PLACE_M:
                     total = each.probability + other.probability
-                    joined[index] = PlaceProbability(other.kind, other.position, total)
+                    kind = each.kind if each.kind == "in view" else other.kind
+                    joined[index] = PlaceProbability(kind, other.position, total)
                     break
             else:
                 joined.append(each)
