@@ -156,8 +156,9 @@ class PromptedRolloutPolicy:
             actions = self._policy.act(
                 [None if image is None else seen.observation(image) for seen, image in pairs]
             )
-        given = f"{len(actions)} actions" if isinstance(actions, Sequence) else f"a {type(actions).__name__}"
-        if given != f"{len(observations)} actions":
+        is_list = isinstance(actions, Sequence)
+        if not is_list or len(actions) != len(observations):
+            given = f"{len(actions)} actions" if is_list else f"a {type(actions).__name__}"
             raise PolicyError(
                 f"{self._name} gave {given} for {len(observations)} observations; act must return a list "
                 "with an action for each."

@@ -136,8 +136,8 @@ class BatchMaker:
         if prob and allows_distractors(example.episode.task) and rng.random() < prob:
             example = replace(example, other=self.source[int(rng.integers(len(self.source)))])
         if self.definers and rng.random() < self.unused_definitions_prob:
-            row = self.definers[int(rng.integers(len(self.definers)))]
-            example = replace(example, definer=self.source.example(row))
+            definer = self.definers[int(rng.integers(len(self.definers)))]
+            example = replace(example, definer=self.source.example(definer))
         return example
 
     def _divide(self, indices: np.ndarray) -> list[np.ndarray]:

@@ -119,12 +119,12 @@ def shuffle_sentences(episode: PreprocessedEpisode, rng: np.random.Generator) ->
     """
     definitions, comparisons, instruction = [], [], []
     for sentence in _SENTENCE_END.split(episode.prompt.text):
-        if _IS_COMPARISON.search(sentence):
-            comparisons.append(sentence)
-        elif sentence.startswith(DEFINITION.partition("{")[0]):
-            definitions.append(sentence)
-        else:
+        if not _defines(sentence):
             instruction.append(sentence)
+        elif _IS_COMPARISON.search(sentence):
+            comparisons.append(sentence)
+        else:
+            definitions.append(sentence)
     if comparisons:
         kept = rng.permutation(len(comparisons))[: int(rng.integers(1, len(comparisons) + 1))]
         definitions += [comparisons[int(number)] for number in kept]
@@ -155,9 +155,10 @@ def with_unused_definitions(
     own = _SENTENCE_END.split(episode.prompt.text)
     num_leading = next((n for n, sentence in enumerate(own) if not _defines(sentence)), len(own))
     words: dict[str, str] = {}
+    taken, said = (_NOVEL_WORD.findall(each.prompt.text) for each in (episode, other))
     for kind in (NOUNS, ADJECTIVES):
-        free = [word for word in kind if not re.search(rf"\b{word}\b", episode.prompt.text)]
-        used = [word for word in kind if re.search(rf"\b{word}\b", other.prompt.text)]
+        free = [word for word in kind if word not in taken]
+        used = [word for word in kind if word in said]
         words |= zip(used, (free[int(n)] for n in rng.permutation(len(free))), strict=False)
     for index in rng.permutation(len(there))[: int(rng.integers(1, MAX_DEFINITIONS + 1))]:
         found = _NOVEL_WORD.search(there[int(index)])
