@@ -19,7 +19,7 @@ TRIANGLES = np.array(
 @contextlib.contextmanager
 def restored_assets() -> Iterator[None]:
     """Forget at the end of a block what it registered."""
-    tables = (registration._ENTRIES, registration.REGISTERED_OBJECTS, registration.REGISTERED_TEXTURES)
+    tables = (registration._CONTENTS, registration.REGISTERED_OBJECTS, registration.REGISTERED_TEXTURES)
     before = [dict(table) for table in tables]
     try:
         yield

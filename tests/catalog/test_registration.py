@@ -121,7 +121,7 @@ def test_a_texture_has_a_name_of_its_own(name: str) -> None:
         ((CORNERS, TRIANGLES - 1), "name vertices -1"),
         ((CORNERS, np.zeros((20_001, 3), int)), "20001 triangles"),
         ((CORNERS * (1, 1, 0), TRIANGLES), "is flat"),
-        ((CORNERS, TRIANGLES[1:]), "is open: 3 edges"),
+        ((CORNERS, TRIANGLES[1:]), "is open"),
         ((CORNERS, np.concatenate([TRIANGLES[:1, ::-1], TRIANGLES[1:]])), "inverted triangles"),
         ("nowhere.obj", "cannot be read"),
     ],

@@ -45,8 +45,8 @@ def forget() -> None:
     for table in (registration.REGISTERED_OBJECTS, registration.REGISTERED_TEXTURES):
         for name in [name for name in table if name.startswith("test ")]:
             del table[name]
-    for key in [key for key in registration._ENTRIES if key[1].startswith("test ")]:
-        del registration._ENTRIES[key]
+    for key in [key for key in registration._CONTENTS if key[1].startswith("test ")]:
+        del registration._CONTENTS[key]
 
 
 def register_bar_task() -> None:

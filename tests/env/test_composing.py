@@ -71,7 +71,7 @@ def test_all_forms_of_objects_mean_the_same() -> None:
         ([("heart", "red", (0.74, 0.1))], ["'a' (red heart)", "with its edge", "0.25 … 0.75 m"]),
         (
             [*OBJECTS, ("star", "blue", (0.52, 0.2))],
-            ["'c' (blue star)", "'b' (green bowl)", "cm²", "0 is allowed"],
+            ["'c' (blue star)", "'b' (green bowl)", "must not cover"],
         ),
         ([("heart", "red", (float("nan"), 0.1))], ["object 0 ('a'): position is nan", "a number from"]),
         ([("heart", "red", (0.5, 0.1), 1e9)], ["yaw_deg is 1000000000.0", "-3600 to 3600"]),

@@ -108,14 +108,14 @@ def test_a_killed_worker_is_reported_and_ends_all() -> None:
     victim = envs.processes[1]
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
-    with pytest.raises(WorkerError, match=r"sub-environment 1 \(exit code -9\) died; (?!.*__main__)"):
+    with pytest.raises(WorkerError, match=r"sub-environment 1 \(exit code -9\) died; "):
         envs.step(IDLE)
     assert not any(process.is_alive() for process in envs.processes)
     envs.close()
 
 
 def test_a_worker_that_does_not_start_is_reported() -> None:
-    with pytest.raises(WorkerError, match=r"0 \(exit code 3\).* could not start: .*__main__"):
+    with pytest.raises(WorkerError, match=r"0 \(exit code 3\).* died.*__main__"):
         build(FailsToStart())
 
 

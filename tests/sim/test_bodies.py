@@ -39,7 +39,6 @@ def test_a_dropped_body_comes_to_lie_at_its_rest_height(name) -> None:
     settling = Settling(bodies)
     while not settling.is_over:
         settling.run()
-    assert settling.is_at_rest
     assert settling.num_ticks < SETTLE_LIMIT_TICKS
     assert bodies.pose(0).z == pytest.approx(placement.pose.z, abs=2e-4)
 

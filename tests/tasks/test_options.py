@@ -94,7 +94,7 @@ def test_every_task_takes_up_to_six_distractors(task: str) -> None:
     counts = []
     for count in (0, MAX_DISTRACTORS):
         problem = sample_episode(task, level=level, seed=1, num_distractors=count).problem
-        checked = [c for c in problem.constraints if isinstance(c, DistractorsApart | ZoneKeptClear)]
+        checked = [c for c in problem.constraints if type(c) in (DistractorsApart, ZoneKeptClear)]
         counts.append((len(problem.scene.placements), sum(len(c.object_ids) for c in checked)))
     (fewer, fewer_checked), (more, more_checked) = counts
     assert more - fewer == MAX_DISTRACTORS

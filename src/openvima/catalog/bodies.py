@@ -6,7 +6,7 @@ origin, and the letter T is upright.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -28,56 +28,43 @@ HEIGHT_DIVISOR = 1.1  # nominal over true height of the container in VIMA-Bench
 FLOOR_Z_M = -0.001  # height of the surface on which bodies rest
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A box along the axes of the link frame.
-
-    Args:
-        size: Full extents in metres.
-        centre: Centre in metres.
-    """
-
-    size: Vector3
-    centre: Vector3 = (0.0, 0.0, 0.0)
-
-    def to_collision(self) -> CollisionBox:
-        """Return the box as a collision shape."""
-        x, y, z = self.size
-        return CollisionBox((x / 2, y / 2, z / 2), self.centre)
+def box(size: Vector3, centre: Vector3 = (0.0, 0.0, 0.0)) -> CollisionBox:
+    """Return a box of some full extents, metres."""
+    x, y, z = size
+    return CollisionBox((x / 2, y / 2, z / 2), centre)
 
 
-def box_mesh(boxes: Sequence[Box]) -> TriangleMesh:
+def box_mesh(boxes: Sequence[CollisionBox]) -> TriangleMesh:
     """Return the triangles of several boxes, each wrapped in the whole texture, in the given order."""
     cube = fixed_geometry("cube").visual  # with edges −1 … 1; every face gets a sixteenth of the texture
-    vertices = [cube.vertices * (np.array(box.size) / 2) + np.array(box.centre) for box in boxes]
+    vertices = [cube.vertices * box.half_size + box.centre for box in boxes]
     repeats = (len(boxes), 1, 1)
     return TriangleMesh(np.concatenate(vertices), np.tile(cube.normals, repeats), np.tile(cube.uvs, repeats))
 
 
 def block(size: Vector3) -> Geometry:
     """Return a solid box, origin at its centre."""
-    box = Box(size)
-    return Geometry(box_mesh([box]), (box.to_collision(),), size[2] / 2 + FLOOR_Z_M)
+    return Geometry(box_mesh([box(size)]), (box(size),), size[2] / 2 + FLOOR_Z_M)
 
 
 def line(size: Vector3) -> Geometry:
     """Return a strip on the table without collision; its thickness is fixed."""
-    strip = Box((size[0], size[1], SHEET_THICKNESS_M))
-    return Geometry(box_mesh([strip]), (), SHEET_THICKNESS_M / 2)
+    strip = box((size[0], size[1], SHEET_THICKNESS_M))
+    return Geometry(box_mesh([strip]), rest_z_m=SHEET_THICKNESS_M / 2)
 
 
 def container(size: Vector3) -> Geometry:
     """Return an open box, origin at its centre; the middle planes of its walls are on the borders."""
     x, y, height = size[0], size[1], size[2] / HEIGHT_DIVISOR
     boxes = [
-        Box((x, y, WALL_M), (0.0, 0.0, -height / 2)),
-        Box((x, WALL_M, height), (0.0, -y / 2, 0.0)),
-        Box((x, WALL_M, height), (0.0, y / 2, 0.0)),
-        Box((WALL_M, y, height), (-x / 2, 0.0, 0.0)),
-        Box((WALL_M, y, height), (x / 2, 0.0, 0.0)),
+        box((x, y, WALL_M), (0.0, 0.0, -height / 2)),
+        box((x, WALL_M, height), (0.0, -y / 2, 0.0)),
+        box((x, WALL_M, height), (0.0, y / 2, 0.0)),
+        box((WALL_M, y, height), (-x / 2, 0.0, 0.0)),
+        box((WALL_M, y, height), (x / 2, 0.0, 0.0)),
     ]
     rest_z_m = (height + WALL_M) / 2 + FLOOR_Z_M
-    return Geometry(box_mesh(boxes), tuple(box.to_collision() for box in boxes), rest_z_m)
+    return Geometry(box_mesh(boxes), tuple(boxes), rest_z_m)
 
 
 def square(size: Vector3) -> Geometry:
@@ -87,24 +74,24 @@ def square(size: Vector3) -> Geometry:
     """
     length, width, half = size[0], size[1], size[0] / 2
     boxes = [
-        Box((length, width, SHEET_THICKNESS_M), (0.0, half, 0.0)),
-        Box((length, width, SHEET_THICKNESS_M), (0.0, -half, 0.0)),
-        Box((width, length, SHEET_THICKNESS_M), (half, 0.0, 0.0)),
-        Box((width, length, SHEET_THICKNESS_M), (-half, 0.0, 0.0)),
+        box((length, width, SHEET_THICKNESS_M), (0.0, half, 0.0)),
+        box((length, width, SHEET_THICKNESS_M), (0.0, -half, 0.0)),
+        box((width, length, SHEET_THICKNESS_M), (half, 0.0, 0.0)),
+        box((width, length, SHEET_THICKNESS_M), (-half, 0.0, 0.0)),
     ]
     strip = CollisionBox((length / 2, width / 2, SHEET_THICKNESS_M))
-    return Geometry(box_mesh(boxes), (strip,), 0.0)
+    return Geometry(box_mesh(boxes), (strip,))
 
 
 def three_sided_rectangle(size: Vector3) -> Geometry:
     """Return three flat bars, open towards +y: `size[0]` is the extent along y, `size[1]` the one along x."""
     depth, width, bar = size[0], size[1], 0.04
     boxes = [
-        Box((width, bar, SHEET_THICKNESS_M), (0.0, -depth / 2, 0.0)),
-        Box((bar, depth, SHEET_THICKNESS_M), (width / 2, 0.0, 0.0)),
-        Box((bar, depth, SHEET_THICKNESS_M), (-width / 2, 0.0, 0.0)),
+        box((width, bar, SHEET_THICKNESS_M), (0.0, -depth / 2, 0.0)),
+        box((bar, depth, SHEET_THICKNESS_M), (width / 2, 0.0, 0.0)),
+        box((bar, depth, SHEET_THICKNESS_M), (-width / 2, 0.0, 0.0)),
     ]
-    return Geometry(box_mesh(boxes), (), 0.0)
+    return Geometry(box_mesh(boxes))
 
 
 def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:

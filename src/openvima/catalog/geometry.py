@@ -2,7 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
-from typing import Protocol, TypeGuard
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -69,8 +69,8 @@ class Geometry:
     """
 
     visual: TriangleMesh
-    collision: tuple[CollisionShape, ...]
-    rest_z_m: float
+    collision: tuple[CollisionShape, ...] = ()
+    rest_z_m: float = 0.0
 
 
 def protect(geometry: Geometry) -> Geometry:
@@ -82,11 +82,7 @@ def protect(geometry: Geometry) -> Geometry:
     return geometry
 
 
-def is_pack(value: object) -> "TypeGuard[Assets]":
-    """Whether a value has the methods of an asset pack."""
-    return all(callable(getattr(value, name, None)) for name in ("geometry", "texture"))
-
-
+@runtime_checkable
 class Assets(Protocol):
     """A pack of shapes and textures.
 

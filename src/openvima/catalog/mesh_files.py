@@ -4,7 +4,7 @@ Meshes of users come from files and code that nobody has reviewed.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -17,7 +17,7 @@ from openvima.input_files import as_path
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObjMesh:
+class ObjMesh(TriangleMesh):
     """The faces of a file as triangles, in the file's order.
 
     Args:
@@ -27,9 +27,6 @@ class ObjMesh:
         parts: Number of the named object ("o" line) that each triangle is part of, shape (F,), int32.
     """
 
-    vertices: np.ndarray
-    normals: np.ndarray
-    uvs: np.ndarray
     parts: np.ndarray
 
 
@@ -115,8 +112,7 @@ MAX_TRIANGLES = 20_000
 MAX_OBJ_BYTES = 8 << 20
 MIN_LENGTH_M, MAX_LENGTH_M = 0.001, 0.4  # of each side; the workspace is 0.5 m × 1 m
 MAX_PARTS = 64  # convex parts of a collision body
-_MAX_UNITS = 1e6  # of coordinates in a file
-_MAX_UV = 1e3
+_MAX_COORDINATE = 1e6  # in a file, of points and textures
 _MIN_THICKNESS = 1e-4  # of a body, relative to its length
 _MAX_HULL_POINTS = 256
 _NUM_DIRECTIONS = 512  # in which a larger hull keeps its farthest points
@@ -217,18 +213,16 @@ def _read(mesh: Mesh, what: str) -> ObjMesh:
         raise AssetError(
             f"mesh of {what} has {len(found.vertices)} triangles; 4 … {MAX_TRIANGLES} are allowed."
         )
-    if not (np.abs(found.vertices) <= _MAX_UNITS).all():  # NaN fails too
-        raise AssetError(f"mesh of {what} has a coordinate that is not finite or beyond ±{_MAX_UNITS:g}.")
+    coordinates = (found.vertices, found.uvs)
+    if not all((np.abs(each) <= _MAX_COORDINATE).all() for each in coordinates):  # NaN fails too
+        raise AssetError(
+            f"mesh of {what} has a coordinate that is not finite or beyond ±{_MAX_COORDINATE:g}."
+        )
     lengths = np.linalg.norm(found.normals, axis=2, keepdims=True)
     flat = face_normals(found.vertices)
     is_usable = np.isfinite(lengths) & (lengths > 0)
     normals = np.where(is_usable, found.normals / np.where(is_usable, lengths, 1.0), flat)
-    uvs = found.uvs
-    if not (np.abs(uvs) <= _MAX_UV).all():
-        raise AssetError(
-            f"mesh of {what} has a texture coordinate that is not finite or beyond ±{_MAX_UV:g}."
-        )
-    return ObjMesh(found.vertices, normals, uvs, found.parts)
+    return replace(found, normals=normals)
 
 
 def _read_file(file: Path, what: str) -> ObjMesh:
@@ -302,12 +296,9 @@ def _orient(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarra
     count = int(corner.max()) + 1
     edges, reverse = start * count + end, end * count + start
     if not np.array_equal(np.sort(edges), np.sort(reverse)):
-        _, uses = np.unique(np.minimum(edges, reverse), return_counts=True)
-        num_open = int((uses % 2).sum())
-        fault = f"is open: {num_open} edges have no second triangle" if num_open else "has inverted triangles"
         raise AssetError(
-            f"mesh of {what} {fault}, and triangles are drawn from outside only. Repair it, or pass "
-            "double_sided=True."
+            f"mesh of {what} is open or has inverted triangles, and triangles are drawn from outside only. "
+            "Repair it, or pass double_sided=True."
         )
     middle = vertices.reshape(-1, 3).mean(axis=0)
     a, b, c = np.moveaxis(vertices - middle, 1, 0)

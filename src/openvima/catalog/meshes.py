@@ -131,19 +131,14 @@ def _side_walls(loop: np.ndarray, z_low: float, z_high: float, texture_per_m: fl
     outward = np.stack([end[:, 1] - start[:, 1], start[:, 0] - end[:, 0]], axis=1)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     folded = outward * (z_high - z_low)  # where the lower edge would be if the wall were folded up flat
-    corners = {
-        "low start": (_at_height(start, z_low), start + folded),
-        "low end": (_at_height(end, z_low), end + folded),
-        "high end": (_at_height(end, z_high), end),
-        "high start": (_at_height(start, z_high), start),
-    }
-    vertices, flat = [], []
-    for names in (("low start", "low end", "high end"), ("low start", "high end", "high start")):
-        vertices.append(np.stack([corners[name][0] for name in names], axis=1))
-        flat.append(np.stack([corners[name][1] for name in names], axis=1))
+    positions = [_at_height(point, z_low) for point in (start, end)]
+    positions += [_at_height(point, z_high) for point in (end, start)]
+    vertices, flat = (
+        np.concatenate([np.stack([corners[i] for i in each], axis=1) for each in ((0, 1, 2), (0, 2, 3))])
+        for corners in (positions, [start + folded, end + folded, end, start])
+    )
     normal = np.repeat(np.concatenate([outward, outward])[:, None], 3, axis=1)
-    uvs = _planar_uvs(np.concatenate(flat), texture_per_m)
-    return TriangleMesh(np.concatenate(vertices), _at_height(normal, 0.0), uvs)
+    return TriangleMesh(vertices, _at_height(normal, 0.0), _planar_uvs(flat, texture_per_m))
 
 
 def _revolved_ring(

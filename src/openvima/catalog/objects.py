@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from openvima.catalog.geometry import Vector3
-from openvima.catalog.records import read_records
-from openvima.errors import UnknownNameError, unknown_name
+from openvima.catalog.records import find_record, read_records
 
 ObjectKind = Literal["kit", "box", "compound", "mesh", "registered"]
 Profile = Literal["square", "circle"]
@@ -27,43 +26,35 @@ class ObjectSpec:
 
     Args:
         name: Display name, by which everything refers to the object, such as "letter A".
-        id: Identifier in upper case, such as "CAPITAL_LETTER_A".
         kind: "kit" (flat prism of fixed size, origin at its bottom), "box" (of the sampled size), "compound"
             (boxes placed from the sampled size), "mesh" (fixed size) or "registered" (a user's mesh, of
             the sampled size).
         size_min: Smallest nominal size (x, y, z) in metres. Sampling and spacing use it; the mesh may be
             smaller or larger.
         size_max: Largest nominal size; each axis is sampled uniformly in between.
-        inertia_diag: Principal moments at the smallest size, kg m².
         symmetry_rad: Angle of rotational symmetry as the benchmark stores it: 2π none, 0 any angle, None
             unset. Stored and true values differ for block (true: π/2), cross (π/2) and triangle (2π); no
             task tests the rotation of these.
         profile: Outline that counts for "same profile"; None is a class of its own.
         mass_kg: Mass.
         friction: Coulomb friction against the table.
-        rolling_friction: Coefficient of rolling resistance, metres.
         com_offset: Centre of mass in the link frame, metres. Those of bowl and frame are beside it, since
             the benchmark reads back their poses.
         kit_scale: Scale s of a kit object: a nominal width of 0.08 s and a height of 0.02 s; None otherwise.
         aliases: Other names for paraphrased instructions; not valid names.
-        novel_names: Further names that no task uses yet.
     """
 
     name: str
-    id: str
     kind: ObjectKind
     size_min: Vector3
     size_max: Vector3
-    inertia_diag: Vector3
     symmetry_rad: float | None = None
     profile: Profile | None = None
     mass_kg: float = 0.1
     friction: float = 1.0
-    rolling_friction: float = 1e-4
     com_offset: Vector3 = (0.0, 0.0, 0.0)
     kit_scale: float | None = None
     aliases: tuple[str, ...] = ()
-    novel_names: tuple[str, ...] = ()
 
 
 OBJECTS: dict[str, ObjectSpec] = {
@@ -89,12 +80,4 @@ def object_spec(name: str) -> ObjectSpec:
         >>> object_spec("block").size_max
         (0.07, 0.07, 0.07)
     """
-    try:
-        return OBJECTS.get(name) or REGISTERED_OBJECTS[name]
-    except (KeyError, TypeError):
-        hint = (
-            "`openvima.catalog.OBJECTS` holds the 31 built-in ones; your own need `register_object`, in "
-            "a file of OPENVIMA_TASK_FILES or for --assets."
-        )
-        known = (*OBJECTS, *REGISTERED_OBJECTS)
-        raise UnknownNameError(unknown_name("object", name, known, hint)) from None
+    return find_record("object", name, OBJECTS, REGISTERED_OBJECTS)

@@ -4,7 +4,6 @@ Files come from a checkout, or from copies in the cache. Every file is compared 
 incomplete or different pack is reported.
 """
 
-import contextlib
 import hashlib
 import io
 import json
@@ -15,7 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from openvima.atomic_io import atomic_write, atomic_write_file
+from openvima.atomic_io import atomic_write_file
 from openvima.catalog.bodies import BOX_SHAPES, fixed_geometry
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
 from openvima.catalog.mesh_files import ObjMesh, parse_obj
@@ -164,7 +163,7 @@ class OriginalAssets:
     name = "original"
 
     def __init__(self, source: str | Path) -> None:
-        self.folder = imported_pack() if source == imported_folder() else find_pack(source)
+        self.folder = find_pack(source)
 
     def __repr__(self) -> str:
         return f"OriginalAssets({str(self.folder)!r})"
@@ -230,7 +229,7 @@ def _kit(pack: Path, spec: ObjectSpec, scale: Vector3) -> Geometry:
     metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
     name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
     visual = _scale(_mesh(pack, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
-    return Geometry(visual, (_hull(visual.vertices),), 0.0)
+    return Geometry(visual, (_hull(visual.vertices),))
 
 
 def _fixed_mesh(pack: Path, object_name: str, scale: Vector3) -> Geometry:
@@ -271,34 +270,21 @@ def _protected_texture(pack: Path, texture_name: str) -> np.ndarray:
         texture = np.array(spec.texel, dtype=np.uint8).reshape(1, 1, 3)
     else:
         try:
-            texture = _image(pack, image_file(spec))
+            texture = _decode(pack, image_file(spec))
         except AssetError as error:
             raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
     texture.setflags(write=False)
     return texture
 
 
-def _image(pack: Path, relative_path: str) -> np.ndarray:
-    """Decode an image once, and cache it: decoders of JPEG differ by a level or two."""
+def _decode(pack: Path, relative_path: str) -> np.ndarray:
+    from PIL import Image
+
     content = read_original(pack, relative_path)
-    path = cache_dir() / "original-images-2" / f"{known_hashes()[relative_path][:32]}.npy"
-    with contextlib.suppress(OSError, ValueError, EOFError):  # a damaged entry is replaced
-        return np.load(path, allow_pickle=False)
-    array = _decode(content, relative_path)
-    with contextlib.suppress(OSError):  # without write access it is decoded each time
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as file:
-            np.save(file, array, allow_pickle=False)
-    return array
-
-
-def _decode(content: bytes, relative_path: str) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
     try:
         with Image.open(io.BytesIO(content)) as image:
             return np.array(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError) as error:
+    except OSError as error:
         raise AssetError(
             f"{relative_path} cannot be decoded ({error}); is Pillow installed with support for it?"
         ) from error

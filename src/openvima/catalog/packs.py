@@ -8,9 +8,7 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-
-from openvima.catalog.geometry import Assets, Geometry, Vector3, is_pack
+from openvima.catalog.geometry import Assets
 from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, echo, unknown_name
 from openvima.input_files import as_path
@@ -31,21 +29,13 @@ class UserAssets:
     def __init__(self, source: str, base: Assets) -> None:
         self.source = source
         self.name = without_folder(source)
-        self._base = base
+        self.geometry, self.texture = base.geometry, base.texture
 
     def __repr__(self) -> str:
         return f"UserAssets({self.source!r})"
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return load_user_assets, (self.source,)
-
-    def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
-        """Return the shape of an object; see `Assets.geometry`."""
-        return self._base.geometry(object_name, size, scale)
-
-    def texture(self, texture_name: str) -> np.ndarray:
-        """Return the texture's image; see `Assets.texture`."""
-        return self._base.texture(texture_name)
 
 
 def load_user_assets(source: str) -> UserAssets:
@@ -63,10 +53,10 @@ def load_user_assets(source: str) -> UserAssets:
     if whole in _packs:
         return _packs[whole]
     made = call_function(whole, what="assets")
-    if made is not None and not is_pack(made):
+    if made is not None and not isinstance(made, Assets):
         raise AssetError(
             f"assets is {source!r}, whose function returned a {type(made).__name__}; return None, or an "
-            "object with the methods geometry and texture."
+            "object with a name and the methods geometry and texture."
         )
     _packs[whole] = UserAssets(whole, made or procedural_assets())
     os.environ[_LOADED_VARIABLE] = "\n".join(dict.fromkeys([*_loaded_sources(), whole]))
@@ -120,10 +110,10 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
         array([[[ 78, 121, 167]]], dtype=uint8)
     """
     if not isinstance(assets, str | Path):
-        if not is_pack(assets):
+        if not isinstance(assets, Assets):
             raise AssetError(
-                f"assets is a {type(assets).__name__}; give a name, a folder, or an object with the methods "
-                "geometry and texture."
+                f"assets is a {type(assets).__name__}; give a name, a folder, or an object with a name "
+                "and the methods geometry and texture."
             )
         return assets
     if assets == "procedural":

@@ -58,7 +58,7 @@ def _load_texture(texture_name: str) -> np.ndarray:
     else:
         from PIL import Image  # scenes of plain colours do without
 
-        with Image.open(_IMAGES / f"{spec.id.lower()}.png") as image:
+        with Image.open(_IMAGES / f"{texture_name.replace(' ', '_')}.png") as image:
             texture = np.array(image.convert("RGB"))
     texture.setflags(write=False)
     return texture

@@ -20,7 +20,7 @@ Cell = tuple[int, int]
 
 def random_shape(rng: np.random.Generator) -> Geometry:
     """Sample a flat prism, origin at its bottom, without collision."""
-    return Geometry(prism(random_outline(rng), 0.0, rng.uniform(*_HEIGHTS_M)), (), 0.0)
+    return Geometry(prism(random_outline(rng), 0.0, rng.uniform(*_HEIGHTS_M)))
 
 
 def random_ring(rng: np.random.Generator) -> Geometry:
@@ -29,14 +29,14 @@ def random_ring(rng: np.random.Generator) -> Geometry:
     outer = radius * _circle(36)
     hole = (_blob if rng.random() < 0.5 else _polygon)(rng)[0]
     hole = hole * radius * rng.uniform(0.35, 0.75) / np.linalg.norm(hole, axis=1).max()
-    return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(*_HEIGHTS_M)), (), 0.0)
+    return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(*_HEIGHTS_M)))
 
 
 def random_block(rng: np.random.Generator) -> Geometry:
     """Sample a block whose sides are at most as 1 to 1.2, without collision."""
     side, ratio = rng.uniform(0.045, 0.11), rng.uniform(1 / 1.2, 1.0)
     outline = np.array(rectangle((0.0, 0.0), (float(side / 2), float(side / 2 * ratio))))
-    return Geometry(prism([outline], 0.0, rng.uniform(0.02, 0.06)), (), 0.0)
+    return Geometry(prism([outline], 0.0, rng.uniform(0.02, 0.06)))
 
 
 def random_container(rng: np.random.Generator) -> Geometry:
@@ -55,22 +55,22 @@ def random_grating(rng: np.random.Generator) -> Geometry:
     slat_width, beam_width = width / num_slats * rng.uniform(0.35, 0.75), rng.uniform(0.008, 0.02)
     parts = [
         *(
-            bodies.Box((beam_width, width, beam), (x, 0.0, beam / 2))
+            bodies.box((beam_width, width, beam), (x, 0.0, beam / 2))
             for x in _spread(length, beam_width, num_beams)
         ),
         *(
-            bodies.Box((length, slat_width, slat), (0.0, y, beam + slat / 2))
+            bodies.box((length, slat_width, slat), (0.0, y, beam + slat / 2))
             for y in _spread(width, slat_width, num_slats)
         ),
     ]
     if rng.random() < 0.3:  # slats upright around it
         height = float(rng.uniform(0.02, 0.05))
         parts += [
-            bodies.Box((beam_width, bodies.WALL_M, height), (x, y, height / 2))
+            bodies.box((beam_width, bodies.WALL_M, height), (x, y, height / 2))
             for x in _spread(length, beam_width, num_slats)
             for y in (-width / 2, width / 2)
         ]
-    return Geometry(drape(bodies.box_mesh(parts)), (), 0.0)
+    return Geometry(drape(bodies.box_mesh(parts)))
 
 
 def random_eared_container(rng: np.random.Generator) -> Geometry:
@@ -86,7 +86,7 @@ def random_eared_container(rng: np.random.Generator) -> Geometry:
         centre[axis] = rim + sign * (length / 2 - 0.004)
         outline = np.array(rectangle((float(centre[0]), float(centre[1])), (float(half[0]), float(half[1]))))
         ears.append(prism([outline], top - min(height, np.ptp(points[:, 2])), top, texture_per_m=2.9))
-    return Geometry(combine([body.visual, *ears]), (), body.rest_z_m)
+    return Geometry(combine([body.visual, *ears]), rest_z_m=body.rest_z_m)
 
 
 def random_square_container(rng: np.random.Generator) -> Geometry:
@@ -282,7 +282,7 @@ def _borders(cells: set[Cell]) -> list[np.ndarray]:
 def _open_box(rng: np.random.Generator) -> Geometry:
     x, y = rng.uniform(0.12, 0.2, 2)
     geometry = bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07))))
-    return Geometry(drape(geometry.visual), (), geometry.rest_z_m)
+    return Geometry(drape(geometry.visual), rest_z_m=geometry.rest_z_m)
 
 
 def _spread(length: float, part: float, count: int) -> list[float]:
@@ -292,7 +292,7 @@ def _spread(length: float, part: float, count: int) -> list[float]:
 
 def _flat_square(rng: np.random.Generator) -> Geometry:
     geometry = bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001))
-    return Geometry(drape(geometry.visual), (), geometry.rest_z_m)
+    return Geometry(drape(geometry.visual), rest_z_m=geometry.rest_z_m)
 
 
 def _frame(rng: np.random.Generator) -> Geometry:
@@ -303,7 +303,7 @@ def _frame(rng: np.random.Generator) -> Geometry:
         count = int(rng.integers(3, 9))
         outer = _polar(np.full(count, rng.uniform(0.075, 0.105)), _jittered_angles(rng, count))
     hole = outer * rng.uniform(0.55, 0.9)
-    return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(0.0015, 0.03), texture_per_m=2.9), (), 0.0)
+    return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(0.0015, 0.03), texture_per_m=2.9))
 
 
 def _bowl(rng: np.random.Generator, sides: int | None = None) -> Geometry:
@@ -322,7 +322,7 @@ def _bowl(rng: np.random.Generator, sides: int | None = None) -> Geometry:
     ]
     sides = sides or int(rng.choice((4, 6, 8, 26)))
     radii = [2.5 * (r + (height - z if number < 4 else 0.0)) for number, (r, z) in enumerate(profile)]
-    return Geometry(revolve(profile, sides, texture_radii=radii), (), 0.0)
+    return Geometry(revolve(profile, sides, texture_radii=radii))
 
 
 _OUTLINES = (_star, _polygon, _blob, _ring, _strokes, _strokes, _strokes)

@@ -4,9 +4,9 @@ import hashlib
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,16 +29,8 @@ _MASS_KG = (0.001, 2.0)
 _FRICTION = (0.05, 1.0)  # as in the catalogue, none exceeds 1; see `sim.model`
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Entry:
-    """A registered object or texture with what it is made of; `digest` tells whether another one is equal."""
-
-    digest: str
-    mesh: UserMesh | None = None
-    image: np.ndarray | None = None
-
-
-_ENTRIES: dict[tuple[str, str], _Entry] = {}  # by "object" or "texture", and name
+# Of each "object" or "texture" by name: a digest that tells whether another one is equal, and mesh or image.
+_CONTENTS: dict[tuple[str, str], tuple[str, Any]] = {}
 
 
 def register_object(
@@ -95,14 +87,11 @@ def register_object(
     largest = smallest if size_max is None else check_lengths(size_max, what)
     if any(most < least for least, most in zip(smallest, largest, strict=True)):
         raise AssetError(f"size_max of {what} is {largest}; no side may be shorter than in size, {smallest}.")
-    x, y, z = (mass_kg / 12 * length**2 for length in smallest)
     spec = ObjectSpec(
         name=name,
-        id=_identifier(name),
         kind="registered",
         size_min=smallest,
         size_max=largest,
-        inertia_diag=(y + z, x + z, x + y),
         symmetry_rad=math.radians(symmetry_deg) if symmetry_deg < 360 else 2 * math.pi,
         profile=profile,
         mass_kg=float(mass_kg),
@@ -110,7 +99,7 @@ def register_object(
         aliases=tuple(aliases),
     )
     arrays = (user_mesh.visual.vertices, user_mesh.visual.normals, user_mesh.visual.uvs, *user_mesh.parts)
-    if _is_new("object", name, _Entry(_digest(repr(spec), *arrays), mesh=user_mesh)):
+    if _is_new("object", name, _digest(repr(spec), *arrays), user_mesh):
         REGISTERED_OBJECTS[name] = spec
     return spec
 
@@ -141,8 +130,8 @@ def register_texture(name: str, image: np.ndarray | str | Path) -> TextureSpec:
         )
     pixels = np.array(pixels, order="C")
     pixels.setflags(write=False)
-    spec = TextureSpec(name, _identifier(name), "registered")
-    if _is_new("texture", name, _Entry(_digest(repr(spec) + repr(pixels.shape), pixels), image=pixels)):
+    spec = TextureSpec(name, "registered")
+    if _is_new("texture", name, _digest(repr((spec, pixels.shape)), pixels), pixels):
         REGISTERED_TEXTURES[name] = spec
     return spec
 
@@ -154,20 +143,17 @@ def registered_geometry(object_name: str, size: Vector3, scale: Vector3) -> Geom
         AssetError: A length is out of bounds.
     """
     x, y, z = (length * factor for length, factor in zip(size, scale, strict=True))
-    return _geometry(_ENTRIES["object", object_name], object_name, (x, y, z))
+    return _geometry(_CONTENTS["object", object_name][1], object_name, (x, y, z))
 
 
 def registered_texture(texture_name: str) -> np.ndarray:
     """Return the image of a registered texture, shape (H, W, 3), uint8."""
-    image = _ENTRIES["texture", texture_name].image
-    assert image is not None
-    return image
+    return _CONTENTS["texture", texture_name][1]
 
 
 @lru_cache(maxsize=256)
-def _geometry(entry: _Entry, object_name: str, lengths: Vector3) -> Geometry:
-    assert entry.mesh is not None
-    return protect(entry.mesh.geometry(check_lengths(lengths, f"object {object_name!r}")))
+def _geometry(mesh: UserMesh, object_name: str, lengths: Vector3) -> Geometry:
+    return protect(mesh.geometry(check_lengths(lengths, f"object {object_name!r}")))
 
 
 def _check_name(name: str, what: str, kind: str, *, alias: bool = False) -> None:
@@ -193,12 +179,12 @@ def _check_number(field: str, value: float, least: float, most: float, what: str
         raise AssetError(f"{field} of {what} is {float(value):g}; it must be {bounds}.")
 
 
-def _is_new(kind: str, name: str, entry: _Entry) -> bool:
-    """Add an entry, unless an equal one is there."""
-    known = _ENTRIES.get((kind, name))
-    if known is not None and known.digest != entry.digest:
+def _is_new(kind: str, name: str, digest: str, content: object) -> bool:
+    """Keep what an object or a texture is made of, unless an equal one is there."""
+    known = _CONTENTS.get((kind, name))
+    if known is not None and known[0] != digest:
         raise AssetError(f"{kind} {name!r} is registered already, and differs; choose another name.")
-    _ENTRIES.setdefault((kind, name), entry)
+    _CONTENTS.setdefault((kind, name), (digest, content))
     return known is None
 
 
@@ -207,10 +193,6 @@ def _digest(text: str, *arrays: np.ndarray) -> str:
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _identifier(name: str) -> str:
-    return name.upper().replace(" ", "_").replace("-", "_")
 
 
 def _read_png(file: Path, what: str) -> np.ndarray:

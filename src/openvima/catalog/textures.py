@@ -6,14 +6,9 @@ colour is the light one with its HSV value lowered by 0.3.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from openvima.catalog.records import read_records
-from openvima.errors import UnknownNameError, unknown_name
+from openvima.catalog.records import find_record, read_records
 
-TextureCategory = Literal[
-    "plain", "special", "stripe", "polka_dot_2", "swirl", "paisley", "neutral", "registered"
-]
 Rgb = tuple[float, float, float]
 
 NEUTRAL_TEXTURE = "gray"
@@ -26,8 +21,8 @@ class TextureSpec:
 
     Args:
         name: Display name, such as "dark red and yellow stripe".
-        id: Identifier in upper case.
-        category: Family of patterns that it belongs to; "neutral" for gray, "registered" for a user's.
+        category: Family of patterns that it belongs to: "plain", "special", "stripe", "polka_dot_2", "swirl"
+            or "paisley"; "neutral" for gray, "registered" for a user's.
         is_dark: Whether it is the dark variant of another one.
         colour: RGB in [0, 1] of a plain colour, unrounded; None for a pattern.
         base_colours: Names of the colours of a pattern: first and second stripe, dots and ground, or the one
@@ -36,8 +31,7 @@ class TextureSpec:
     """
 
     name: str
-    id: str
-    category: TextureCategory
+    category: str
     is_dark: bool = False
     colour: Rgb | None = None
     base_colours: tuple[str, ...] = ()
@@ -91,12 +85,4 @@ def texture_spec(name: str) -> TextureSpec:
     """
     if name == NEUTRAL_TEXTURE:
         return _NEUTRAL
-    try:
-        return TEXTURES.get(name) or REGISTERED_TEXTURES[name]
-    except (KeyError, TypeError):
-        hint = (
-            "`openvima.catalog.TEXTURES` holds the 82 built-in ones; your own need `register_texture`, in "
-            "a file of OPENVIMA_TASK_FILES or for --assets."
-        )
-        known = (*TEXTURES, *REGISTERED_TEXTURES)
-        raise UnknownNameError(unknown_name("texture", name, known, hint)) from None
+    return find_record("texture", name, TEXTURES, REGISTERED_TEXTURES)

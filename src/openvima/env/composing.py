@@ -47,7 +47,7 @@ from openvima.scene.goal import is_condition
 from openvima.scene.prompt import PHOTO_SIDE
 from openvima.tasks.placing import TOLERANCE, TOLERANCE_DEG, rotation_goal
 from openvima.tasks.sweep_table import MAGNIFICATION
-from openvima.tasks.table import CELL_M, TableSampler
+from openvima.tasks.table import TableSampler
 
 Handles = Mapping[str, Placement]
 
@@ -153,11 +153,6 @@ def default_names() -> Iterator[str]:
     yield from map("object{}".format, itertools.count(len(ascii_lowercase)))
 
 
-def is_fixed_by_default(object_name: str) -> bool:
-    """Return whether an object is fixed to the table unless it is said otherwise, as bases are."""
-    return object_name in _FIXED_OBJECTS
-
-
 ObjectLike = SceneObject | Mapping[str, Any] | Sequence[Any]
 FIELDS = tuple(field.name for field in fields(SceneObject))
 
@@ -252,13 +247,10 @@ def add_object(table: TableSampler, given: SceneObject, handles: Handles) -> Pla
     check_inside(new, table.assets, described(given.name, new))
     covered = table.covered(new)
     for name, other in handles.items():
-        area_m2 = float((covered & table.covered(other)).sum()) * CELL_M**2
-        if area_m2:
-            apart_m = _reach_m(new, table.assets) + _reach_m(other, table.assets)
+        if (covered & table.covered(other)).any():
             raise SceneError(
                 f"{described(given.name, new)} at {_position_text(new)} overlaps {described(name, other)} at "
-                f"{_position_text(other)} by {1e4 * area_m2:.1f} cm² of the table; 0 is allowed, and "
-                f"{apart_m:.2f} m between their positions always suffice."
+                f"{_position_text(other)}; objects must not cover one another."
             )
     return new
 
@@ -270,20 +262,18 @@ def put(table: TableSampler, given: SceneObject, *, on_top: bool = False) -> Pla
         given.texture,
         size=object_spec(given.object).size_max,
         pose=Pose.planar(*given.position, math.radians(given.yaw_deg)),
-        fixed=is_fixed_by_default(given.object) if given.fixed is None else given.fixed,
+        fixed=given.object in _FIXED_OBJECTS if given.fixed is None else given.fixed,
         scale=(given.scale, given.scale, given.scale),
         on_top=on_top,
     )
 
 
 def check_inside(placement: Placement, assets: Assets, label: str) -> None:
-    """Check that position and outline are in the workspace.
+    """Check that the outline is in the workspace.
 
     Raises:
-        SceneError: They are not.
+        SceneError: It is not.
     """
-    if not in_workspace(placement.pose):
-        raise SceneError(f"{label} is at {_position_text(placement)}; {WORKSPACE}.")
     low, high = _extent(placement, assets)
     for axis, name in enumerate("xy"):
         for edge in (low[axis], high[axis]):
@@ -296,20 +286,9 @@ def check_inside(placement: Placement, assets: Assets, label: str) -> None:
 
 def _extent(placement: Placement, assets: Assets) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest x and y of an object's mesh, metres."""
-    corners = _outline(placement, assets)
-    return corners.min(axis=0), corners.max(axis=0)
-
-
-def _outline(placement: Placement, assets: Assets) -> np.ndarray:
-    """Return the corners of an object's mesh on the table, shape (N, 2), metres."""
     geometry = assets.geometry(placement.object, placement.size, placement.scale)
-    return placement.pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
-
-
-def _reach_m(placement: Placement, assets: Assets) -> float:
-    """Largest planar distance of an object's mesh from its position."""
-    offsets = _outline(placement, assets) - (placement.pose.x, placement.pose.y)
-    return float(np.hypot(*offsets.T).max())
+    corners = placement.pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def described(name: str, placement: Placement) -> str:
@@ -373,24 +352,6 @@ _SYMMETRY_RAD = {
 }
 
 
-def composed_goals(
-    given: object, handles: Handles, end_effector: EndEffector, assets: Assets
-) -> tuple[Goal, ...]:
-    """Make goals of what a user gives.
-
-    Args:
-        given: A list of goals, each its name and arguments, or a goal of `openvima.scene`; None for no goals.
-        handles: Objects of the scene.
-        end_effector: Tool of the arm.
-        assets: Asset pack.
-
-    Raises:
-        SceneError: A goal is unknown or malformed; the message lists the allowed ones.
-    """
-    listed = () if given is None else entries(given, "goals")
-    return tuple(_goal(each, f"goal {n}", handles, end_effector, assets) for n, each in enumerate(listed))
-
-
 def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, assets: Assets) -> Goal:
     if is_condition(given):
         return given
@@ -432,7 +393,7 @@ def _usage(name: str) -> str:
 def _in(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     """The position of a is within 0.1 m of that of b, as in the tasks; so a is in b or on it."""
     _check_two_objects(a, b)
-    return AtPose(a.id, b.pose, TOLERANCE, relative_to=b.id)
+    return AtPose.into(a, b, TOLERANCE)
 
 
 def _at(a: Placement, position: object, yaw_deg: object = None, *, assets: Assets) -> Goal:
@@ -673,11 +634,11 @@ def composed(values: Mapping[str, Any], *, assets: Assets, photo: Callable[[str]
     handles: dict[str, Placement] = {}
     for given in scene_objects(values.get("objects")):
         handles[given.name] = add_object(table, given, handles)
-    scene = table.scene()
+    listed = () if values.get("goals") is None else entries(values["goals"], "goals")
     fills = ImageMaker(handles, table, photo)
     problem = Problem(
-        scene,
+        table.scene(),
         composed_prompt(values.get("prompt"), values.get("images"), fills),
-        composed_goals(values.get("goals"), handles, end_effector, assets),
+        tuple(_goal(each, f"goal {n}", handles, end_effector, assets) for n, each in enumerate(listed)),
     )
     return Episode(COMPOSED, "train", "user", 0, problem, oracle_max_steps=max_steps, max_steps=max_steps)

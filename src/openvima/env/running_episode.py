@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.errors import ActionError, brief_repr, echo
+from openvima.errors import brief_repr
 from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
 from openvima.scene.action import END_EFFECTOR, PRIMITIVES, STAY, ToolCommand, steps_per_primitive
 from openvima.sim.tool_path import PathFollower, onward_path, tool_path
@@ -17,37 +17,6 @@ from openvima.tasks import goals
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision
 from openvima.tasks.sampling import make_rng
-
-
-class ObjectNames(Mapping[int, dict[str, str]]):
-    """Maps the id of every placement to the names of its object and texture.
-
-    Not a dictionary: Gymnasium's vector environments split those and require string keys.
-
-    Args:
-        scene: The scene.
-
-    Example:
-        >>> info["objects"][5]  # doctest: +SKIP
-        {'object': 'letter A', 'texture': 'red swirl'}
-    """
-
-    __slots__ = ("_names",)
-
-    def __init__(self, scene: Scene) -> None:
-        self._names = {p.id: {"object": p.object, "texture": p.texture} for p in scene.placements}
-
-    def __getitem__(self, object_id: int) -> dict[str, str]:
-        return self._names[object_id]
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __repr__(self) -> str:
-        return repr(self._names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,16 +32,6 @@ class VideoFrame:
     joints: np.ndarray
 
     __repr__ = brief_repr
-
-
-def _arrays(action: Action | ToolCommand) -> Any:
-    """Return the arrays of an action, whose values its constructor does not check."""
-    try:
-        return action.to_arrays() if isinstance(action, Action) else action.to_array()
-    except (TypeError, ValueError, OverflowError, RuntimeError):
-        raise ActionError(
-            f"the action is {echo(repr(action))}; its values must be numbers. Nothing was moved."
-        ) from None
 
 
 @dataclass(slots=True, eq=False)
@@ -128,7 +87,7 @@ class PrimitiveRun:
         Raises:
             ActionError: It is invalid.
         """
-        arrays: Any = _arrays(action) if isinstance(action, Action) else action
+        arrays: Any = action.to_arrays() if isinstance(action, Action) else action
         return Action.from_arrays(arrays)
 
     def step(self, action: Any, *, realtime: bool) -> None:
@@ -198,7 +157,7 @@ class ToolRun(PrimitiveRun):
         Raises:
             ActionError: It is invalid.
         """
-        return ToolCommand.from_array(_arrays(action) if isinstance(action, ToolCommand) else action)
+        return ToolCommand.from_array(action.to_array() if isinstance(action, ToolCommand) else action)
 
     def step(self, action: ToolCommand, *, realtime: bool) -> None:
         """Follow a checked command; evaluate the goals where a manipulation has ended."""

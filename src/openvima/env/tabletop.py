@@ -2,8 +2,8 @@
 
 import copy
 import inspect
+from collections import UserDict
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any  # observations and infos are nested dictionaries
@@ -17,12 +17,11 @@ from openvima.catalog.packs import load_assets
 from openvima.env.episode_file import episode_from_values, load_episode
 from openvima.env.running_episode import (
     RUNS,
-    ObjectNames,
     PrimitiveRun,
     ToolRun,
     VideoFrame,
 )
-from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
+from openvima.errors import ConfigError, EpisodeError, unknown_name
 from openvima.html import notebook_html
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Image, Rasteriser, front_above_top
@@ -163,8 +162,9 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         _check_render_mode(render_mode)
         self.task = task
         self.level = task_spec(task).checked_level(level)
-        if task_options:
-            _check_task_options(task, task_options)
+        parameters = inspect.signature(TabletopEnv.__init__).parameters.values()
+        others = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+        task_spec(task).check_options(task_options, others)
         make_rng(domain, task, self.level, 0, purpose="scene")  # checks the domain
         self.domain = domain
         self.assets = load_assets(assets)
@@ -184,9 +184,6 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         self._rasteriser = Rasteriser(self.assets)
         self._run: PrimitiveRun | None = None
         self._prepared: tuple[tuple[Any, ...], PrimitiveRun] | None = None  # what it depends on, and itself
-        if task_options:
-            with suppress(SamplingError):  # another seed may succeed
-                self._sample(0)  # the task checks its options
 
     def __repr__(self) -> str:
         run = self._run
@@ -522,7 +519,10 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             "domain": episode.domain,
             "seed": episode.seed,
             "end_effector": problem.scene.end_effector,
-            "objects": ObjectNames(problem.scene),
+            # Not a dictionary: Gymnasium's vector environments split those and require string keys.
+            "objects": UserDict(
+                {p.id: {"object": p.object, "texture": p.texture} for p in problem.scene.placements}
+            ),
         }
 
 
@@ -551,16 +551,6 @@ def _action_space(control: str) -> spaces.Space:
     return spaces.Dict(
         {key: spaces.Box(*bounds[key.split("_")[1]], dtype=np.float32) for key in ACTION_SHAPES}
     )
-
-
-def _check_task_options(task: str, options: Mapping[str, Any]) -> None:
-    of_task = task_spec(task).options
-    for name in options:
-        if name not in of_task:
-            parameters = inspect.signature(TabletopEnv.__init__).parameters.values()
-            known = [*(each.name for each in parameters if each.kind is each.KEYWORD_ONLY), *of_task]
-            hint = f"Allowed: {', '.join(known)}."
-            raise ConfigError(unknown_name(f"option of task {task!r} or of environments:", name, known, hint))
 
 
 def _check_render_mode(render_mode: str | None) -> None:

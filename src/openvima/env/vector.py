@@ -29,7 +29,7 @@ from openvima.env.tabletop import TabletopEnv, reset_option
 from openvima.errors import ActionError, ConfigError, EpisodeError, WorkerError, unknown_name
 from openvima.multiprocess import defer_sigint, init_worker, single_threaded_workers
 from openvima.scene import ACTION_SHAPES, WORKSPACE_LOW, Action
-from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, ToolCommand, is_valid_batch
+from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, ToolCommand
 from openvima.tasks.sampling import checked_seed
 
 RESET_MASK = "reset_mask"  # Gymnasium's option: which sub-environments to reset, shape (N,), bool
@@ -159,9 +159,7 @@ class TabletopVectorEnv(VectorEnv):
                 self.processes.append(context.Process(target=_work, args=arguments, daemon=True))
                 self.processes[-1].start()
                 there.close()
-        self._has_started = False
-        self._ask("call", [("render_mode", (), {})] * num_workers)
-        self._has_started = True
+        self._ask("call", [("render_mode", (), {})] * num_workers)  # once all have started
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in all sub-environments, or in those of `options["reset_mask"]`.
@@ -272,12 +270,11 @@ class TabletopVectorEnv(VectorEnv):
             process.join(timeout=0.2)  # its exit code may arrive after the end of its pipe
             if process.exitcode is not None:
                 dead += [f"{index} (exit code {process.exitcode})" for index in range(part.start, part.stop)]
-        which = f"the worker of sub-environment {', '.join(dead) or '?'}"
-        if not self._has_started:
-            return (
-                f'{which} could not start: scripts need `if __name__ == "__main__":`, as workers import them.'
-            )
-        return f"{which} died; all others were terminated. Exit code -9 often means out of memory."
+        return (
+            f"the worker of sub-environment {', '.join(dead) or '?'} died; all others were terminated. Exit "
+            "code -9 often means out of memory; code 1 at the start, that a script lacks `if __name__ == "
+            '"__main__":`.'
+        )
 
     def _join(self, infos: Iterable[Sequence[Info | None]]) -> dict[str, Any]:
         batch: dict[str, Any] = {}
@@ -481,8 +478,6 @@ def _check_actions(actions: Any, num_envs: int, control: str) -> None:
                 f"actions are one mapping with keys {', '.join(ACTION_SHAPES)} and a row for each "
                 f"sub-environment, not {given}. `stack_actions` makes it from a list. Nothing was moved."
             )
-        if is_valid_batch(actions, num_envs):
-            return
         for key, value in actions.items():
             if np.shape(value)[:1] != (num_envs,):
                 raise ActionError(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,16 +53,11 @@ class Action:
 
         Positions are clipped to the workspace and rounded to float32.
         """
-        low, high = _LIMITS[2]
-        pose0 = np.clip(np.array(pick, dtype=np.float32), low, high)
-        pose1 = np.clip(np.array(place, dtype=np.float32), low, high)
-        x, y, z, w = (float(np.float32(c)) for c in yaw_quaternion(yaw_rad))
-        return Action(
-            (float(pose0[0]), float(pose0[1])),
-            (float(pose1[0]), float(pose1[1])),
-            IDENTITY,
-            (x, y, z, w),
+        (x0, y0), (x1, y1) = (
+            np.clip(np.array(point, np.float32), *_LIMITS[2]).tolist() for point in (pick, place)
         )
+        x, y, z, w = np.array(yaw_quaternion(yaw_rad), np.float32).tolist()
+        return Action((x0, y0), (x1, y1), pose1_rotation=(x, y, z, w))
 
     @staticmethod
     def from_arrays(action: Mapping[str, object]) -> "Action":
@@ -81,19 +77,21 @@ class Action:
         if not isinstance(action, Mapping):
             keys, given = ", ".join(ACTION_SHAPES), type(action).__name__
             raise ActionError(f"an action is a mapping with keys {keys}, not {given}. Nothing was moved.")
-        problems = _key_problems(action)
-        values: dict[str, tuple[float, ...]] = {}
+        missing = ", ".join(key for key in ACTION_SHAPES if key not in action)
+        unknown = ", ".join(str(key) for key in action if key not in ACTION_SHAPES)
+        problems = [f"{missing} missing."] if missing else []
+        if unknown:
+            problems.append(f"unknown keys {echo(unknown)}; allowed are {', '.join(ACTION_SHAPES)}.")
+        values: dict[str, Any] = {}
         for key, length in ACTION_SHAPES.items():
             if key in action:
-                values[key], problem = _check_value(key, action[key], length)
-                problems += problem
+                try:
+                    values[key] = _within_limits(_as_float32(action[key], length))
+                except ActionError as error:
+                    problems.append(f"{key} is {error}.")
         if problems:
             raise ActionError(" ".join(problems) + " Nothing was moved.")
-        x0, y0 = values["pose0_position"]
-        x1, y1 = values["pose1_position"]
-        ax, ay, az, aw = values["pose0_rotation"]
-        bx, by, bz, bw = values["pose1_rotation"]
-        return Action((x0, y0), (x1, y1), (ax, ay, az, aw), (bx, by, bz, bw))
+        return Action(**values)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the action as float32 arrays under the four keys."""
@@ -122,26 +120,6 @@ def pose_after(pose: Pose, action: Action) -> Pose:
     return Pose.planar(*action.pose1_position, turn_rad) @ picked_from_object
 
 
-def is_valid_batch(actions: Mapping[str, object], count: int) -> bool:
-    """Return whether `Action.from_arrays` takes every row of a batch; faster than asking row by row.
-
-    Args:
-        actions: Arrays with `count` rows under the four keys.
-        count: Number of actions.
-    """
-    if actions.keys() != ACTION_SHAPES.keys():
-        return False
-    for key, length in ACTION_SHAPES.items():
-        value, (low, high) = actions[key], _LIMITS[length]
-        if not isinstance(value, np.ndarray) or value.shape != (count, length) or value.dtype.kind != "f":
-            return False
-        with np.errstate(over="ignore"):
-            rounded = value.astype(np.float32)
-        if not ((low <= rounded) & (rounded <= high)).all():  # nor is what is not finite
-            return False
-    return True
-
-
 def _tool_yaw(quaternion: Quaternion) -> float:
     """Heading of the tool's x axis; tilt is ignored."""
     if not any(quaternion):
@@ -150,39 +128,45 @@ def _tool_yaw(quaternion: Quaternion) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def _key_problems(action: Mapping[str, object]) -> list[str]:
-    missing = [key for key in ACTION_SHAPES if key not in action]
-    unknown = [str(key) for key in action if key not in ACTION_SHAPES]
-    problems = [f"{', '.join(missing)} missing."] if missing else []
-    if unknown:
-        problems.append(f"unknown keys {echo(', '.join(unknown))}; allowed are {', '.join(ACTION_SHAPES)}.")
-    return problems
+def _as_float32(value: object, length: int) -> np.ndarray:
+    """Return numbers in float32 precision.
 
-
-def _check_value(key: str, value: object, length: int) -> tuple[tuple[float, ...], list[str]]:
+    Raises:
+        ActionError: The shape or dtype is another, or a number is not finite.
+    """
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RuntimeError):
         # Such as nested lists of unequal lengths, or a tensor on a device or with gradients.
-        return (), [f"{key} is a {type(value).__name__} that NumPy cannot convert; give {length} numbers."]
-    if not np.issubdtype(array.dtype, np.floating):
-        return (), [f"{key} has dtype {array.dtype}; it must be floating-point (float32)."]
-    if array.shape != (length,):
-        return (), [f"{key} has shape {array.shape}; it must be ({length},)."]
-    with np.errstate(over="ignore"):  # reported below as not finite
-        given = tuple(array.astype(np.float32).tolist())
-    low, high = _LIMITS[length]
-    if all(least <= value <= most for least, value, most in zip(low, given, high, strict=True)):
-        return given, []
-    if not all(map(math.isfinite, given)):
-        return (), [f"{key} is {given}; all values must be finite."]
-    text = ", ".join(f"{v:.4g}" for v in given)
+        array = np.empty(0, object)
+    if array.shape != (length,) or not np.issubdtype(array.dtype, np.floating):
+        raise ActionError(
+            f"a {type(value).__name__} of shape {array.shape} and dtype {array.dtype}; it must be {length} "
+            "floating-point numbers"
+        )
+    with np.errstate(over="ignore"):
+        array = array.astype(np.float32)
+    if not np.isfinite(array).all():
+        raise ActionError(f"({', '.join(f'{v:g}' for v in array)}); all values must be finite")
+    return array
+
+
+def _within_limits(array: np.ndarray) -> tuple[float, ...]:
+    """Return a position or a quaternion, whose values are within bounds.
+
+    Raises:
+        ActionError: One is not.
+    """
+    values = tuple(array.tolist())
+    low, high = _LIMITS[len(values)]
+    if all(least <= value <= most for least, value, most in zip(low, values, high, strict=True)):
+        return values
     allowed = (
         f"x must lie in {low[0]:g} … {high[0]:g} m and y in {low[1]:g} … {high[1]:g} m"
-        if length == 2
+        if len(values) == 2
         else "each component must lie in -1 … 1"
     )
-    return (), [f"{key} is ({text}); {allowed}."]
+    raise ActionError(f"({', '.join(f'{v:.4g}' for v in values)}); {allowed}")
 
 
 CONTROLS = ("primitives", "end_effector")
@@ -255,24 +239,13 @@ class ToolCommand:
         Raises:
             ActionError: It has another shape or dtype, or a value that is not finite.
         """
-        names = ", ".join(COMMAND_NAMES)
         try:
-            array = np.asarray(command)
-        except (TypeError, ValueError, RuntimeError):  # such as a tensor on a device, or with gradients
-            array = np.empty(0, object)
-        if not np.issubdtype(array.dtype, np.floating) or array.shape != (len(COMMAND_NAMES),):
-            given = f"shape {array.shape}, dtype {array.dtype}"
-            if not isinstance(command, np.ndarray):
-                given = f"a {type(command).__name__}" + (f" ({given})" if array.dtype != object else "")
+            array = _as_float32(command, len(COMMAND_NAMES))
+        except ActionError as error:
             raise ActionError(
-                f"the command is {given}; with control 'end_effector' it must be {len(COMMAND_NAMES)} "
-                f"floating-point numbers: {names}. Nothing was moved."
-            )
-        with np.errstate(over="ignore"):  # reported below as not finite
-            array = array.astype(np.float32)
-        if not np.isfinite(array).all():
-            text = ", ".join(f"{value:g}" for value in array)
-            raise ActionError(f"the command is ({text}); all values must be finite. Nothing was moved.")
+                f"the command is {error}: {', '.join(COMMAND_NAMES)}, with control 'end_effector'. Nothing "
+                "was moved."
+            ) from None
         motion = array[:-1].astype(np.float64)
         excess = float((np.abs(motion) / np.array(COMMAND_HIGH[:-1], np.float32)).max())
         dx, dy, dz, dyaw = (motion / max(excess, 1.0)).tolist()

@@ -4,12 +4,12 @@ A goal is met once; constraints must hold until the goals are met.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol, TypeAlias, TypeGuard, TypeVar
+from typing import Any, ClassVar, Protocol, TypeAlias, TypeGuard
 
 from openvima.errors import brief_repr
-from openvima.scene.scene import Pose, Scene, angle_difference, rotate
+from openvima.scene.scene import Placement, Pose, Scene, angle_difference, rotate
 
 
 class Condition(Protocol):
@@ -106,6 +106,18 @@ def block_points(pose: Pose) -> list[tuple[float, float, float]]:
     return points
 
 
+def _renumbered(self: Any, new_of: Mapping[int, int]) -> Any:
+    """Return the same condition for other object ids."""
+    new: dict[str, object] = {
+        name: new_of[getattr(self, name)]
+        for name in ("object_id", "relative_to")
+        if getattr(self, name, None) is not None
+    }
+    if hasattr(self, "object_ids"):
+        new["object_ids"] = tuple(sorted(new_of[object_id] for object_id in self.object_ids))
+    return replace(self, **new)
+
+
 @dataclass(frozen=True, slots=True)
 class AtPose:
     """The object's link frame is at a target pose.
@@ -125,6 +137,13 @@ class AtPose:
     symmetry_rad: float = 2 * math.pi
     relative_to: int | None = None
 
+    renumbered = _renumbered
+
+    @staticmethod
+    def into(placement: Placement, base: Placement, tolerance: Tolerance) -> "AtPose":
+        """Return the goal of an object in its base, at any heading that the tolerance takes."""
+        return AtPose(placement.id, base.pose, tolerance, relative_to=base.id)
+
     def is_met(self, scene: Scene) -> bool:
         """Whether the object is at the target."""
         return self.tolerance.accepts(scene[self.object_id].pose, self.target, self.symmetry_rad)
@@ -141,10 +160,6 @@ class AtPose:
         """Return the goal itself: one pick and place meets it."""
         return self
 
-    def renumbered(self, new_of: Mapping[int, int]) -> "AtPose":
-        """Return the goal for other object ids."""
-        return _renumber(self, new_of)
-
 
 @dataclass(frozen=True, slots=True)
 class InZone:
@@ -160,6 +175,8 @@ class InZone:
     zone: Zone
     relative_to: int | None = None
 
+    renumbered = _renumbered
+
     def is_met(self, scene: Scene) -> bool:
         """Whether the block is in the zone."""
         return all(self.zone.contains(point) for point in block_points(scene[self.object_id].pose))
@@ -173,19 +190,9 @@ class InZone:
         """Return the goal itself: sweeps meet it."""
         return self
 
-    def renumbered(self, new_of: Mapping[int, int]) -> "InZone":
-        """Return the goal for other object ids."""
-        return _renumber(self, new_of)
-
 
 OracleMove: TypeAlias = AtPose | InZone
 """Goals that the oracle pursues: by pick and place, and by sweeps."""
-_Move = TypeVar("_Move", AtPose, InZone)
-
-
-def _renumber(goal: _Move, new_of: Mapping[int, int]) -> _Move:
-    relative_to = None if goal.relative_to is None else new_of[goal.relative_to]
-    return replace(goal, object_id=new_of[goal.object_id], relative_to=relative_to)
 
 
 def is_condition(value: object) -> TypeGuard[Condition]:
@@ -286,6 +293,12 @@ class DistractorsApart:
     goals: tuple[int, ...] | None = None
 
     __repr__ = brief_repr
+    renumbered = _renumbered
+
+    @staticmethod
+    def of(distractors: Iterable[Placement], *, at_end: bool = False) -> "DistractorsApart":
+        """Return the constraint for all goals and these objects."""
+        return DistractorsApart(tuple(placement.id for placement in distractors), at_end)
 
     def violation(self, context: StepContext) -> str:
         """Say which distractor is where it must not be."""
@@ -304,10 +317,6 @@ class DistractorsApart:
                     return f"{moved} is where {distractor} is"
         return ""
 
-    def renumbered(self, new_of: Mapping[int, int]) -> "DistractorsApart":
-        """Return the constraint for other object ids."""
-        return replace(self, object_ids=_renumber_ids(self.object_ids, new_of))
-
 
 def _were_completed(goals: Iterable[int], context: StepContext) -> bool:
     """Whether this step fulfilled the last of these goals."""
@@ -323,23 +332,26 @@ class ZoneKeptClear:
     zone: Zone
 
     __repr__ = brief_repr
+    renumbered = _renumbered
 
     def is_met(self, scene: Scene) -> bool:
         """Whether the zone is clear."""
-        return _first_in(self.zone, self.object_ids, scene) is None
+        return next(self.inside(scene), None) is None
 
     def reason(self, scene: Scene) -> str:
         """Name the first block in the zone."""
-        object_id = _first_in(self.zone, self.object_ids, scene)
-        return "" if object_id is None else f"distractor {scene.describe(object_id)} is in the goal zone"
+        return f"distractor {scene.describe(next(self.inside(scene)))} is in the goal zone"
 
-    def renumbered(self, new_of: Mapping[int, int]) -> "ZoneKeptClear":
-        """Return the constraint for other object ids."""
-        return replace(self, object_ids=_renumber_ids(self.object_ids, new_of))
+    def inside(self, scene: Scene) -> Iterator[int]:
+        """Yield the ids of the blocks with a point in the zone."""
+        for object_id in self.object_ids:
+            pose = scene[object_id].pose
+            if self.zone.is_near(pose) and any(self.zone.contains(point) for point in block_points(pose)):
+                yield object_id
 
 
 @dataclass(frozen=True, slots=True)
-class NeverTouches:
+class NeverTouches(ZoneKeptClear):
     """No point of these blocks ever enters the zone; tested during motion, and permanent.
 
     Args:
@@ -350,24 +362,13 @@ class NeverTouches:
 
     monitored: ClassVar[bool] = True
 
-    object_ids: tuple[int, ...]
-    zone: Zone
     name: str
 
     __repr__ = brief_repr
 
-    def is_met(self, scene: Scene) -> bool:
-        """Whether no block touches the zone now."""
-        return _first_in(self.zone, self.object_ids, scene) is None
-
     def reason(self, scene: Scene) -> str:
         """Name the first block in the zone."""
-        object_id = _first_in(self.zone, self.object_ids, scene)
-        return "" if object_id is None else f"{scene.describe(object_id)} touched the {self.name}"
-
-    def renumbered(self, new_of: Mapping[int, int]) -> "NeverTouches":
-        """Return the constraint for other object ids."""
-        return replace(self, object_ids=_renumber_ids(self.object_ids, new_of))
+        return f"{scene.describe(next(self.inside(scene)))} touched the {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,16 +406,3 @@ class EveryStepCounts:
             return ""
         awaited = context.describe(context.open_goals[0])
         return f"the step did not bring {awaited} to where it had to go next"
-
-
-def _first_in(zone: Zone, object_ids: Iterable[int], scene: Scene) -> int | None:
-    """Id of the first block with a point in a zone, or None."""
-    for object_id in object_ids:
-        pose = scene[object_id].pose
-        if zone.is_near(pose) and any(zone.contains(point) for point in block_points(pose)):
-            return object_id
-    return None
-
-
-def _renumber_ids(object_ids: Iterable[int], new_of: Mapping[int, int]) -> tuple[int, ...]:
-    return tuple(sorted(new_of[object_id] for object_id in object_ids))

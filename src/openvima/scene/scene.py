@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -198,7 +198,7 @@ class Placement:
 
     def at(self, pose: Pose) -> "Placement":
         """Return the same object at another pose."""
-        return Placement(self.id, self.object, self.texture, self.size, pose, self.fixed, self.scale)
+        return replace(self, pose=pose)
 
 
 @dataclass(frozen=True, slots=True)

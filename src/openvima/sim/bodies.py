@@ -28,6 +28,9 @@ class Bodies:
     Args:
         scene: The scene to load; all bodies start at rest.
         assets: Asset pack.
+
+    Attributes:
+        geoms: MuJoCo ids of the convex parts of each body.
     """
 
     def __init__(self, scene: Scene, assets: Assets) -> None:
@@ -43,10 +46,10 @@ class Bodies:
         self._joint = {index: rank for rank, index in enumerate(rigid)}
         self._mocap = {index: rank for rank, index in enumerate(fixed)}
         first, count = self.model.body_geomadr, self.model.body_geomnum
-        self._geoms = tuple(
+        self.geoms = tuple(
             range(int(first[i + 1]), int(first[i + 1] + count[i + 1])) for i in range(len(self.shapes))
         )
-        self._has_walls = any(self._geoms[index] for index in fixed)
+        self._has_walls = any(self.geoms[index] for index in fixed)
         self._probe_mocap = len(fixed)
         self.probe_geom = int(first[len(self.shapes) + 1])
         self.spatula_geom = int(first[len(self.shapes) + 2]) if with_spatula else -1
@@ -73,10 +76,6 @@ class Bodies:
         self._load_model(with_spatula=self.spatula_geom >= 0)
         mujoco.mj_setState(self.model, self.data, state, _STATE)
         self.refresh()
-
-    def geoms(self, index: int) -> range:
-        """MuJoCo ids of the convex parts of a body."""
-        return self._geoms[index]
 
     def pose(self, index: int) -> Pose:
         """Current pose of a body's link frame."""
@@ -179,8 +178,7 @@ class Bodies:
                 so that the faces of the smallest block keep that speed.
         """
         velocities = self._velocities[: len(self.rigid)]
-        np.minimum(velocities, max_speed * _FASTEST, out=velocities)
-        np.maximum(velocities, max_speed * _SLOWEST, out=velocities)
+        np.clip(velocities, max_speed * _SLOWEST, max_speed * _FASTEST, out=velocities)
 
     def speeds(self) -> tuple[float, float]:
         """Largest component of linear (m/s) and angular (rad/s) velocity of the free bodies."""
@@ -258,7 +256,7 @@ def body_gap(bodies: Bodies, index1: int, index2: int) -> float:
     reach = bodies.shapes[index1].radius_m + bodies.shapes[index2].radius_m
     if bodies.pose(index1).planar_distance(bodies.pose(index2)) > reach + 0.01:
         return np.inf
-    pairs = [(g1, g2) for g1 in bodies.geoms(index1) for g2 in bodies.geoms(index2)]
+    pairs = [(g1, g2) for g1 in bodies.geoms[index1] for g2 in bodies.geoms[index2]]
     return min((gap(bodies, g1, g2) for g1, g2 in pairs), default=np.inf)
 
 

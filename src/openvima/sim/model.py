@@ -15,7 +15,7 @@ VIMA-Bench multiplies the friction coefficients of a pair; MuJoCo takes the larg
 
 import hashlib
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import mujoco
@@ -49,12 +49,11 @@ PROBE_HALF_LENGTH_M = 0.2
 _COLLIDES, _COLLIDES_WITH_SPATULA = 1, 2  # bits of contype and conaffinity
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class BodyShape:
-    """One body without its pose; bodies with equal `key` are equal.
+    """One body without its pose.
 
     Args:
-        key: Digest of everything that the model depends on.
         shapes: Convex parts in the link frame.
         points: Corners of all parts with their margins, shape (N, 4): x, y, z, margin; metres.
         radius_m: Largest distance of a corner from the link frame, margin included.
@@ -63,29 +62,24 @@ class BodyShape:
         inertia: Principal moments in kg m².
     """
 
-    key: bytes
-    shapes: tuple[CollisionShape, ...] = field(compare=False)
-    points: np.ndarray = field(compare=False)
-    radius_m: float = field(compare=False)
-    spec: ObjectSpec = field(compare=False)
-    fixed: bool = field(compare=False)
-    inertia: Vector3 = field(compare=False)
+    shapes: tuple[CollisionShape, ...]
+    points: np.ndarray
+    radius_m: float
+    spec: ObjectSpec
+    fixed: bool
+    inertia: Vector3
 
 
 @lru_cache(maxsize=256)
 def body_shape(object_name: str, geometry: Geometry, fixed: bool) -> BodyShape:
     """Prepare the body of an object; one without collision shapes counts as fixed."""
     spec = object_spec(object_name)
-    digest = hashlib.sha1(repr((spec.mass_kg, spec.friction, spec.com_offset, fixed)).encode())
-    for shape in geometry.collision:
-        digest.update(repr(shape).encode() if isinstance(shape, CollisionBox) else shape.points.tobytes())
     corners = [
         np.c_[shape.points, np.full(len(shape.points), _margin(shape))] for shape in geometry.collision
     ]
     points = np.concatenate(corners) if corners else np.zeros((0, 4))
     reach = np.linalg.norm(points[:, :3], axis=1) + points[:, 3]
     return BodyShape(
-        digest.digest(),
         geometry.collision,
         points,
         float(reach.max(initial=0.0)),

@@ -44,14 +44,9 @@ class Settling:
         self.num_ticks = 0
 
     @property
-    def is_at_rest(self) -> bool:
-        """Whether every body has been slow for long enough."""
-        return self._quiet >= _QUIET_STRIDES
-
-    @property
     def is_over(self) -> bool:
-        """Whether everything is at rest, or the limit is reached."""
-        return self.is_at_rest or self.num_ticks >= SETTLE_LIMIT_TICKS
+        """Whether every body has been slow for long enough, or the limit is reached."""
+        return self._quiet >= _QUIET_STRIDES or self.num_ticks >= SETTLE_LIMIT_TICKS
 
     def run(self, num_ticks: int = STRIDE_TICKS) -> None:
         """Run one stride; where it is the last one, stop all bodies."""
@@ -185,7 +180,6 @@ class PrimitiveState:
         self.bodies = bodies
         self.path = path
         self.num_ticks = 0
-        self.completed = True
         self._monitor = monitor
         self._unmonitored_ticks = 0
 
@@ -229,7 +223,6 @@ class PrimitiveState:
             settling.run()
             self.count_ticks(STRIDE_TICKS, held)
             self.path.store(STRIDE_TICKS, scene=lambda: self.scene(held))
-        self.completed = self.completed and settling.is_at_rest
 
     def finish(self) -> Scene:
         """Reset bodies that hardly moved; monitor and return the final scene."""

@@ -63,7 +63,7 @@ class Spatula:
         self._tip: Vector3 = (0.0, 0.0, ur5.SWEEP_HOVER_TIP_Z_M)
         self._recent: list[tuple[np.ndarray, Vector3]] = []  # coordinates and tip before the last strides
         self._sleeping = set(() if awake else state.bodies.rigid)  # at rest, and far from all that moves
-        self._pushed = tuple(geom for index in state.bodies.rigid for geom in state.bodies.geoms(index))
+        self._pushed = tuple(geom for index in state.bodies.rigid for geom in state.bodies.geoms[index])
 
     def lower(self, x: float, y: float) -> None:
         """Lower the spatula at a point and displace bodies there."""
@@ -235,9 +235,9 @@ class Spatula:
         bodies.place_spatula(self._pose())
         bodies.refresh()
         others = [index for index in range(len(bodies.shapes)) if index not in carried]
-        fixed = [geom for index in others if index not in bodies.rigid for geom in bodies.geoms(index)]
-        free = [geom for index in others if index in bodies.rigid for geom in bodies.geoms(index)]
-        carried_geoms = [geom for index in carried for geom in bodies.geoms(index)]
+        fixed = [geom for index in others if index not in bodies.rigid for geom in bodies.geoms[index]]
+        free = [geom for index in others if index in bodies.rigid for geom in bodies.geoms[index]]
+        carried_geoms = [geom for index in carried for geom in bodies.geoms[index]]
         ways = (
             distance_to_contact(bodies, (bodies.spatula_geom,), free, direction=direction, length_m=length),
             distance_to_contact(bodies, carried_geoms, [*free, *fixed], direction=direction, length_m=length),

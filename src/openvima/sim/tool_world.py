@@ -46,15 +46,19 @@ class ToolWorld:
     Args:
         scene: The objects at the start. Those that hover or overlap settle before the first command.
         assets: Asset pack.
+
+    Attributes:
+        scene_at_rest: The scene when everything was last at rest, before the tool took hold.
+        pose: Current pose of the tool.
     """
 
     def __init__(self, scene: Scene, assets: Assets) -> None:
-        self._scene = scene
+        self.scene_at_rest = scene
         self._bodies = Bodies(scene, assets)
         self._is_settled = is_at_rest(self._bodies)
         self._joints = ur5.HOME
         tip = ur5.forward(ur5.HOME)
-        self._pose = ToolPose(tip.x, tip.y, tip.z, 0.0)
+        self.pose = ToolPose(tip.x, tip.y, tip.z, 0.0)
         self._state: PrimitiveState | None = None  # since the tool last took hold, until all is at rest
         self._settling: Settling | None = None
         self._held: HeldBody | None = None
@@ -65,24 +69,14 @@ class ToolWorld:
     def scene(self) -> Scene:
         """The current scene, with a held body at the tool."""
         if self._state is None:
-            return self._scene
+            return self.scene_at_rest
         held = self._held
         return self._state.scene(None if held is None else (held.index, self._held_pose(held)))
-
-    @property
-    def scene_at_rest(self) -> Scene:
-        """The scene when everything was last at rest, before the tool took hold."""
-        return self._scene
 
     @property
     def joints(self) -> np.ndarray:
         """Current joint angles of the arm, shape (6,), float64, radians."""
         return self._joints.copy()
-
-    @property
-    def pose(self) -> ToolPose:
-        """Current pose of the tool."""
-        return self._pose
 
     @property
     def holds(self) -> bool:
@@ -92,7 +86,7 @@ class ToolWorld:
     @property
     def grasped(self) -> int | None:
         """Id of the body on the cup."""
-        return None if self._held is None else self._scene.placements[self._held.index].id
+        return None if self._held is None else self.scene_at_rest.placements[self._held.index].id
 
     @property
     def grasp(self) -> ToolPose | None:
@@ -107,7 +101,7 @@ class ToolWorld:
     @property
     def is_down(self) -> bool:
         """Whether the cup or the held body touches what is below it."""
-        return self._pose.z <= self._lowest_z(self._pose) + _TOUCH_M
+        return self.pose.z <= self._lowest_z(self.pose) + _TOUCH_M
 
     def command(
         self,
@@ -131,7 +125,7 @@ class ToolWorld:
         if not self._is_settled:
             state = self._new_state(monitor)
             state.settle(max_speed=SEPARATION_SPEED)
-            self._scene, self._is_settled = state.finish(), True
+            self.scene_at_rest, self._is_settled = state.finish(), True
         if not command.tool:
             self._let_go()
         for _ in range(_NUM_PARTS):
@@ -143,16 +137,16 @@ class ToolWorld:
             self._take_hold(monitor)
         if self._state is None or self.holds or self.is_moving:
             return False
-        self._scene, self._state = self._state.finish(), None
+        self.scene_at_rest, self._state = self._state.finish(), None
         return True
 
     def _new_state(self, monitor: Callable[[Scene], None] | None) -> PrimitiveState:
-        return PrimitiveState(self._scene, self._bodies, ArmPath(self._joints, None), monitor)
+        return PrimitiveState(self.scene_at_rest, self._bodies, ArmPath(self._joints, None), monitor)
 
     def _take_hold(self, monitor: Callable[[Scene], None] | None) -> None:
         """Grasp the body below the cup, or press the spatula to the table, if it is near enough."""
-        pose, state = self._pose, self._state or self._new_state(monitor)
-        if self._scene.end_effector == "spatula":
+        pose, state = self.pose, self._state or self._new_state(monitor)
+        if self.scene_at_rest.end_effector == "spatula":
             if pose.z > ur5.SWEEP_TIP_Z_M + PRESS_WITHIN_M:
                 return
             awake = self._settling is not None
@@ -174,7 +168,7 @@ class ToolWorld:
         """Release the body, or take the spatula off the table."""
         if self._spatula is not None:
             self._settling, self._spatula = self._spatula.release(), None
-        held, pose = self._held, self._pose
+        held, pose = self._held, self.pose
         if held is None:
             return
         target = self._held_pose(held)
@@ -199,7 +193,7 @@ class ToolWorld:
         target = self._reachable((dx, dy, dz, turn)) or self._reachable((dx, dy, dz, 0.0))
         if target is None:
             return
-        is_cup = self._scene.end_effector == "suction"
+        is_cup = self.scene_at_rest.end_effector == "suction"
         self._go(self._above_contact(target) if is_cup else target)
 
     def _reachable(self, motion: tuple[float, float, float, float]) -> ToolPose | None:
@@ -225,7 +219,7 @@ class ToolWorld:
 
         Near the rim the lowest height may lie beyond the arm: such a pose cannot be reached.
         """
-        pose, (dx, dy, dz, turn) = self._pose, motion
+        pose, (dx, dy, dz, turn) = self.pose, motion
         x, y = (
             min(max(at + fraction * delta, low - _MARGIN_M), high + _MARGIN_M)
             for at, delta, low, high in zip(
@@ -238,7 +232,7 @@ class ToolWorld:
     def _within_height(self, x: float, y: float, z: float) -> float:
         """The nearest height at which the tool may be above a point."""
         highest = min(HIGHEST_TIP_Z_M, ur5.highest_tip_z(x, y) - ur5.REACH_RESERVE_M)
-        lowest = ur5.SWEEP_TIP_Z_M if self._scene.end_effector == "spatula" else _LOWEST_CUP_Z_M
+        lowest = ur5.SWEEP_TIP_Z_M if self.scene_at_rest.end_effector == "spatula" else _LOWEST_CUP_Z_M
         return max(min(z, highest), lowest)
 
     def _can_reach(self, pose: ToolPose) -> bool:
@@ -256,11 +250,11 @@ class ToolWorld:
 
     def _go(self, pose: ToolPose) -> None:
         self._joints = self._joints_at(pose)
-        self._pose = pose
+        self.pose = pose
 
     def _above_contact(self, target: ToolPose) -> ToolPose:
         """Stop at the first contact from above, and beside what is in the way; lifting is always free."""
-        pose, highest = self._pose, max(self._pose.z, target.z)
+        pose, highest = self.pose, max(self.pose.z, target.z)
         lowest = self._lowest_z(target)
         if lowest > min(highest + _TOUCH_M, _greatest_z(target.x, target.y)):
             target = replace(pose, z=self._within_height(pose.x, pose.y, target.z))
@@ -277,12 +271,12 @@ class ToolWorld:
         return held.grasp.z + set_down_at.z - held.carried(pose.x, pose.y, pose.yaw_rad).z
 
     def _held_pose(self, held: HeldBody) -> Pose:
-        pose = self._pose
+        pose = self.pose
         return held.carried(pose.x, pose.y, pose.yaw_rad).moved(dz=pose.z - held.grasp.z)
 
     def _run_physics(self) -> None:
         """Run the physics of a part of a command, if anything moves."""
-        pose, state = self._pose, self._state
+        pose, state = self.pose, self._state
         if self._spatula is not None:
             self._spatula.slide(pose.x, pose.y, pose.yaw_rad, _PART_TICKS)
         if self._settling is None or state is None:

@@ -94,7 +94,7 @@ def _gaps_to_axis(bodies: Bodies, x: float, y: float) -> dict[int, float]:
     bodies.refresh()
     probe = bodies.probe_geom
     return {
-        index: min((gap(bodies, probe, geom) for geom in bodies.geoms(index)), default=math.inf)
+        index: min((gap(bodies, probe, geom) for geom in bodies.geoms[index]), default=math.inf)
         for index, shape in enumerate(bodies.shapes)
         if math.hypot(bodies.pose(index).x - x, bodies.pose(index).y - y)
         < shape.radius_m + ur5.CAPTURE_RADIUS_M
@@ -107,7 +107,7 @@ def _surface_z(bodies: Bodies, index: int, x: float, y: float) -> float:
     bodies.refresh()
     probe = (bodies.probe_geom,)
     depth = _ABOVE_ALL_M - FLOOR_Z_M
-    drop = distance_to_contact(bodies, probe, bodies.geoms(index), direction=_DOWN, length_m=depth)
+    drop = distance_to_contact(bodies, probe, bodies.geoms[index], direction=_DOWN, length_m=depth)
     return bodies.highest_z(index) if drop is None else _ABOVE_ALL_M - drop
 
 
@@ -202,9 +202,9 @@ def _distance_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool
         geom
         for other, shape in enumerate(bodies.shapes)
         if other != index and bodies.pose(other).planar_distance(above) < reach + shape.radius_m
-        for geom in bodies.geoms(other)
+        for geom in bodies.geoms[other]
     ]
-    to_others = distance_to_contact(bodies, bodies.geoms(index), others, direction=_DOWN, length_m=to_floor)
+    to_others = distance_to_contact(bodies, bodies.geoms[index], others, direction=_DOWN, length_m=to_floor)
     if to_others is None:
         return to_floor, True
     return min(to_floor, to_others), False
@@ -285,13 +285,11 @@ class Execution:
         joint_path: Waypoints of the arm, shape (W, 6), float32, radians, joined by straight lines in joint
             space (straight lines of the tool while sweeping).
         num_ticks: Number of physics ticks of 1/240 s.
-        completed: Whether everything came to rest within 1000 ticks.
     """
 
     grasped: int | None
     joint_path: np.ndarray
     num_ticks: int
-    completed: bool
 
 
 class World:
@@ -304,6 +302,9 @@ class World:
         assets: Asset pack.
         compat: Move the spatula straight in joint space, as VIMA-Bench's arm does, and stop it 3 mm earlier.
 
+    Attributes:
+        scene: The current scene.
+
     Raises:
         UnknownNameError: An object is not in the catalogue.
         AssetError: The asset pack lacks a file.
@@ -315,16 +316,11 @@ class World:
     """
 
     def __init__(self, scene: Scene, assets: Assets, *, compat: bool = False) -> None:
-        self._scene = scene
+        self.scene = scene
         self._bodies = Bodies(scene, assets)
         self._compat = compat
         self._joints = ur5.HOME
         self._is_settled = is_at_rest(self._bodies)
-
-    @property
-    def scene(self) -> Scene:
-        """The current scene."""
-        return self._scene
 
     @property
     def joints(self) -> np.ndarray:
@@ -351,18 +347,18 @@ class World:
             The result; `scene` and `joints` are updated.
         """
         path = ArmPath(self._joints, record)
-        state = PrimitiveState(self._scene, self._bodies, path, monitor)
+        state = PrimitiveState(self.scene, self._bodies, path, monitor)
         if not self._is_settled:
             state.settle(max_speed=SEPARATION_SPEED)
             self._is_settled = True
         grasped = self._perform(state, action)
-        self._scene = state.finish()
+        self.scene = state.finish()
         self._joints = path.joints
         grasped_id = None if grasped is None else state.placement(grasped).id
-        return Execution(grasped_id, path.array(), state.num_ticks, state.completed)
+        return Execution(grasped_id, path.array(), state.num_ticks)
 
     def _perform(self, state: PrimitiveState, action: Action) -> int | None:
-        if self._scene.end_effector == "suction":
+        if self.scene.end_effector == "suction":
             return pick_place(state, action)
         sweep(state, action, compat=self._compat)
         return None

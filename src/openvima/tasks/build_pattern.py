@@ -10,10 +10,9 @@ Source:   level L8 of openvima; not in the VIMA paper.
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 from openvima.scene import (
-    WORKSPACE_HIGH,
-    WORKSPACE_LOW,
     AtPose,
     DistractorsApart,
     Pose,
@@ -22,9 +21,8 @@ from openvima.scene import (
     SceneImage,
     Tolerance,
 )
-from openvima.tasks.options import check_num_distractors
 from openvima.tasks.registry import register_task
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import TableSampler, grid_point
 
 TEMPLATE = "Rearrange to this {scene}."
 TOLERANCE = Tolerance(position_m=0.08)  # half the distance of two cells
@@ -45,26 +43,22 @@ _SPARE_STEPS = 2
 
 
 @register_task("build_pattern", family="visual_goal_reaching", template=TEMPLATE, oracle_max_steps=12)
-def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: Annotated[int, range(3)] = 1) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
         num_distractors: Objects in the way, 0 … 2.
     """
-    check_num_distractors(num_distractors, high=2)
     target_cells = _shifted(table, table.choose(PATTERNS).split())
     cells = [(row, column) for row in range(NUM_ROWS) for column in range(NUM_COLUMNS)]
-    free = [cell for cell in cells if cell not in target_cells]
-    free = [free[index] for index in table.rng.permutation(len(free))]
+    free = table.shuffled([cell for cell in cells if cell not in target_cells])
     if len(free) < len(target_cells) + num_distractors:
         num_distractors = len(free) - len(target_cells)
 
-    appearances = table.appearances()
     count = len(target_cells) + num_distractors
-    drawn = [appearances[index] for index in table.rng.choice(len(appearances), count, replace=False)]
-    in_the_way = table.rng.choice(len(target_cells), num_distractors, replace=False).tolist()
-    start_cells = [*free[: len(target_cells)], *(target_cells[index] for index in in_the_way)]
+    drawn = table.distinct(table.appearances(), count)
+    start_cells = [*free[: len(target_cells)], *table.distinct(target_cells, num_distractors)]
     placed = [
         table.add(name, texture, size=table.sample_size(name), pose=_in_cell(table, cell))
         for (name, texture), cell in zip(drawn, start_cells, strict=True)
@@ -79,7 +73,7 @@ def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, scene=SceneImage.of(targets)),
         goals=tuple(AtPose(target.id, target.pose, TOLERANCE) for target in targets),
-        constraints=(DistractorsApart(tuple(p.id for p in distractors), at_end=True),),
+        constraints=(DistractorsApart.of(distractors, at_end=True),),
         prerequisites=tuple(
             AtPose(p.id, pose, TOLERANCE) for p, pose in zip(distractors, parking, strict=True)
         ),
@@ -95,11 +89,8 @@ def _shifted(table: TableSampler, rows: Sequence[str]) -> list[tuple[int, int]]:
 
 def cell_centre(cell: tuple[int, int]) -> Pose:
     """Return the centre of a cell of the table, unrotated."""
-    (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
     row, column = cell
-    x = low_x + (row + 0.5) * (high_x - low_x) / NUM_ROWS
-    y = low_y + (column + 0.5) * (high_y - low_y) / NUM_COLUMNS
-    return Pose.planar(x, y)
+    return grid_point(row + 0.5, NUM_ROWS, column + 0.5, NUM_COLUMNS)
 
 
 def _in_cell(table: TableSampler, cell: tuple[int, int]) -> Pose:

@@ -92,7 +92,7 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
     free_bases = [p for p in scene.placements if p.fixed and p not in bases]
     for base in free_bases if task == "pick_in_order_then_restore" else ():
         shape, texture = draw(BASES)
-        table.add(shape, texture, size=table.sample_size(shape), pose=base.pose, fixed=False, on_top=True)
+        table.add(shape, texture, pose=base.pose, fixed=False, on_top=True)
         forbidden.add((shape, texture))
     hidden = table.choose((*moved, *bases))
     put(

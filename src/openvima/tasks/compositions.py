@@ -27,7 +27,7 @@ from openvima.scene import (
 )
 from openvima.tasks.manipulate_old_neighbor import NEIGHBOURS
 from openvima.tasks.novel_words import NOUNS, choose_words, gray_image
-from openvima.tasks.options import check_num_distractors
+from openvima.tasks.options import FewDistractors
 from openvima.tasks.placing import ANGLES_DEG, rotation_goal
 from openvima.tasks.referring_grammar import offset
 from openvima.tasks.registry import register_task
@@ -125,7 +125,7 @@ Goals = tuple[AtPose, ...]
 
 
 def _into(placement: Placement, base: Placement) -> Goals:
-    return (AtPose(placement.id, base.pose, TOLERANCE, relative_to=base.id),)
+    return (AtPose.into(placement, base, TOLERANCE),)
 
 
 def _put(made: Composition, n: int) -> Goals:
@@ -230,7 +230,6 @@ def template(kinds: tuple[str, ...]) -> str:
 
 def compose_problem(table: TableSampler, kinds: tuple[str, ...], num_distractors: int) -> Problem:
     """Place what all instructions need, and distractors; build the problem."""
-    check_num_distractors(num_distractors, high=3)
     made, stages = Composition(table), []
     for n, kind in enumerate(kinds, 1):
         if goals := INSTRUCTIONS[kind][1](made, n):
@@ -279,7 +278,7 @@ def _register(name: str, kinds: tuple[str, ...]) -> None:
         oracle_max_steps=len(kinds) + 1 + _SPARE_STEPS,
         summary=f"instructions in one prompt: {', '.join(kinds).replace('_', ' ')}.",
     )
-    def sample(table: TableSampler, *, num_distractors: int = 2) -> Problem:
+    def sample(table: TableSampler, *, num_distractors: FewDistractors = 2) -> Problem:
         """Sample one problem.
 
         Args:

@@ -12,7 +12,7 @@ import math
 from itertools import accumulate
 
 from openvima.scene import EveryStepCounts, ObjectImage, Placement, Pose, Problem, Prompt
-from openvima.tasks.options import check_difficulty, check_num_distractors
+from openvima.tasks.options import Difficulty, NumDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
@@ -38,8 +38,8 @@ NUM_POINTS = 5  # 0.22 m from each other, 0.19 m from the centre
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int = 1,
-    difficulty: str = "easy",
+    num_distractors: NumDistractors = 1,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -48,8 +48,6 @@ def sample(
         num_distractors: Distractors on the table, 0 … 6: one in the middle, the others away from the circle.
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 frames.
     """
-    check_num_distractors(num_distractors)
-    check_difficulty(difficulty)
     num_frames = NUM_FRAMES[difficulty]
     appearances = table.appearances()
     appearance = table.choose(appearances)

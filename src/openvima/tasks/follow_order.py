@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Iterator
 
 from openvima.scene import WORKSPACE_LOW, EveryStepCounts, Placement, Pose, Problem, Prompt
-from openvima.tasks.options import check_difficulty, check_num_distractors
+from openvima.tasks.options import Difficulty, NumDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
@@ -40,8 +40,8 @@ Stacks = tuple[tuple[int, ...], ...]
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int = 1,
-    difficulty: str = "easy",
+    num_distractors: NumDistractors = 1,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -50,23 +50,21 @@ def sample(
         num_distractors: Further objects, 0 … 6.
         difficulty: "easy", "medium" or "hard": 3, 4 or 4 objects in 3, 4 or 5 frames.
     """
-    check_difficulty(difficulty)
     num_frames, num_blocks = NUM_FRAMES[difficulty], NUM_BLOCKS[difficulty]
-    check_num_distractors(num_distractors)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     shape = table.choose(objects)
-    appearances = table.rng.choice(len(textures), num_blocks, replace=False)
+    block_textures = table.distinct(textures, num_blocks)
     stackings = table.choose(all_stackings(num_blocks, num_frames - 1))
     size = table.sample_size(shape)
     blocks = [
-        table.add(shape, textures[appearance], size=size, pose=place)
-        for appearance, place in zip(appearances, _row(num_blocks), strict=True)
+        table.add(shape, texture, size=size, pose=place)
+        for texture, place in zip(block_textures, _row(num_blocks), strict=True)
     ]
     other_shapes = [name for name in objects if name != shape]
     table.place(
         "distractor",
-        lambda: (table.choose(other_shapes), table.choose(textures)),
+        table.drawing(other_shapes, textures),
         count=num_distractors,
         tries=num_distractors + 10,
     )

@@ -10,7 +10,7 @@ Source:   level L8 of openvima; not in the VIMA paper.
 """
 
 from openvima.scene import AtPose, DistractorsApart, Placement, Problem, Prompt
-from openvima.tasks.options import check_num_distractors
+from openvima.tasks.options import FewDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import frame_images, goals_between, with_frame_slots
 from openvima.tasks.table import TableSampler
@@ -28,14 +28,13 @@ _SPARE_STEPS = 2
     template=with_frame_slots(TEMPLATE, NUM_FRAMES),
     oracle_max_steps=2 * (NUM_FRAMES - 1) + _SPARE_STEPS,
 )
-def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: FewDistractors = 1) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
         num_distractors: Further objects, 0 … 3.
     """
-    check_num_distractors(num_distractors, high=3)
     taken: set[tuple[str, str]] = set()
 
     def put(what: str) -> Placement:
@@ -64,7 +63,7 @@ def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
         scene=scene,
         prompt=Prompt.parse(with_frame_slots(TEMPLATE, NUM_FRAMES), **frame_images(frames)),
         goals=goals,
-        constraints=(DistractorsApart(tuple(p.id for p in distractors), at_end=True),),
+        constraints=(DistractorsApart.of(distractors, at_end=True),),
         stages=(1,) * len(goals),
         oracle_max_steps=len(goals) + _SPARE_STEPS,
     )

@@ -14,6 +14,7 @@ from openvima.tasks.novel_words import (
     place_base_and_pair,
     sample_adjective_example,
 )
+from openvima.tasks.options import Difficulty, NumDistractors
 from openvima.tasks.placing import into_base
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -31,8 +32,8 @@ REQUEST = "Put the {adv}{novel_adj} {dragged_obj} into the {base_obj}."
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int = 0,
-    difficulty: str = "easy",
+    num_distractors: NumDistractors = 0,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 

@@ -16,8 +16,8 @@ from openvima.tasks.novel_words import (
     gray_image,
     place_base_and_pair,
     sample_adjective_example,
-    shuffle_sentences,
 )
+from openvima.tasks.options import Difficulty, NumDistractors
 from openvima.tasks.placing import into_base
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -35,8 +35,8 @@ REQUEST = "Put the {adv}{novel_adj} {novel_name_1} into the {novel_name_2}."
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int = 2,
-    difficulty: str = "easy",
+    num_distractors: NumDistractors = 2,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -48,7 +48,7 @@ def sample(
     """
     example = sample_adjective_example(table)
     noun, base_noun = choose_words(table, NOUNS, 2)
-    introductions = shuffle_sentences(table, INTRODUCTIONS)
+    introductions = table.shuffled(INTRODUCTIONS)
     base, target, others = place_base_and_pair(
         table, example, num_distractors=num_distractors, difficulty=difficulty
     )

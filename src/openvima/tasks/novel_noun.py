@@ -8,8 +8,8 @@ Source:   VIMA paper, task list of the appendix, "Novel noun".
 """
 
 from openvima.scene import Problem, Prompt
-from openvima.tasks.novel_words import NOUNS, choose_words, gray_image, shuffle_sentences
-from openvima.tasks.options import check_num_distractors, textures_by_difficulty
+from openvima.tasks.novel_words import NOUNS, choose_words, gray_image
+from openvima.tasks.options import Difficulty, NumDistractors, textures_by_difficulty
 from openvima.tasks.placing import into_base, of_a_third_shape, place_base_and_target, place_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -28,8 +28,8 @@ REQUEST = "Put a {novel_name_1} into a {novel_name_2}."
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int = 1,
-    difficulty: str = "easy",
+    num_distractors: NumDistractors = 1,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -38,7 +38,6 @@ def sample(
         num_distractors: Further objects, 0 … 6.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
-    check_num_distractors(num_distractors)
     noun, base_noun = choose_words(table, NOUNS, 2)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     base, target = place_base_and_target(
@@ -47,7 +46,7 @@ def sample(
     draw_distractor = of_a_third_shape(table, base, target, (*dragged_textures, *base_textures))
     distractors = place_distractors(table, draw_distractor, count=num_distractors)
     prompt = Prompt.parse(
-        " ".join((*shuffle_sentences(table, INTRODUCTIONS), REQUEST)),
+        " ".join((*table.shuffled(INTRODUCTIONS), REQUEST)),
         novel_name_1=noun,
         novel_name_2=base_noun,
         dragged_obj_1=gray_image(target),

@@ -7,7 +7,6 @@ from typing import Literal
 from openvima.catalog import Vector3
 from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
 from openvima.scene import ObjectImage, Placement, Pose
-from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.placing import APART_M, of_a_third_shape, place_distractors
 from openvima.tasks.table import NO_SCALE, TableSampler
 
@@ -17,12 +16,7 @@ NOUNS = ("dax", "blicket", "wug", "zup")
 
 def choose_words(table: TableSampler, words: Sequence[str], count: int = 1) -> tuple[str, ...]:
     """Draw distinct words."""
-    return tuple(words[int(i)] for i in table.rng.permutation(len(words))[:count])
-
-
-def shuffle_sentences(table: TableSampler, sentences: Sequence[str]) -> list[str]:
-    """Return sentences in random order."""
-    return [sentences[int(i)] for i in table.rng.permutation(len(sentences))]
+    return tuple(table.shuffled(words)[:count])
 
 
 def gray_image(placement: Placement) -> ObjectImage:
@@ -110,13 +104,10 @@ def place_base_and_pair(
     Returns:
         Base, target, and all other objects, the twin first.
     """
-    check_difficulty(difficulty)
-    check_num_distractors(num_distractors)
     pool = table.pool
     base_texture, texture = table.choose(pool.base_textures), table.choose(pool.dragged_textures)
     base = table.place_one("base", lambda: (table.choose(pool.base_objects), base_texture))
-    first, second = table.rng.permutation(len(pool.dragged_objects))[:2]
-    shape, other_shape = pool.dragged_objects[first], pool.dragged_objects[second]
+    shape, other_shape = table.shuffled(pool.dragged_objects)[:2]
     size = table.sample_size(shape)
 
     def put(what: str, object_name: str, attribute: Attribute, size: Vector3 | None) -> Placement:

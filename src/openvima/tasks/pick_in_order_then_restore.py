@@ -9,20 +9,17 @@ Source:   VIMA paper, task list of the appendix, "Visual memory".
 """
 
 from openvima.scene import (
-    WORKSPACE_HIGH,
-    WORKSPACE_LOW,
     AtPose,
     InOrder,
     ObjectImage,
     Placement,
-    Pose,
     Problem,
     Prompt,
     Tolerance,
 )
-from openvima.tasks.options import check_difficulty
+from openvima.tasks.options import Difficulty
 from openvima.tasks.registry import register_task
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import TableSampler, grid_point
 
 TEMPLATE = "Put {{dragged_obj}} into {targets}. Finally restore it into its original container."
 TOLERANCE = Tolerance(position_m=0.05)
@@ -44,20 +41,24 @@ def template(num_targets: int) -> str:
     oracle_max_steps=4,
     distractors_allowed=True,
 )
-def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
+def sample(table: TableSampler, *, difficulty: Difficulty = "easy") -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
         difficulty: "easy" and "medium" ask for two bases, "hard" for three.
     """
-    check_difficulty(difficulty)
     pool, num_targets = table.pool, NUM_TARGETS[difficulty]
-    centres = [_cell_centre(row, column) for row in range(NUM_ROWS) for column in range(NUM_COLUMNS)]
-    centres = [centres[index] for index in table.rng.permutation(len(centres))]
+    centres = table.shuffled(
+        [
+            grid_point(row + 0.5, NUM_ROWS, column + 1, NUM_COLUMNS + 1)
+            for row in range(NUM_ROWS)
+            for column in range(NUM_COLUMNS)
+        ]
+    )
     name, texture = table.choose(pool.dragged_objects), table.choose(pool.dragged_textures)
     shape = table.choose(pool.base_objects)
-    textures = table.rng.choice(pool.base_textures, size=len(centres), replace=False).tolist()
+    textures = table.distinct(pool.base_textures, len(centres))
     size, base_size = table.sample_size(name), table.sample_size(shape)
 
     def add_base(index: int) -> Placement:
@@ -76,17 +77,8 @@ def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(template(num_targets), dragged_obj=ObjectImage(dragged), **images),
-        goals=tuple(
-            AtPose(dragged.id, base.pose, TOLERANCE, relative_to=base.id) for base in (*targets, source)
-        ),
+        goals=tuple(AtPose.into(dragged, base, TOLERANCE) for base in (*targets, source)),
         constraints=(InOrder(tuple(range(1, num_targets))),),
         stages=(1,) * (num_targets + 1),
         oracle_max_steps=num_targets + _SPARE_STEPS,
     )
-
-
-def _cell_centre(row: int, column: int) -> Pose:
-    (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
-    x = low_x + (row + 0.5) * (high_x - low_x) / NUM_ROWS
-    y = low_y + (column + 1) * (high_y - low_y) / (NUM_COLUMNS + 1)
-    return Pose.planar(x, y)

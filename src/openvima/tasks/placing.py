@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_difficulty, check_num_distractors, check_switch
 from openvima.tasks.table import TableSampler, is_in_the_way
 
 TOLERANCE = Tolerance(position_m=0.1)
@@ -60,7 +59,7 @@ def of_a_third_shape(
         for shape in (*table.pool.dragged_objects, *table.pool.base_objects)
         if shape not in (base.object, target.object)
     ]
-    return lambda: (table.choose(shapes), table.choose(textures))
+    return table.drawing(shapes, textures)
 
 
 def into_base(
@@ -75,8 +74,8 @@ def into_base(
     return Problem(
         scene=table.scene(),
         prompt=prompt,
-        goals=(AtPose(target.id, base.pose, TOLERANCE, relative_to=base.id),),
-        constraints=(DistractorsApart(tuple(distractor.id for distractor in distractors)),),
+        goals=(AtPose.into(target, base, TOLERANCE),),
+        constraints=(DistractorsApart.of(distractors),),
     )
 
 
@@ -88,14 +87,8 @@ _SPARE_STEPS = 2
 
 
 def object_counts(difficulty: str, num_distractors: int | None) -> tuple[int, int]:
-    """Return the number of objects to gather and of distractors, by default that of the difficulty.
-
-    Raises:
-        ConfigError: An option is invalid.
-    """
-    check_difficulty(difficulty)
+    """Return the number of objects to gather and of distractors, by default that of the difficulty."""
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
-    check_num_distractors(num_distractors)
     return NUM_DRAGGED[difficulty], num_distractors
 
 
@@ -125,13 +118,9 @@ def gathering_problem(
 
     Returns:
         The problem; without `compat`, it is undecided at the start.
-
-    Raises:
-        ConfigError: `after_bowl` is neither true nor false.
     """
     if after_bowl is None:
         after_bowl = table.compat and "bowl" in table.pool.base_objects
-    check_switch("after_bowl", after_bowl)
     tolerance = Tolerance(BOWL_TOLERANCE_M if after_bowl or base.object == "bowl" else TOLERANCE_M)
     num_dragged, _ = counts
     dragged: list[Placement] = []
@@ -156,8 +145,8 @@ def gathering_problem(
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(template, base_obj=ObjectImage(base)),
-        goals=tuple(AtPose(p.id, base.pose, tolerance, relative_to=base.id) for p in placed[:num_dragged]),
-        constraints=(DistractorsApart(tuple(p.id for p in placed[num_dragged:])),),
+        goals=tuple(AtPose.into(p, base, tolerance) for p in placed[:num_dragged]),
+        constraints=(DistractorsApart.of(placed[num_dragged:]),),
         oracle_max_steps=num_dragged + _SPARE_STEPS,
     )
 

@@ -2,7 +2,7 @@
 
 import re
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib import resources
@@ -61,10 +61,10 @@ def rewrite(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generator
         'Put the red swirl letter A into the blue bowl.'
     """
     shown = {name: fill.placement for name, fill in prompt.images if isinstance(fill, ObjectImage)}
-    nouns = _nouns({name: shown.get(name) for name, _ in prompt.images}, prompts, rng)
+    text, nouns = _described(prompt.text, [name for name, _ in prompt.images], shown, prompts, rng)
     return replace(
         prompt,
-        text=with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns}),
+        text=text,
         images=tuple((name, fill) for name, fill in prompt.images if name not in nouns),
         is_ambiguous=any(_is_ambiguous(shown[n], noun, shown.values(), scene) for n, noun in nouns.items()),
     )
@@ -92,28 +92,22 @@ def describe(prompt: RenderedPrompt, prompts: str) -> RenderedPrompt:
     for name, record in shown.items():
         if len(record.object) + len(record.texture) > _MAX_NAMES:
             raise PromptError(f"image {echo(name)} has names of over {_MAX_NAMES} characters; shorten them.")
-    nouns = _nouns({name: shown.get(name) for name in records}, prompts, rng)
-    text = with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns})
+    text, nouns = _described(prompt.text, list(records), shown, prompts, rng)
     return RenderedPrompt(text, {name: image for name, image in prompt.images.items() if name not in nouns})
 
 
 def image_descriptions(prompt: RenderedPrompt) -> dict[str, str]:
-    """Return the description of the object in each object image by placeholder, where there is one."""
-    found = {
+    """Return the description of the object in each object image by placeholder."""
+    return {
         name: description_of(image.objects[0])
         for name, image in prompt.images.items()
         if image.kind == "object" and image.objects
     }
-    return {name: text for name, text in found.items() if text}
 
 
 def description_of(record: ObjectRecord) -> str:
-    """Return texture and name of an object, such as "red swirl letter A".
-
-    Empty for names that no prompt can hold: those of over 200 characters, or with braces.
-    """
-    text = _description(record, record.object)
-    return text if len(text) <= _MAX_NAMES and not {"{", "}"} & set(text) else ""
+    """Return texture and name of an object, such as "red swirl letter A"."""
+    return _description(record, record.object)
 
 
 def synonyms(description: str) -> tuple[str, ...]:
@@ -129,17 +123,22 @@ def synonyms(description: str) -> tuple[str, ...]:
     return tuple(description.removesuffix(noun) + alias for alias in specs[noun].aliases) if noun else ()
 
 
-def _nouns(
-    shown: Mapping[str, Placement | ObjectRecord | None], prompts: str, rng: np.random.Generator
-) -> dict[str, str]:
-    """Choose the images to replace, and a noun for each; images of scenes are None."""
+def _described(
+    text: str,
+    names: Sequence[str],
+    shown: Mapping[str, Placement] | Mapping[str, ObjectRecord],
+    prompts: str,
+    rng: np.random.Generator,
+) -> tuple[str, dict[str, str]]:
+    """Choose the images to replace, of those that show an object; return the text, and the noun of each."""
     form, _, synonyms = prompts.partition(",")
     nouns: dict[str, str] = {}
-    for (name, item), (image_draw, noun_draw) in zip(shown.items(), rng.random((len(shown), 2)), strict=True):
-        if item is not None and (form == "text" or (form == "mixed" and image_draw < _REPLACED_PROB)):
-            names = _names(item)
-            nouns[name] = names[int(noun_draw * len(names))] if synonyms else names[0]
-    return nouns
+    for name, (image_draw, noun_draw) in zip(names, rng.random((len(names), 2)), strict=True):
+        if name in shown and (form == "text" or (form == "mixed" and image_draw < _REPLACED_PROB)):
+            known = _names(shown[name])
+            nouns[name] = known[int(noun_draw * len(known))] if synonyms else known[0]
+    phrases = {name: _description(shown[name], noun) for name, noun in nouns.items()}
+    return with_phrases(text, phrases), nouns
 
 
 def _names(item: Placement | ObjectRecord) -> tuple[str, ...]:

@@ -8,10 +8,12 @@ Success:  each object was within 0.1 m of its target, and at the end the distrac
 Source:   VIMA paper, task list of the appendix, "Rearrange".
 """
 
+from typing import Literal
+
 from openvima.catalog import TEXTURE_SETS
-from openvima.errors import ConfigError, SamplingError, unknown_name
+from openvima.errors import SamplingError
 from openvima.scene import AtPose, DistractorsApart, Placement, Problem, Prompt, SceneImage, Tolerance
-from openvima.tasks.options import check_difficulty, check_num_distractors
+from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import Reject, TableSampler, is_in_the_way
 
@@ -27,9 +29,9 @@ _TRIES = 20
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int | None = None,
-    distractor_textures: str = "all",
-    difficulty: str = "easy",
+    num_distractors: SomeDistractors = None,
+    distractor_textures: Literal["all", "pool"] = "all",
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -40,19 +42,15 @@ def sample(
             those of the level.
         difficulty: "easy", "medium" or "hard"; without effect, as in the benchmark.
     """
-    check_difficulty(difficulty)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
     textures_of = {"all": TEXTURE_SETS["T"], "pool": textures}
-    if distractor_textures not in textures_of:
-        raise ConfigError(unknown_name("choice of distractor_textures", distractor_textures, textures_of))
     num_objects = 1 + int(table.rng.choice(len(NUM_OBJECTS_WEIGHTS), p=NUM_OBJECTS_WEIGHTS))
     if num_distractors is None:
         num_distractors = int(num_objects == 1)
-    check_num_distractors(num_distractors)
 
     targets = table.place(
         "object at its target",
-        lambda: (table.choose(objects), table.choose(textures)),
+        table.drawing(objects, textures),
         count=num_objects,
         tries=num_objects + 10,
     )
@@ -86,7 +84,7 @@ def sample(
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, scene=SceneImage.of(targets)),
         goals=tuple(AtPose(target.id, target.pose, TOLERANCE) for target in targets),
-        constraints=(DistractorsApart(tuple(p.id for p in distractors), at_end=True),),
+        constraints=(DistractorsApart.of(distractors, at_end=True),),
         prerequisites=tuple(AtPose(place.id, place.pose, TOLERANCE) for place in parking),
     )
 
@@ -95,9 +93,8 @@ def _on_target(
     table: TableSampler, appearance: tuple[str, str], start: Placement, target: Placement
 ) -> tuple[Placement, Placement]:
     """Place the distractor on the target; return it there and at its parking place."""
-    size = table.sample_size(appearance[0])
     z = target.pose.z if table.compat else None  # as in VIMA-Bench, at the height of the object
-    distractor = table.add(*appearance, size=size, pose=target.pose, z=z)
+    distractor = table.add(*appearance, pose=target.pose, z=z)
     if not table.compat and is_in_the_way(distractor, start):
         raise SamplingError("the distractor on the target crowds the object's start.")
     in_the_way = _in_the_way_of([target], table)

@@ -8,10 +8,11 @@ Source:   VIMA paper, task list of the appendix, "Rearrange then restore".
 """
 
 from dataclasses import replace
+from typing import Literal
 
 from openvima.scene import AtPose, DistractorsApart, Problem, Prompt
 from openvima.tasks import rearrange
-from openvima.tasks.options import check_switch
+from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -27,10 +28,10 @@ TEMPLATE = "Rearrange objects to this setup {scene} and then restore."
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int | None = None,
-    distractor_textures: str = "all",
+    num_distractors: SomeDistractors = None,
+    distractor_textures: Literal["all", "pool"] = "all",
     restore_distractor: bool = False,
-    difficulty: str = "easy",
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -44,7 +45,6 @@ def sample(
             way must not come back.
         difficulty: "easy", "medium" or "hard"; without effect, as in the benchmark.
     """
-    check_switch("restore_distractor", restore_distractor)
     problem = rearrange.sample(
         table,
         num_distractors=num_distractors,
@@ -54,7 +54,7 @@ def sample(
     arrange, (apart,) = problem.goals, problem.constraints
     assert isinstance(apart, DistractorsApart)
     starts = [problem.scene[goal.object_id] for goal in arrange if isinstance(goal, AtPose)]
-    to_restore = [starts[index] for index in table.rng.permutation(len(starts))]
+    to_restore = table.shuffled(starts)
     if restore_distractor and len(starts) == 1 and apart.object_ids:
         to_restore.append(problem.scene[apart.object_ids[0]])
         apart = replace(apart, goals=tuple(range(len(arrange))))

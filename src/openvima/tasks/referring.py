@@ -68,7 +68,7 @@ def referring_problem(table: TableSampler, kind: str) -> Problem:
         if command == "put":
             fills["base"] = ObjectImage(base)
         tolerance = TOLERANCE if len(moved) == 1 else SEVERAL
-        goals = [AtPose(p.id, base.pose, tolerance, relative_to=base.id) for p in moved]
+        goals = [AtPose.into(p, base, tolerance) for p in moved]
     else:
         fills["angle"] = angle_deg = table.choose(ANGLES_DEG)
         goals = [rotation_goal(p, angle_deg, position_m=TOLERANCE.position_m) for p in moved]
@@ -86,7 +86,7 @@ def referring_problem(table: TableSampler, kind: str) -> Problem:
 def _place_bases(table: TableSampler, count: int) -> list[Placement]:
     """Place containers of one shape and different textures."""
     shape = table.choose(table.pool.base_objects)
-    textures = table.rng.choice(table.pool.base_textures, size=count, replace=False).tolist()
+    textures = table.distinct(table.pool.base_textures, count)
     return [
         table.place_one("base", lambda texture=texture: (shape, texture), tries=_TRIES)
         for texture in textures
@@ -99,12 +99,11 @@ def _place_objects(
     """Place objects of few shapes and textures, no two alike; return them and those that are not there."""
     pool = table.pool
     shapes = [s for s in pool.dragged_objects if object_spec(s).symmetry_rad == NO_SYMMETRY]
-    shapes = table.rng.permutation(shapes if command == "rotate" else pool.dragged_objects)[:NUM_SHAPES]
-    textures = table.rng.permutation(pool.dragged_textures)[:NUM_TEXTURES].tolist()
+    shapes = table.shuffled(shapes if command == "rotate" else pool.dragged_objects)[:NUM_SHAPES]
+    textures = table.shuffled(pool.dragged_textures)[:NUM_TEXTURES]
     if not are_distinct((*textures, *(base.texture for base in bases))):
         raise SamplingError(f"{', '.join(textures)} are not clearly distinct.")
-    appearances = list(itertools.product(shapes.tolist(), textures))
-    chosen = [appearances[index] for index in table.rng.permutation(len(appearances))]
+    chosen = table.shuffled(list(itertools.product(shapes, textures)))
     placed: list[Placement] = []
     while len(placed) < count:
         scale = table.choose(SCALES)

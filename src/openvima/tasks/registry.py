@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
 from openvima.catalog.partitions import PACKAGE_TASKS, PUBLISHED_LEVELS
@@ -81,6 +81,35 @@ class TaskSpec:
         parameters = inspect.signature(self.sample).parameters.values()
         return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
 
+    def check_options(self, options: Mapping[str, object], others: Sequence[str] = ()) -> None:
+        """Check the names of options, and values where the annotation says which are allowed.
+
+        These are `Literal`, `bool` with or without None, and `Annotated[int, range(n)]`.
+
+        Args:
+            options: Names and values.
+            others: Names of options that a caller takes besides, to be suggested.
+
+        Raises:
+            ConfigError: The task has no such option, or its value is not allowed.
+        """
+        for name, value in options.items():
+            if name not in self.options:
+                known = [*others, *self.options]
+                hint = f"Allowed: {', '.join(known)}."
+                raise ConfigError(unknown_name(f"option of task {self.name!r}:", name, known, hint))
+            parameter = inspect.signature(self.sample).parameters[name]
+            annotation = parameter.annotation
+            numbers = getattr(annotation, "__metadata__", (None,))[0]
+            if value is parameter.default:
+                continue
+            if get_origin(annotation) is Literal and value not in get_args(annotation):
+                raise ConfigError(unknown_name(name, value, get_args(annotation)))
+            if annotation in (bool, bool | None) and not isinstance(value, bool):
+                raise ConfigError(f"{name} is {value!r}; give true or false.")
+            if isinstance(numbers, range) and (type(value) is not int or value not in numbers):
+                raise ConfigError(f"{name} is {value!r}; give an integer from 0 to {numbers[-1]}.")
+
     def checked_level(self, level: str | None) -> Level:
         """Return the level, or the first one of the task for None.
 
@@ -96,8 +125,8 @@ class TaskSpec:
             f"task {self.name!r} is not defined at level {level}; use {', '.join(self.levels)}."
         )
 
-    def pool(self, level: str | None = None) -> Pool:
-        """Return the objects and textures at a level, by default the first.
+    def pool(self, level: str) -> Pool:
+        """Return the objects and textures at a level.
 
         Raises:
             ConfigError: There is no such level, or the task is not defined there.
@@ -201,9 +230,7 @@ def check_steps(task: str, oracle_max_steps: int) -> None:
         ConfigError: It is not an integer from 1 to 18, two steps below the longest episode.
     """
     most = MAX_EPISODE_STEPS - EXTRA_STEPS
-    if isinstance(oracle_max_steps, bool) or not (
-        isinstance(oracle_max_steps, int) and 1 <= oracle_max_steps <= most
-    ):
+    if type(oracle_max_steps) is not int or not 1 <= oracle_max_steps <= most:
         raise ConfigError(
             f"oracle_max_steps of task {task!r} is {oracle_max_steps!r}; give an integer from 1 to {most}: "
             f"a policy has {EXTRA_STEPS} steps more, and an episode at most {MAX_EPISODE_STEPS}."

@@ -9,7 +9,7 @@ Source:   level L8 of openvima; not in the VIMA paper.
 """
 
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_num_distractors
+from openvima.tasks.options import FewDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -22,26 +22,23 @@ _SPARE_STEPS = 2
 
 
 @register_task("reverse_order", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=11)
-def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: FewDistractors = 1) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
         num_distractors: Further objects, 0 … 3.
     """
-    check_num_distractors(num_distractors, high=3)
-    options = table.appearances()
-    drawn = table.rng.choice(len(options), NUM_OBJECTS + num_distractors, replace=False)
-    appearances = [options[index] for index in drawn]
+    appearances = table.distinct(table.appearances(), NUM_OBJECTS + num_distractors)
     places = [Pose.planar(ROW_X, (n - (NUM_OBJECTS - 1) / 2) * SPACING_M) for n in range(NUM_OBJECTS)]
     side = table.choose((-1, 1))  # of the row where the oracle puts objects aside
     row = [
-        table.add(name, texture, size=table.sample_size(name), pose=pose)
+        table.add(name, texture, pose=pose)
         for (name, texture), pose in zip(appearances, places, strict=False)
     ]
-    beside = table.rng.permutation(NUM_OBJECTS)[:num_distractors].tolist()
+    beside = table.shuffled(range(NUM_OBJECTS))[:num_distractors]
     distractors = [
-        table.add(name, texture, size=table.sample_size(name), pose=places[n].moved(dx=-side * ASIDE_M))
+        table.add(name, texture, pose=places[n].moved(dx=-side * ASIDE_M))
         for (name, texture), n in zip(appearances[NUM_OBJECTS:], beside, strict=True)
     ]
 
@@ -53,7 +50,7 @@ def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, **{f"object_{n}": ObjectImage(p) for n, p in enumerate(row, 1)}),
         goals=tuple(AtPose(row[n].id, places[NUM_OBJECTS - 1 - n], TOLERANCE) for n in (*second, *first)),
-        constraints=(DistractorsApart(tuple(p.id for p in distractors), at_end=True),),
+        constraints=(DistractorsApart.of(distractors, at_end=True),),
         prerequisites=tuple(AtPose(row[n].id, places[n].moved(dx=side * ASIDE_M), TOLERANCE) for n in first),
         oracle_max_steps=3 * half + _SPARE_STEPS,
     )

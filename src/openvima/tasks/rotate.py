@@ -9,7 +9,7 @@ Source:   VIMA paper, task list of the appendix, "Rotate".
 from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, ObjectImage, Problem, Prompt
-from openvima.tasks.options import check_difficulty, check_num_distractors
+from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.placing import ANGLES_DEG, check_angles, rotation_goal
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -30,8 +30,8 @@ def sample(
     table: TableSampler,
     *,
     angles_deg: Sequence[float] = ANGLES_DEG,
-    num_distractors: int | None = None,
-    difficulty: str = "easy",
+    num_distractors: SomeDistractors = None,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -41,18 +41,16 @@ def sample(
         num_distractors: Further objects, 0 … 6; by default as many as the difficulty says.
         difficulty: "easy", "medium" or "hard": 1, 3 or 5 distractors.
     """
-    check_difficulty(difficulty)
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
-    check_num_distractors(num_distractors)
     check_angles(angles_deg)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     angle_deg = table.choose(angles_deg)
-    target = table.place_one("target", lambda: (table.choose(objects), table.choose(textures)))
+    target = table.place_one("target", table.drawing(objects, textures))
     others = [texture for texture in textures if texture != target.texture]
     distractors = table.place(
         "distractor",
-        lambda: (table.choose(objects), table.choose(others)),
+        table.drawing(objects, others),
         count=num_distractors,
         tries=num_distractors + 10,
         apart_m=TOLERANCE_M,
@@ -61,5 +59,5 @@ def sample(
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, dragged_obj=ObjectImage(target), angle_in_degree=round(angle_deg)),
         goals=(rotation_goal(target, angle_deg, position_m=TOLERANCE_M),),
-        constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
+        constraints=(DistractorsApart.of(distractors),),
     )

@@ -10,6 +10,7 @@ Source:   VIMA paper, task list of the appendix, "Visual reasoning".
 
 from openvima.catalog import Pool, object_spec
 from openvima.scene import Problem
+from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.placing import gathering_problem, object_counts
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -21,9 +22,9 @@ TEMPLATE = "Put all objects with the same profile as {base_obj} into it."
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int | None = None,
+    num_distractors: SomeDistractors = None,
     after_bowl: bool | None = None,
-    difficulty: str = "easy",
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 

@@ -35,7 +35,7 @@ from openvima.scene.goal import (
 from openvima.tasks import clutter
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewrite
-from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, check_steps, list_tasks, task_spec
+from openvima.tasks.registry import EXTRA_STEPS, check_steps, list_tasks, task_spec
 from openvima.tasks.table import TableSampler, is_wedged
 from openvima.user_code import described
 
@@ -182,10 +182,6 @@ class RenumberedCondition:
         move = oracle_move(self.condition, self._as_made(scene))
         return None if move is None else move.renumbered(self.new_of)
 
-    def renumbered(self, new_of: Mapping[int, int]) -> "RenumberedCondition":
-        """Return the condition for other ids."""
-        return RenumberedCondition(self.condition, {old: new_of[new] for old, new in self.new_of.items()})
-
     def _as_made(self, scene: Scene) -> Scene:
         return _renumber_scene(scene, {new: old for old, new in self.new_of.items()})
 
@@ -246,7 +242,7 @@ def sample_episode(
 
     spec = task_spec(task)
     level, number = spec.checked_level(level), checked_seed(seed)
-    _check_options(spec, options)
+    spec.check_options(options)
     pack = load_assets(assets)  # may register objects of the pool and of the text form
     check_text_form(task, prompts)
     pool = spec.pool(level)
@@ -256,9 +252,14 @@ def sample_episode(
         table = TableSampler(rng, pool, assets=pack, end_effector=spec.end_effector, compat=compat)
         try:
             problem = spec.sample(table, **options)
-            if level == clutter.LEVEL and isinstance(problem, Problem):
+            if not isinstance(problem, Problem):
+                raise ConfigError(
+                    f"`sample` of task {task!r} returned a {type(problem).__name__}; return a Problem, see "
+                    "docs/your_own_task.md."
+                )
+            if level == clutter.LEVEL:
                 problem = clutter.add_clutter(table, problem, task)
-            if level not in PUBLISHED_LEVELS and isinstance(problem, Problem):
+            if level not in PUBLISHED_LEVELS:
                 _check_room(problem.scene, pack)
         except SamplingError as error:
             reason = error
@@ -269,11 +270,6 @@ def sample_episode(
             raise ConfigError(
                 f"`sample` of task {task!r}, seed {number}, raised {described(error)}."
             ) from error
-        if not isinstance(problem, Problem):
-            raise ConfigError(
-                f"`sample` of task {task!r} returned a {type(problem).__name__}; return a Problem, see "
-                "docs/your_own_task.md."
-            )
         if not compat:
             problem = shuffle_ids(problem, make_rng(domain, task, level, number, "ids", attempt=attempt))
         if prompts != MULTIMODAL:
@@ -357,9 +353,3 @@ def check_task_options(tasks: tuple[str, ...], text: str) -> None:
             continue
         except ConfigError as error:
             raise ConfigError(f"task option of {task!r}: {error}") from None
-
-
-def _check_options(spec: TaskSpec, options: dict[str, object]) -> None:
-    for name in options:
-        if name not in spec.options:
-            raise ConfigError(unknown_name(f"option of task {spec.name!r}:", name, spec.options))

@@ -8,7 +8,7 @@ Source:   VIMA paper, task list of the appendix, "Scene understanding".
 """
 
 from openvima.scene import Placement, Problem, Prompt, SceneImage
-from openvima.tasks.options import check_num_distractors, textures_by_difficulty
+from openvima.tasks.options import Difficulty, NumDistractors, textures_by_difficulty
 from openvima.tasks.placing import APART_M, into_base, place_base_and_target
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -22,8 +22,8 @@ TEMPLATE = "Put the {dragged_texture} object in {scene} into the {base_texture} 
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int = 1,
-    difficulty: str = "easy",
+    num_distractors: NumDistractors = 1,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -32,7 +32,6 @@ def sample(
         num_distractors: Distractors on the table, 0 … 6.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
-    check_num_distractors(num_distractors)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     textures = (*dragged_textures, *base_textures)
 

@@ -9,6 +9,7 @@ Source:   level L8 of openvima; not in the VIMA paper.
 """
 
 from openvima.scene import Problem
+from openvima.tasks.options import FewDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.sorting import NUM_GROUPS, sorting_problem
 from openvima.tasks.table import TableSampler
@@ -20,7 +21,7 @@ TEMPLATE = (
 
 
 @register_task("sort_by_texture", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=11)
-def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
+def sample(table: TableSampler, *, num_distractors: FewDistractors = 1) -> Problem:
     """Sample one problem.
 
     Args:
@@ -28,13 +29,13 @@ def sample(table: TableSampler, *, num_distractors: int = 1) -> Problem:
         num_distractors: Objects of other textures, 0 … 3.
     """
     pool = table.pool
-    drawn = table.rng.permutation(pool.dragged_textures).tolist()
+    drawn = table.shuffled(pool.dragged_textures)
     textures, others = drawn[:NUM_GROUPS], drawn[NUM_GROUPS:]
     return sorting_problem(
         table,
         TEMPLATE,
         draw=lambda group: (table.choose(pool.dragged_objects), textures[group]),
-        draw_distractor=lambda: (table.choose(pool.dragged_objects), table.choose(others)),
+        draw_distractor=table.drawing(pool.dragged_objects, others),
         base_textures=others,
         describe=lambda number, _: {f"texture_{number + 1}": textures[number]},
         num_distractors=num_distractors,

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_num_distractors
 from openvima.tasks.table import TableSampler
 
 NUM_GROUPS = 3
@@ -39,20 +38,15 @@ def sorting_problem(
         base_textures: Textures of containers, which all differ.
         describe: Returns the fills of the prompt that name a group, from its number and its objects.
         num_distractors: Objects of no group, 0 … 3.
-
-    Raises:
-        ConfigError: The number is out of range.
     """
     num_objects = int(table.rng.integers(LEAST, MOST + 1))
-    check_num_distractors(num_distractors, high=MAX_DISTRACTORS)
-    textures = table.rng.choice(base_textures, size=NUM_GROUPS, replace=False).tolist()
+    textures = table.distinct(base_textures, NUM_GROUPS)
     side = table.choose((-1, 1))  # of the table where the containers are
     bases = [
         _put(table, (table.choose(table.pool.base_objects), texture), MIDDLE_X + side * BASES_M, y)
-        for texture, y in zip(textures, table.rng.permutation(BASES_Y).tolist(), strict=True)
+        for texture, y in zip(textures, table.shuffled(BASES_Y), strict=True)
     ]
-    cells = [(MIDDLE_X - side * row, y) for row in ROWS_M for y in COLUMNS_Y]
-    cells = [cells[index] for index in table.rng.permutation(len(cells))]
+    cells = table.shuffled([(MIDDLE_X - side * row, y) for row in ROWS_M for y in COLUMNS_Y])
     groups: list[list[Placement]] = [[] for _ in bases]
     for number in range(num_objects):
         group = number % NUM_GROUPS
@@ -63,9 +57,7 @@ def sorting_problem(
     ]
 
     goals = [
-        AtPose(p.id, base.pose, TOLERANCE, relative_to=base.id)
-        for base, group in zip(bases, groups, strict=True)
-        for p in group
+        AtPose.into(p, base, TOLERANCE) for base, group in zip(bases, groups, strict=True) for p in group
     ]
     constraints = []
     for base, group in zip(bases, groups, strict=True):
@@ -87,4 +79,4 @@ def sorting_problem(
 def _put(table: TableSampler, appearance: Appearance, x: float, y: float, *, turns: int = 0) -> Placement:
     """Add an object, turned by a multiple of 90 degrees so that it stays in its cell."""
     pose = Pose.planar(x, y, turns * math.pi / 2)
-    return table.add(*appearance, size=table.sample_size(appearance[0]), pose=pose)
+    return table.add(*appearance, pose=pose)

@@ -18,7 +18,6 @@ from openvima.scene import (
     block_points,
     in_workspace,
 )
-from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.pushes import Rectangle
 from openvima.tasks.table import TableSampler
 
@@ -134,11 +133,8 @@ def sweep_problem(
         distractor_spread_m: Side of the distractors' square.
 
     Raises:
-        ConfigError: There is no such difficulty, or the number is out of range.
         SamplingError: No valid group of blocks was found.
     """
-    check_difficulty(difficulty)
-    check_num_distractors(0 if num_distractors is None else num_distractors)
     rng, pool = table.rng, table.pool
     num_swept = 1 + int(rng.choice(3, p=NUM_SWEPT_WEIGHTS[difficulty]))
     swept_texture = table.choose(pool.dragged_textures)

@@ -8,6 +8,7 @@ Source:   VIMA paper, task list of the appendix, "Visual constraint satisfaction
 """
 
 from openvima.scene import Placement, Problem, Zone
+from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.sweep_table import Layout, place_flat, sweep_problem
 from openvima.tasks.table import TableSampler
@@ -27,7 +28,9 @@ DISTRACTOR_SPREAD_M = 0.09
     end_effector="spatula",
     oracle_max_steps=8,
 )
-def sample(table: TableSampler, *, num_distractors: int | None = None, difficulty: str = "easy") -> Problem:
+def sample(
+    table: TableSampler, *, num_distractors: SomeDistractors = None, difficulty: Difficulty = "easy"
+) -> Problem:
     """Sample one problem.
 
     Args:

@@ -75,15 +75,13 @@ class TableSampler:
         end_effector: EndEffector = "suction",
         compat: bool = False,
     ) -> None:
-        from openvima.render.labels import empty_labels  # imports Numba, which a list of tasks does not need
-
         self.rng = rng
         self.pool = pool
         self.compat = compat
         self.placements: list[Placement] = []
         self.assets = assets
         self._end_effector: EndEffector = end_effector
-        self._labels, self._heights = empty_labels()
+        self._labels, self._heights = self._stamp_all(())
 
     def appearances(self) -> list[tuple[str, str]]:
         """All shapes and textures of dragged objects of the pool."""
@@ -92,6 +90,18 @@ class TableSampler:
     def choose(self, options: Sequence[T]) -> T:
         """Draw one option uniformly."""
         return options[int(self.rng.integers(len(options)))]
+
+    def shuffled(self, options: Sequence[T]) -> list[T]:
+        """Return the options in random order."""
+        return [options[index] for index in self.rng.permutation(len(options)).tolist()]
+
+    def distinct(self, options: Sequence[T], count: int) -> list[T]:
+        """Draw so many different options."""
+        return [options[index] for index in self.rng.choice(len(options), count, replace=False).tolist()]
+
+    def drawing(self, objects: Sequence[str], textures: Sequence[str]) -> Callable[[], tuple[str, str]]:
+        """Return a function that draws an object and its texture, for `place`."""
+        return lambda: (self.choose(objects), self.choose(textures))
 
     def sample_size(self, object_name: str) -> Vector3:
         """Draw a nominal size in metres: each axis independently, of registered objects all by one factor."""
@@ -195,8 +205,8 @@ class TableSampler:
         object_name: str,
         texture: str,
         *,
-        size: Vector3,
         pose: Pose,
+        size: Vector3 | None = None,
         fixed: bool | None = None,
         scale: Vector3 = NO_SCALE,
         z: float | None = None,
@@ -207,8 +217,8 @@ class TableSampler:
         Args:
             object_name: Display name in the catalogue.
             texture: Display name in the catalogue.
-            size: Nominal size in metres.
             pose: Its pose; the height is ignored.
+            size: Nominal size in metres; by default drawn.
             fixed: Whether it is fixed to the table; by default if it is a base of the pool.
             scale: Factor per axis on top of the size.
             z: Height of its link frame in metres; by default that of rest on the table (with `compat`: half
@@ -218,6 +228,7 @@ class TableSampler:
         Returns:
             The object.
         """
+        size = size or self.sample_size(object_name)
         new = self._at_rest(object_name, texture, size, pose, scale, fixed)
         if on_top:
             height_m = self._height_below(new)
@@ -318,7 +329,7 @@ class TableSampler:
         return placement
 
     def _stamp(self, labels: np.ndarray, heights: np.ndarray, placement: Placement) -> None:
-        from openvima.render.labels import stamp
+        from openvima.render.labels import stamp  # imports Numba, which a list of tasks does not need
 
         stamp(labels, heights, placement, self.assets)
 
@@ -354,6 +365,13 @@ class TableSampler:
             if base.fixed and not movable.fixed and is_in_hollow(movable, base):
                 return True
         return False
+
+
+def grid_point(row: float, num_rows: int, column: float, num_columns: int) -> Pose:
+    """Return the pose at a fraction of the table's width and length, from its lower corner, unrotated."""
+    (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
+    x = low_x + row * (high_x - low_x) / num_rows
+    return Pose.planar(x, low_y + column * (high_y - low_y) / num_columns)
 
 
 def is_in_hollow(placement: Placement, base: Placement) -> bool:

@@ -11,7 +11,7 @@ Source:   VIMA paper, task list of the appendix, "Twist".
 import math
 
 from openvima.scene import DistractorsApart, Placement, Pose, Problem, Prompt, SceneImage
-from openvima.tasks.options import check_difficulty, check_num_distractors
+from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.placing import (
     ANGLES_DEG,
     rotated_clockwise,
@@ -38,8 +38,8 @@ EXAMPLE_LOW, EXAMPLE_HIGH = (0.4375, -0.375), (0.5625, 0.375)  # m, x and y, of 
 def sample(
     table: TableSampler,
     *,
-    num_distractors: int | None = None,
-    difficulty: str = "easy",
+    num_distractors: SomeDistractors = None,
+    difficulty: Difficulty = "easy",
 ) -> Problem:
     """Sample one problem.
 
@@ -49,14 +49,12 @@ def sample(
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 objects, at least one of them a target and at least
             one a distractor.
     """
-    check_difficulty(difficulty)
     num_objects = NUM_OBJECTS[difficulty]
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     num_targets = int(table.rng.integers(1, num_objects))
     if num_distractors is None:
         num_distractors = num_objects - num_targets
-    check_num_distractors(num_distractors)
     angle_deg, texture = table.choose(ANGLES_DEG), table.choose(textures)
     others = [other for other in textures if other != texture]
     targets = table.place(
@@ -67,7 +65,7 @@ def sample(
     )
     distractors = table.place(
         "distractor",
-        lambda: (table.choose(objects), table.choose(others)),
+        table.drawing(objects, others),
         count=num_distractors,
         tries=num_distractors + 10,
     )
@@ -80,7 +78,7 @@ def sample(
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, twist_obj_texture=texture, **examples),
         goals=tuple(rotation_goal(target, angle_deg, position_m=TOLERANCE_M) for target in targets),
-        constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
+        constraints=(DistractorsApart.of(distractors),),
         oracle_max_steps=num_objects + 2,
     )
 
@@ -89,4 +87,4 @@ def _example(table: TableSampler, object_name: str, texture: str) -> Placement:
     """Place an object near the middle of an empty table, at a random heading."""
     x, y = table.rng.uniform(EXAMPLE_LOW, EXAMPLE_HIGH).tolist()
     pose = Pose.planar(x, y, table.rng.uniform(0.0, 2 * math.pi))
-    return table.add(object_name, texture, size=table.sample_size(object_name), pose=pose, z=0.0)
+    return table.add(object_name, texture, pose=pose, z=0.0)

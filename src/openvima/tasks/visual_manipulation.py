@@ -8,7 +8,7 @@ Source:   VIMA paper, task list of the appendix, "Simple object manipulation".
 """
 
 from openvima.scene import ObjectImage, Problem, Prompt
-from openvima.tasks.options import check_num_distractors, textures_by_difficulty
+from openvima.tasks.options import Difficulty, NumDistractors, textures_by_difficulty
 from openvima.tasks.placing import into_base, place_base_and_target, place_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
@@ -23,7 +23,9 @@ TEMPLATE = "Put the {dragged_obj_1} into the {base_obj}."
     oracle_max_steps=3,
     distractors_allowed=True,
 )
-def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "easy") -> Problem:
+def sample(
+    table: TableSampler, *, num_distractors: NumDistractors = 1, difficulty: Difficulty = "easy"
+) -> Problem:
     """Sample one problem.
 
     Args:
@@ -31,7 +33,6 @@ def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "
         num_distractors: Further objects, 0 … 6.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
-    check_num_distractors(num_distractors)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     base, target = place_base_and_target(
         table, dragged_textures=dragged_textures, base_textures=base_textures
