@@ -43,6 +43,7 @@ from openvima.evaluation.statistics import wilson_interval
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.perception.preprocessing import extract_observation
 from openvima.policies.inference import NetworkPolicy
+from openvima.policies.loading import load_policy
 from openvima.policies.nn.actions import DecodingStrategy
 from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.pointer.model import Pointer
@@ -308,8 +309,8 @@ def main() -> None:
     parser.add_argument("--assets", default="procedural", help="as of `openvima evaluate`")
     parser.add_argument("--json", type=Path, help="file to write")
     arguments = parser.parse_args()
-    policy = NetworkPolicy.from_pretrained(arguments.policy, dtype=torch.float32)
-    if not isinstance(policy.network, Pointer):
+    policy = load_policy(arguments.policy, dtype=torch.float32)
+    if not isinstance(policy, NetworkPolicy) or not isinstance(policy.network, Pointer):
         parser.error(f"--policy is {arguments.policy}; it must be a pointer network, such as nano or small")
     ways = arguments.ways.split(",")
     if unknown := set(ways) - set(FORCED):

@@ -28,7 +28,7 @@ from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.actions import ACTIONS_NAME
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.sources import weights_hash
-from openvima.policies.naming import BUNDLED, SMALL
+from openvima.policies.naming import BUNDLED, MODEL_CARD, SMALL
 from openvima.report.table import Line, Table, markdown
 from tables import tables
 from weights import facts, settings, ship, shipped
@@ -178,7 +178,7 @@ def write(
     if evaluation and (file := draw_failures(evaluation, images / "openvima_small_failures.png")):
         drawn["failures"] = file
     made = {name: text or absent for name, text in tables(findings, recorded_means(recorded)).items()}
-    made |= weights_tables(BUNDLED[SMALL].folder)
+    made |= weights_tables(BUNDLED[SMALL])
     page = out.with_suffix(".md")
     if not page.exists():
         sections = "\n\n".join(
@@ -210,8 +210,8 @@ def _pair_table(pairs: Sequence[tuple[str, str]]) -> str:
 
 def main() -> None:
     """Ship weights, or write record, figures and tables of evaluations."""
-    folder = BUNDLED[SMALL].folder
-    default = [Path("README.md"), Path("docs/openvima_small.md"), BUNDLED[SMALL].model_card]
+    folder = BUNDLED[SMALL]
+    default = [Path("README.md"), Path("docs/openvima_small.md"), folder / MODEL_CARD]
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("scores", type=Path, nargs="?", help="folder of the folders of evaluations")

@@ -72,7 +72,7 @@ def _level_table(
     found = {what: means for name, what in shown.items() if (means := findings.means(name))}
     if not found:
         return None
-    own = shipped(BUNDLED[POLICY].folder)
+    own = shipped(BUNDLED[POLICY])
     ours = (f"{own.parameters / 1e6:.1f}M", f"{own.episodes:,}") if own else ("–", "–")
     columns = ("", "parameters", "demonstrations") if models else ("",)
     lines = []
@@ -164,7 +164,7 @@ def _failure_table(results: Results | None) -> Table | None:
 
 def _baseline_table(findings: Findings, recorded: Mapping[str, LevelMean]) -> Table:
     """Architectures that were trained on the same demonstrations for the same time, and ours."""
-    trainings, own = findings.baselines, shipped(BUNDLED[POLICY].folder)
+    trainings, own = findings.baselines, shipped(BUNDLED[POLICY])
     levels = list(dict.fromkeys(level for training in trainings for level in training.means()))
     lines = []
     if own is not None:

@@ -13,7 +13,7 @@ import yaml
 from openvima.atomic_io import atomic_write_file
 from openvima.data import Dataset
 from openvima.errors import ConfigError, DatasetError
-from openvima.policies.build import policy_size
+from openvima.policies.build import count_parameters, outline_network
 from openvima.policies.checkpoint import load_network, read_info, write_checkpoint
 from openvima.policies.naming import CONFIG_FILE, METRICS_FILE, WEIGHTS_FILE
 from openvima.policies.t5 import tokenizer_for
@@ -94,7 +94,7 @@ def shipped(folder: Path) -> Shipped | None:
         return None
     sessions, costs = _sessions(folder / RECORD), read_costs(folder / RECORD)
     return Shipped(
-        policy_size(read_info(folder).config).parameters.total,
+        count_parameters(outline_network(read_info(folder).config))["total"].total,
         (folder / WEIGHTS_FILE).stat().st_size,
         sessions[-1]["data"]["content_hash"],
         sessions[-1]["data"]["counts"]["episodes"],

@@ -19,7 +19,7 @@ from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.statistics import mean_of_rates
-from openvima.policies.build import policy_size
+from openvima.policies.build import count_parameters, outline_network
 from openvima.policies.checkpoint import read_info
 from openvima.policies.naming import METRICS_FILE, find_checkpoint
 from openvima.training.run_folder import SESSIONS_FILE, read_costs, whole_lines
@@ -87,7 +87,9 @@ def record_of(what: str, run: Path, scores: Path, *, options: list[str]) -> dict
         "what": what,
         "options": options,
         "commits": sorted({values["git"]["commit"] for _, values in whole_lines(run / SESSIONS_FILE)}),
-        "parameters": policy_size(read_info(find_checkpoint(run)).config).parameters.total,
+        "parameters": count_parameters(outline_network(read_info(find_checkpoint(run)).config))[
+            "total"
+        ].total,
         "minutes": round(costs["seconds"] / 60, 1),
         "steps": curve[-1]["step"],
         "curve": [{key: round(line[key], 4) for key in keys if key in line} for line in curve],

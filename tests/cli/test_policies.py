@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.policies import PRESETS, build, load_policy, preset  # noqa: E402
-from openvima.policies.build import build_network, policy_size  # noqa: E402
+from openvima.policies.build import build_network, count_parameters, outline_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
 from openvima.policies.naming import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE  # noqa: E402
 from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
@@ -19,7 +19,7 @@ from published_policies import small_vima, write_published, write_tokenizer  # n
 def count_each_preset_once() -> Iterator[None]:
     """Of the presets, each list counts all."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "policy_size", cache(policy_size))
+        patch.setattr(build, "outline_network", cache(outline_network))
         yield
 
 
@@ -37,15 +37,14 @@ def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys,
     assert max(len(line) for line in lines if "model card" not in line) <= 100
     rows = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
     assert rows.keys() >= PRESETS.keys()
-    size = policy_size(preset("vima-20m"))
-    counts = [
-        *(count.total for count in size.parts.values()),
-        size.parameters.total,
-        size.parameters.trainable,
+    counts = count_parameters(outline_network(preset("vima-20m")))
+    total = counts["total"]
+    numbers = [
+        f"{count / 1e6:.2f}"
+        for count in (*(count.total for count in counts.values()), total.trainable, total.frozen)
     ]
-    numbers = [f"{count / 1e6:.2f}" for count in [*counts, size.parameters.frozen]]
     assert rows["vima-20m"] == ["384", "4", "12", *numbers]
-    assert rows["preset"][3:] == [*size.parts, "total", "trained", "frozen"]
+    assert rows["preset"][3:] == [*counts, "trained", "frozen"]
 
 
 def test_a_preset_is_shown_with_all_of_its_sizes(capsys) -> None:

@@ -17,7 +17,7 @@ from openvima.cli.detector import COMMANDS
 from openvima.detector.config import detector_config
 from openvima.detector.network import MaskRCNN
 from openvima.policies import preset
-from openvima.policies.build import policy_size
+from openvima.policies.build import count_parameters, outline_network
 from openvima.policies.naming import BUNDLED, SMALL
 from openvima.policies.pointer.candidates import GridCandidates
 from openvima.training.recipes import RECIPES
@@ -32,7 +32,7 @@ DETECTOR, MIDAS, POLICIES, OPENVIMA_SMALL = (
 )
 MARKS = {
     *(f"{name}-figure" for name in _FIGURES),
-    *(*weights_tables(BUNDLED[SMALL].folder), *tables(Findings({}), {})),
+    *(*weights_tables(BUNDLED[SMALL]), *tables(Findings({}), {})),
 }
 
 
@@ -77,17 +77,18 @@ def test_the_table_of_sizes_is_that_of_the_presets() -> None:
     rows = re.findall(r"^\| `([\w-]+)` \| (\d.*) \|$", POLICIES, flags=re.MULTILINE)
     assert {name for name, _ in rows} > {f"vima-{size}" for size in ("2m", "9m", "200m")}
     for name, row in rows:
-        size = policy_size(preset(name))
-        counts = (size.parameters.total, size.parameters.trainable)
-        millions = [f"{count / 1e6:.2f}" for count in counts]
-        assert row.split(" | ") == [str(size.width), str(size.num_layers), str(size.num_heads), *millions]
+        config = preset(name)
+        decoder, count = config.decoder, count_parameters(outline_network(config))["total"]
+        millions = [f"{number / 1e6:.2f}" for number in (count.total, count.trainable)]
+        sizes = (decoder.width, decoder.num_layers, decoder.num_heads)
+        assert row.split(" | ") == [*map(str, sizes), *millions]
 
 
 def test_every_recipe_that_the_page_of_midas_names_is_there() -> None:
     assert set(re.findall(r"^\| `(midas-[a-z-]+[a-z])` \| [^\d]", MIDAS, flags=re.MULTILINE)) <= {*RECIPES}
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/openvima_small.md", BUNDLED[SMALL].model_card])
+@pytest.mark.parametrize("page", ["README.md", "docs/openvima_small.md", BUNDLED[SMALL] / "MODEL_CARD.md"])
 def test_every_mark_has_an_end_and_a_table_or_figure(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     begun = re.findall(r"<!-- small:(\S+) -->", text)

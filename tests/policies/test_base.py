@@ -16,7 +16,6 @@ from openvima.policies.build import (
     config_to_dict,
     count_parameters,
     outline_network,
-    policy_size,
 )
 from openvima.policies.presets import PUBLISHED, SIZE_NAMES
 from openvima.policies.sizes import SIZES
@@ -56,15 +55,15 @@ DECODERS = {"2m": 2.10, "4m": 4.20, "9m": 9.85, "20m": 18.90, "43m": 41.99, "92m
 
 @pytest.mark.parametrize(("size", "millions"), DECODERS.items())
 def test_the_decoder_of_vima_has_the_published_size(size: str, millions: float) -> None:
-    assert policy_size(preset(f"vima-{size}")).parts["decoder"].total / 1e6 == pytest.approx(
-        millions, abs=5e-3
-    )
+    counts = count_parameters(outline_network(preset(f"vima-{size}")))
+    assert counts["decoder"].total / 1e6 == pytest.approx(millions, abs=5e-3)
 
 
 @pytest.mark.parametrize("size", ["2m", "200m"])
 @pytest.mark.slow
 def test_the_decoders_of_all_architectures_are_of_equal_size(size: str) -> None:
-    decoders = [policy_size(preset(f"{name}-{size}")).parts["decoder"].total for name in PUBLISHED]
+    networks = [outline_network(preset(f"{name}-{size}")) for name in PUBLISHED]
+    decoders = [count_parameters(network)["decoder"].total for network in networks]
     assert max(decoders) < 1.003 * min(decoders)  # self blocks have biases, cross blocks none
 
 
@@ -78,26 +77,26 @@ def test_every_parameter_belongs_to_one_part(name: str) -> None:
         owners = [part for part, prefixes in PARTS.items() if parameter.startswith(prefixes)]
         expected = 2 if parameter.startswith("head.actions.") else 1  # of two the first counts, "actions"
         assert len(owners) == expected, (parameter, owners)
-    total = policy_size(sizes).parameters
-    assert total.total == sum(parameter.numel() for parameter in network.parameters())
+    assert count_parameters(network)["total"].total == sum(
+        parameter.numel() for parameter in network.parameters()
+    )
 
 
 def test_an_outline_counts_what_a_network_has() -> None:
     sizes = preset("flamingo-nano")
     sizes = replace(sizes, prompt=replace(sizes.prompt, train_words=False, trained_layers=1))
     network = build_network(sizes, seed=0)
-    parts = policy_size(sizes).parts
-    assert parts == count_parameters(network)
+    counts = count_parameters(outline_network(sizes))
+    assert counts == count_parameters(network)
     frozen = sum(parameter.numel() for parameter in network.parameters() if not parameter.requires_grad)
-    assert parts["prompt"].frozen == policy_size(sizes).parameters.frozen == frozen > 0
+    assert counts["prompt"].frozen == counts["total"].frozen == frozen > 0
 
 
 def test_of_t5_words_and_all_but_two_layers_are_frozen() -> None:
     layer = 4 * 768 * 768 + 2 * 768 * 3072 + 2 * 768
     words, position_biases = 32128 * 768, 32 * 12
-    size = policy_size(preset("vima-2m"))
-    assert size.parts["prompt"].frozen == words + position_biases + 10 * layer
-    assert all(count.frozen == 0 for part, count in size.parts.items() if part != "prompt")
+    counts = count_parameters(outline_network(preset("vima-2m")))
+    assert counts["prompt"].frozen == counts["total"].frozen == words + position_biases + 10 * layer
 
 
 def test_every_size_of_every_published_architecture_is_a_preset_that_survives_its_file() -> None:

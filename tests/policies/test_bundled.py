@@ -1,13 +1,11 @@
 """Bundled checkpoints by name. Most tests replace the checkpoint with a small network."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from openvima.cli import quickstart
-from openvima.cli.main import main
 from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.errors import InputFileError, UnknownPolicyError
 from openvima.evaluation import Results
@@ -17,7 +15,6 @@ from openvima.evaluation.sources import weights_hash
 from openvima.policies import load_policy
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint
-from openvima.policies.inference import NetworkPolicy
 from openvima.policies.naming import (
     BUNDLED,
     MODEL_CARD,
@@ -37,7 +34,7 @@ def bundled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder, elsewhere = tmp_path / "package", tmp_path / "elsewhere"
     save_checkpoint(build_network(narrow_small(), seed=5), folder, dtype=torch.float16)
     (folder / MODEL_CARD).write_text("# A card")
-    monkeypatch.setitem(BUNDLED, SMALL, replace(BUNDLED[SMALL], folder=folder))
+    monkeypatch.setitem(BUNDLED, SMALL, folder)
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
     return folder
@@ -45,15 +42,10 @@ def bundled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_it_is_loaded_by_its_name_and_never_computes_in_float16(bundled: Path, demonstrations) -> None:
     expected = load_checkpoint(bundled).state_dict()
-    for load in (load_policy, NetworkPolicy.from_pretrained):
-        policy = load(SMALL)
-        floats = [
-            t for t in [*policy.network.parameters(), *policy.network.buffers()] if t.is_floating_point()
-        ]
-        assert {tensor.dtype for tensor in floats} == {torch.float64}
-        assert all(
-            torch.equal(tensor, expected[name]) for name, tensor in policy.network.state_dict().items()
-        )
+    policy = load_policy(SMALL)
+    floats = [t for t in [*policy.network.parameters(), *policy.network.buffers()] if t.is_floating_point()]
+    assert {tensor.dtype for tensor in floats} == {torch.float64}
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in policy.network.state_dict().items())
     assert load_policy(SMALL, dtype=torch.float32).network.query.dtype == torch.float32
     policy.reset([demonstrations[0].prompt])
     policy.act([demonstrations[0].observation(0)])
@@ -68,19 +60,6 @@ def test_the_message_for_an_unknown_name_lists_the_bundled_checkpoint(bundled: P
     for find in (weights_hash, find_checkpoint):
         with pytest.raises(InputFileError, match="openvima-small"):
             find("something")
-
-
-@pytest.mark.slow
-def test_without_its_weights_the_message_says_where_they_belong(bundled: Path, capsys) -> None:
-    (bundled / "model.safetensors").unlink()
-    for work in (load_policy, weights_hash, find_checkpoint):
-        with pytest.raises(InputFileError, match=f"lacks the weights of 'openvima-small'.*{bundled}"):
-            work(SMALL)
-    assert main(["policies"]) == 0
-    assert SMALL not in capsys.readouterr().out
-    assert main(["quickstart"]) == 2
-    assert "lacks the weights" in capsys.readouterr().err
-    assert not list(Path().iterdir())
 
 
 def test_quickstart_scores_it_beside_the_policy_that_it_trains(

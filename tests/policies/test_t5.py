@@ -196,7 +196,7 @@ def test_weights_of_other_sizes_are_refused_in_one_message_and_change_nothing(
     message = str(caught.value)
     assert "prompt.words.weight is float32 (128, 24) instead of float32 (130, 24)" in message
     assert "prompt.text.blocks.2.key.weight" in message
-    assert " and 2 more" in message
+    assert " and 3 more" in message
     assert all(torch.equal(tensor, before[name]) for name, tensor in network.state_dict().items())
 
 

@@ -96,7 +96,7 @@ def test_a_run_keeps_its_last_checkpoint_and_the_best_and_leaves_global_state_al
         ({"preset": "vima-2m"}, "'vima-2m' encodes prompts with T5.*model.text_encoder"),
         (
             {"preset": "gato-nano", "pretraining.steps": 5},
-            "'gato-nano' with image tokens 'patches' encodes no crops",
+            "'gato-nano' takes whole frames, as 'patches'",
         ),
     ],
 )

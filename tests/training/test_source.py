@@ -1,7 +1,6 @@
 """Demonstrations before a training: opened, checked and split; and false positives in their batches."""
 
 from collections import Counter
-from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -13,11 +12,10 @@ import torch
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.object_cache import open_object_cache
 from openvima.data.subsets import MergeConfig, merge
-from openvima.errors import ConfigError, DatasetError, PromptError
+from openvima.errors import ConfigError, DatasetError
 from openvima.perception.objects import TOP, observe
 from openvima.policies.loading import held_out_data
 from openvima.policies.processor import Processor
-from openvima.policies.tokenizer import WordTokenizer
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training import TrainingConfig
 from openvima.training.augmentation.demonstrations import add_false_positives
@@ -30,7 +28,6 @@ from openvima.training.config import AugmentationConfig, LoaderConfig
 from openvima.training.policy import scene_tasks
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
-    check_words,
     find_definers,
     make_order,
     open_demonstrations,
@@ -179,23 +176,6 @@ def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_pro
     assert [order.batch_size for order in orders] == [2, 2]
     with pytest.raises(ConfigError, match="there are 3 demonstrations to train on and 4 processes"):
         make_order(few, batch_size=64, seed=0, bucket=0, rank=0, num_ranks=4)
-
-
-def test_an_unknown_word_is_found_before_training(data):
-    class Cache:
-        def texts(self):
-            return {"rotate the xylophone"}
-
-    class Pieces(WordTokenizer):
-        def encode(self, text):
-            if "xylophone" in text:
-                raise PromptError(text)
-            return super().encode(text)
-
-    processor = replace(OBJECTS, tokenizer=Pieces())
-    check_words(open_object_cache(Dataset(data)), processor)
-    with pytest.raises(PromptError, match="xylophone"):
-        check_words(Cache(), processor)
 
 
 @pytest.mark.parametrize("layout", ["objects", "views"])

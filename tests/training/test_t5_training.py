@@ -8,7 +8,7 @@ import torch
 
 pytest.importorskip("transformers")
 
-from openvima.errors import ConfigError, InputFileError
+from openvima.errors import ConfigError, InputFileError, PromptError
 from openvima.policies import presets, sizes
 from openvima.policies.checkpoint import load_checkpoint
 from openvima.policies.nn.prompt_encoder import TextEncoderConfig
@@ -61,6 +61,11 @@ def test_training_starts_from_t5_keeps_its_frozen_weights_and_stores_its_tokeniz
     for checkpoint in checkpoints(run):
         assert T5Tokenizer(checkpoint / "tokenizer").encode(text) == expected
     assert_it_acts(run)
+
+
+def test_a_word_that_t5_lacks_is_named_before_the_first_step(t5_settings) -> None:
+    with pytest.raises(PromptError, match="'дом'"):
+        build_learner(TrainingConfig.of(t5_settings), ["put the block", "into the дом"])
 
 
 @pytest.mark.slow

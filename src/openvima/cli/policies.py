@@ -9,8 +9,7 @@ import tyro
 from openvima.cli.terminal import print_files, print_table
 
 if TYPE_CHECKING:
-    from openvima.policies.build import PolicyConfig, PolicySize
-    from openvima.policies.naming import BundledPolicy
+    from openvima.policies.build import Count, PolicyConfig
 
 Precision = Literal["float32", "bfloat16", "float16", "float64"]
 _NOTES = (
@@ -34,15 +33,14 @@ def list_() -> int:
     from openvima.policies.presets import PRESETS, own_policies, preset
 
     require_torch("counting parameters")
-    from openvima.policies.build import policy_size
+    from openvima.policies.build import count_parameters, outline_network
     from openvima.policies.checkpoint import read_info
 
-    _print_table({name: policy_size(preset(name)) for name in PRESETS})
-    for name, policy in BUNDLED.items():
-        if policy.is_installed:
-            parameters = policy_size(read_info(policy.folder).config).parameters
-            print(f"\n{name}, a bundled checkpoint, {_millions(parameters.total)} M parameters")
-            _print_facts(policy)
+    _print_table({name: preset(name) for name in PRESETS})
+    for name, folder in BUNDLED.items():
+        total = count_parameters(outline_network(read_info(folder).config))["total"]
+        print(f"\n{name}, a bundled checkpoint, {_millions(total.total)} M parameters")
+        _print_facts(folder)
     for name, source in own_policies().items():
         print(f"\n{name}, a learner of your own, {source}")
     return 0
@@ -64,17 +62,17 @@ def show(policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POL
     from openvima.policies.naming import BUNDLED
 
     require_torch("counting parameters")
-    from openvima.policies.build import config_to_dict, policy_size
+    from openvima.policies.build import config_to_dict, count_parameters, outline_network
 
     config, bundled = _config(policy), BUNDLED.get(policy)
-    size = policy_size(config)
+    counts = count_parameters(outline_network(config))
     import yaml
 
-    print(f"{policy}: {_summary(size)}")
+    print(f"{policy}: {_summary(config, counts['total'])}")
     if bundled:
         _print_facts(bundled)
     print(f"\n{'part':<10}{'trained':>14}{'frozen':>14}{'total':>14}")
-    for part, count in {**size.parts, "total": size.parameters}.items():
+    for part, count in counts.items():
         print(f"{part:<10}{count.trainable:>14,}{count.frozen:>14,}{count.total:>14,}")
     print(f"\n{yaml.safe_dump(config_to_dict(config), sort_keys=False)}", end="")
     return 0
@@ -114,7 +112,7 @@ def convert(
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
     require_torch("reading a policy")
-    from openvima.policies.build import policy_size
+    from openvima.policies.build import count_parameters
     from openvima.policies.checkpoint import load_network, save_checkpoint
     from openvima.policies.t5 import tokenizer_for
 
@@ -124,7 +122,7 @@ def convert(
     import torch
 
     save_checkpoint(network, out, loaded_tokenizer, dtype=getattr(torch, precision))
-    print(f"{source}: {_summary(policy_size(network.config))}")
+    print(f"{source}: {_summary(network.config, count_parameters(network)['total'])}")
     print(out)
     if network.config.prompt.tokenizer == "t5" and not found:
         hint = (
@@ -186,35 +184,38 @@ def _config(policy: str) -> "PolicyConfig":
     return read_info(found).config if found.is_dir() else load_network(found)[0].config
 
 
-def _summary(size: "PolicySize") -> str:
-    layers = "1 layer" if size.num_layers == 1 else f"{size.num_layers} layers"
-    total = size.parameters
+def _summary(config: "PolicyConfig", total: "Count") -> str:
+    decoder = config.decoder
+    layers = "1 layer" if decoder.num_layers == 1 else f"{decoder.num_layers} layers"
     return (
-        f"{size.architecture}, width {size.width}, {layers}, {size.num_heads} heads; "
+        f"{config.architecture}, width {decoder.width}, {layers}, {decoder.num_heads} heads; "
         f"{_millions(total.total)} M parameters, of which {_millions(total.trainable)} M are trained"
     )
 
 
-def _print_facts(policy: "BundledPolicy") -> None:
-    print(f"  weights:     {policy.weights.stat().st_size / 1e6:.1f} MB")
-    print(f"  trained on:  {policy.trained_on}")
-    print(f"  model card:  {policy.model_card}")
+def _print_facts(bundled: Path) -> None:
+    from openvima.policies.naming import MODEL_CARD, WEIGHTS_FILE
+
+    print(f"  weights:     {(bundled / WEIGHTS_FILE).stat().st_size / 1e6:.1f} MB")
+    print(f"  model card:  {bundled / MODEL_CARD}")
 
 
-def _print_table(sizes: dict[str, "PolicySize"]) -> None:
+def _print_table(configs: dict[str, "PolicyConfig"]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
+    from openvima.policies.build import PARTS, count_parameters, outline_network
+
     table = Table(title="parameters in millions", box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
-    first, *_ = sizes.values()
     for number, name in enumerate(
-        ("preset", "width", "layers", "heads", *first.parts, "total", "trained", "frozen")
+        ("preset", "width", "layers", "heads", *PARTS, "total", "trained", "frozen")
     ):
         table.add_column(name, justify="right" if number else "left", no_wrap=True)
-    for name, size in sizes.items():
-        counts = [count.total for count in (*size.parts.values(), size.parameters)]
-        millions = map(_millions, (*counts, size.parameters.trainable, size.parameters.frozen))
-        table.add_row(name, str(size.width), str(size.num_layers), str(size.num_heads), *millions)
+    for name, config in configs.items():
+        counts, decoder = count_parameters(outline_network(config)), config.decoder
+        totals = [count.total for count in counts.values()]
+        millions = map(_millions, (*totals, counts["total"].trainable, counts["total"].frozen))
+        table.add_row(name, str(decoder.width), str(decoder.num_layers), str(decoder.num_heads), *millions)
     print_table(table)
     print(*_NOTES, sep="\n")
 

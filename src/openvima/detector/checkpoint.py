@@ -37,7 +37,6 @@ from openvima.policies.tensor_files import (
 )
 
 _KIND = "detector"
-_MAX_LISTED = 5  # names per kind of problem in a message
 _COUNTER = "num_batches_tracked"  # of batch normalisation; unused
 
 
@@ -134,7 +133,7 @@ def build_network(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *
 def _check(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, source: Path) -> None:
     expected = {name: own for name, own in network.state_dict().items() if not name.endswith(_COUNTER)}
     given = {name: tensor for name, tensor in tensors.items() if not name.endswith(_COUNTER)}
-    problems = mismatches(given, expected, limit=_MAX_LISTED)
+    problems = mismatches(given, expected)
     if problems:
         raise InputFileError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
 

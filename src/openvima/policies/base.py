@@ -137,10 +137,11 @@ class PromptLimits:
         Raises:
             PromptError: It holds more than allowed; the message names the number.
         """
-        found = {"chars": len(prompt.text), "images": 0, "objects": 0}
-        if found["chars"] <= self.chars:
-            found["images"] = max(len(prompt.images), len(PLACEHOLDER.findall(prompt.text)))
-            found["objects"] = sum(len(image.objects) for image in prompt.images.values())
+        found = {
+            "chars": len(prompt.text),
+            "images": max(len(prompt.images), len(PLACEHOLDER.findall(prompt.text))),
+            "objects": sum(len(image.objects) for image in prompt.images.values()),
+        }
         for name, number in found.items():
             if number > (allowed := getattr(self, name)):
                 what = "characters" if name == "chars" else name

@@ -109,51 +109,13 @@ class Count:
         return self.trainable + self.frozen
 
 
-@dataclass(frozen=True, slots=True)
-class PolicySize:
-    """Size of a policy.
-
-    Args:
-        architecture: vima, gato, flamingo, gpt, midas or pointer.
-        width: Width of the decoder.
-        num_layers: Layers of the decoder: pairs of a cross block and a self block, or self blocks alone.
-        num_heads: Heads of self-attention.
-        parts: Parameters of each of `PARTS`.
-    """
-
-    architecture: str
-    width: int
-    num_layers: int
-    num_heads: int
-    parts: Mapping[str, Count]
-
-    @property
-    def parameters(self) -> Count:
-        """Parameters of all parts."""
-        counts = self.parts.values()
-        return Count(sum(count.trainable for count in counts), sum(count.frozen for count in counts))
-
-
-def policy_size(config: PolicyConfig) -> PolicySize:
-    """Count the parameters of a network without allocating it."""
-    decoder = config.decoder
-    return PolicySize(
-        architecture=config.architecture,
-        width=decoder.width,
-        num_layers=decoder.num_layers,
-        num_heads=decoder.num_heads,
-        parts=count_parameters(outline_network(config)),
-    )
-
-
 def count_parameters(network: PolicyNetwork) -> dict[str, Count]:
-    """Count the parameters of each part."""
-    counts = dict.fromkeys(PARTS, Count())
+    """Count the parameters of each of `PARTS`, and of all as "total"; an outline has the same."""
+    counts = dict.fromkeys((*PARTS, "total"), Count())
     for name, parameter in network.named_parameters():
         part = next(part for part, prefixes in PARTS.items() if name.startswith(prefixes))
-        number, count = parameter.numel(), counts[part]
-        if parameter.requires_grad:
-            counts[part] = Count(count.trainable + number, count.frozen)
-        else:
-            counts[part] = Count(count.trainable, count.frozen + number)
+        trained = parameter.numel() * parameter.requires_grad
+        for key in (part, "total"):
+            old = counts[key]
+            counts[key] = Count(old.trainable + trained, old.frozen + parameter.numel() - trained)
     return counts

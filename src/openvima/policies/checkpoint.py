@@ -35,7 +35,6 @@ from openvima.policies.tensor_files import (
 from openvima.policies.tokenizer import Tokenizer, WordTokenizer
 
 _KIND = "network"
-_MAX_LISTED = 5  # names that a message lists per kind of problem
 _PRECISIONS = {
     "float32": torch.float32,
     "bfloat16": torch.bfloat16,
@@ -196,7 +195,7 @@ def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, s
 
 
 def _check(network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:
-    if problems := mismatches(tensors, network.state_dict(), limit=_MAX_LISTED):
+    if problems := mismatches(tensors, network.state_dict()):
         raise InputFileError(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
             "Use the config that was written with the weights."

@@ -14,7 +14,7 @@ from openvima.errors import PolicyError
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import ImageStack
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash, usable_device
-from openvima.policies.checkpoint import load_network, save_checkpoint
+from openvima.policies.checkpoint import save_checkpoint
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import PROMPT_LIMITS, Processor
@@ -277,30 +277,6 @@ class NetworkPolicy(Policy):
             for index, margin in zip(self._episodes.indices, margins, strict=True):
                 near[index] = margin < NEAR_TIE
         return near
-
-    @staticmethod
-    def from_pretrained(
-        path_or_hub_id: str | Path,
-        *,
-        tokenizer: Tokenizer | None = None,
-        **options: Any,
-    ) -> "NetworkPolicy":
-        """Load a policy from a folder, a file or the Hugging Face Hub.
-
-        Args:
-            path_or_hub_id: A checkpoint folder; a run folder, of which the best checkpoint is loaded; a
-                published `.ckpt` file; the name of a bundled checkpoint; or a name on the Hub such as
-                "owner/policy@v1".
-            tokenizer: By default the one stored with the policy.
-            **options: Options of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
-
-        Raises:
-            InputFileError: There is no such folder, or it holds no readable checkpoint.
-            PolicyError: The policy needs the T5 tokenizer, which is neither stored nor given.
-        """
-        network, stored = load_network(path_or_hub_id)
-        tokenizer = tokenizer or tokenizer_for(network.config.prompt, stored)
-        return NetworkPolicy(network, tokenizer=tokenizer, **options)
 
     def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
         """Write a checkpoint folder; see `openvima.policies.checkpoint.save_checkpoint`.

@@ -238,9 +238,13 @@ def load_policy(
         _check_extractor(source, options)
         return policy_of_run(source, code, device=options.get("device", "cpu"))
     require_torch(f"the policy in {source}")
+    from openvima.policies.checkpoint import load_network
     from openvima.policies.inference import NetworkPolicy
+    from openvima.policies.t5 import tokenizer_for
 
-    return NetworkPolicy.from_pretrained(source, **options)
+    network, stored = load_network(source)
+    tokenizer = options.pop("tokenizer", None) or tokenizer_for(network.config.prompt, stored)
+    return NetworkPolicy(network, tokenizer=tokenizer, **options)
 
 
 def _check_extractor(source: str, options: Mapping[str, Any]) -> None:

@@ -38,41 +38,8 @@ Kind = Literal[
     "oracle", "random", "untrained", "remote", "lerobot", "vlm", "code", "bundled", "path", "hub", "unknown"
 ]
 
-_TRAINED = Path(__file__).parent / "trained"
-
-
-@dataclass(frozen=True, slots=True)
-class BundledPolicy:
-    """A bundled checkpoint.
-
-    Args:
-        folder: The checkpoint folder, with the model card beside the weights.
-        trained_on: Training data, in one line.
-    """
-
-    folder: Path
-    trained_on: str
-
-    @property
-    def model_card(self) -> Path:
-        """Model card: data, training, scores, weak tasks and limitations."""
-        return self.folder / MODEL_CARD
-
-    @property
-    def weights(self) -> Path:
-        """Weights file; an installation may lack it."""
-        return self.folder / WEIGHTS_FILE
-
-    @property
-    def is_installed(self) -> bool:
-        """Whether this installation has weights and config."""
-        return self.weights.is_file() and (self.folder / CONFIG_FILE).is_file()
-
-
-BUNDLED: dict[str, BundledPolicy] = {
-    SMALL: BundledPolicy(_TRAINED / SMALL, "demonstrations of the 13 training tasks, training partition"),
-    VIMA: BundledPolicy(_TRAINED / VIMA, "demonstrations of the 13 training tasks, 40% of random appearance"),
-}
+# Folders of the bundled checkpoints, with the model card beside the weights.
+BUNDLED: dict[str, Path] = {name: Path(__file__).parent / "trained" / name for name in (SMALL, VIMA)}
 
 
 def bundled_folder(name: str) -> Path:
@@ -83,7 +50,6 @@ def bundled_folder(name: str) -> Path:
 
     Raises:
         PolicyError: A local folder has that name and holds a checkpoint, too.
-        InputFileError: This installation lacks its weights.
     """
     # A folder without a checkpoint may have the name, as after
     # `evaluate --policy openvima-small --out openvima-small`.
@@ -92,13 +58,7 @@ def bundled_folder(name: str) -> Path:
             f"{name!r} is a bundled checkpoint, and also a local folder with a checkpoint; write ./{name} "
             "for the folder, or run in another directory for the bundled one."
         )
-    policy = BUNDLED[name]
-    if not policy.is_installed:
-        raise InputFileError(
-            f"this installation lacks the weights of {name!r}, which belong into {policy.folder}; "
-            "reinstall openvima, or give a run folder."
-        )
-    return policy.folder
+    return BUNDLED[name]
 
 
 _HUB_FILES = (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*")
@@ -222,8 +182,7 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
             "owner/policy@v1", which is downloaded.
 
     Raises:
-        InputFileError: There is no such path, it is the name of a preset, or the installation lacks the
-            weights.
+        InputFileError: There is no such path, or it is the name of a preset.
         ServerError: The download failed.
         PolicyError: A local folder has the name of a bundled checkpoint and holds a checkpoint, too.
         MissingExtraError: The Hub's client is needed and not installed.

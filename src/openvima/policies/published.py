@@ -17,16 +17,11 @@ import torch
 from openvima.errors import ConfigError, InputFileError
 from openvima.policies.architectures import flamingo, gato, gpt, vima
 from openvima.policies.build import PolicyConfig, outline_network
-from openvima.policies.config_fields import MAX_WIDTH
 from openvima.policies.nn.actions import ACTION_PARTS
-from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
-from openvima.policies.sizes import SIZES, TUNED_T5_LAYERS, Size
+from openvima.policies.sizes import TUNED_T5_LAYERS, Size
 from openvima.policies.tensor_files import check_finite, listed, mismatches, read_archive
-
-_MAX_LISTED = 20  # names that a message lists per kind of problem
-_DEFAULTS = SIZES["2m"]  # sizes to use where a weight is missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,13 +178,11 @@ class PublishedAdapter:
     Args:
         rules: Names of all weights.
         cfg_names: What `cfg` calls the width, the number of layers and the numbers of heads.
-        decoder: Prefix of the decoder's weights.
         build: Its config in a size.
     """
 
     rules: tuple[Rule, ...]
     cfg_names: tuple[str, ...]
-    decoder: str
     build: Callable[[Size], Any]
 
 
@@ -212,19 +205,16 @@ def _pattern(template: str) -> re.Pattern[str]:
 VIMA = PublishedAdapter(
     (*_SHARED_RULES, *_vit_rules("images.crop_encoder"), *_OBJECT_RULES, *_CROSS_ATTENTION_RULES),
     cfg_names=("embed_dim", "xf_n_layers", "sattn_n_heads", "xattn_n_heads"),
-    decoder="xattn_gpt",
     build=vima,
 )
 GATO = PublishedAdapter(
     (*_SHARED_RULES, *_vit_rules("images"), *_PREFIX_RULES),
     cfg_names=("embed_dim", "n_layer", "n_head"),
-    decoder="transformer.lm",
     build=gato,
 )
 FLAMINGO = PublishedAdapter(
     (*_SHARED_RULES, *_vit_rules("images"), *_RESAMPLER_RULES, *_CROSS_ATTENTION_RULES),
     cfg_names=("embed_dim", "dt_n_layers", "dt_n_heads", "xattn_n_heads"),
-    decoder="xattn_gpt",
     build=flamingo,
 )
 GPT = replace(GATO, build=gpt)  # with a class token
@@ -309,7 +299,7 @@ def load_published(file: str | Path) -> PolicyNetwork:
     Raises:
         InputFileError: The file is missing, damaged or of another format, it would execute code, or its
             weights do not match its `cfg`. One message lists missing and unexpected names and wrong shapes,
-            up to 20 of each.
+            up to 5 of each.
     """
     file = Path(file)
     if not file.exists() or file.is_dir():
@@ -317,7 +307,7 @@ def load_published(file: str | Path) -> PolicyNetwork:
     weights, cfg = _contents(file, read_archive(file))
     try:
         network, tensors = outline_network(config_from_published(weights, cfg)), from_published(weights)
-        if problems := mismatches(tensors, network.state_dict(), limit=_MAX_LISTED):
+        if problems := mismatches(tensors, network.state_dict()):
             raise InputFileError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
         network.load_state_dict(tensors, assign=True)
     except (InputFileError, ConfigError) as error:
@@ -330,45 +320,22 @@ def load_published(file: str | Path) -> PolicyNetwork:
 
 
 def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapping[str, object]]:
-
-    if not isinstance(values, Mapping) or any(
-        not isinstance(values.get(name), Mapping) for name in ("state_dict", "cfg")
+    if not isinstance(values, Mapping) or not all(
+        isinstance(values.get(name), Mapping) for name in ("state_dict", "cfg")
     ):
-        keys = [short(key).strip("'") for key in values] if isinstance(values, Mapping) else []
-        found = listed("the keys", keys, limit=_MAX_LISTED) or [f"a {type(values).__name__}"]
         raise InputFileError(
-            f"{file} holds {found[0]}; a published checkpoint holds the mappings state_dict and cfg. "
+            f"{file} holds {short(values)}; a published checkpoint holds the mappings state_dict and cfg. "
             "The number of heads cannot be inferred from weights alone."
         )
     weights = values["state_dict"]
     others = [
-        short(name).strip("'")
+        short(name)
         for name, value in weights.items()
         if not isinstance(value, torch.Tensor) or not isinstance(name, str)
     ]
     if others:
-        raise InputFileError(
-            f"{file}: state_dict holds more than weights: {', '.join(others[:_MAX_LISTED])}."
-        )
+        raise InputFileError(f"{file}: {listed('state_dict holds more than weights', others)[0]}.")
     return weights, values["cfg"]
-
-
-@dataclass(frozen=True, slots=True)
-class _Shapes:
-    """Shapes of weights by published name; missing ones are reported on loading."""
-
-    shapes: Mapping[str, tuple[int, ...]]
-
-    def length(self, name: str, axis: int, *, default: int) -> int:
-        """Length of one axis of a weight, or the default if it is missing."""
-        shape = self.shapes.get(name, ())
-        return shape[axis] if axis < len(shape) else default
-
-    def count(self, stem: str, *, default: int) -> int:
-        """Number of layers with this name stem, or the default if there are none."""
-        pattern = re.compile(re.escape(stem) + r"\.(\d+)\.")
-        found = {match[1] for name in self.shapes if (match := pattern.match(name))}
-        return len(found) or default
 
 
 def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str, object]) -> PolicyConfig:
@@ -382,87 +349,62 @@ def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str,
         The config; as in the paper, words are frozen and the last two layers of T5 are trained.
 
     Raises:
-        InputFileError: The weights belong to none of the four policies, or `cfg` lacks an entry or
-            contradicts them.
+        InputFileError: The weights belong to none of the four policies or lack some that tell sizes, or `cfg`
+            lacks an entry.
+        ConfigError: The sizes contradict each other.
     """
     adapter = adapter_of(weights)
-    shapes = _Shapes({name: tuple(tensor.shape) for name, tensor in without_prefix(weights).items()})
-    decoder = _decoder(adapter, shapes, cfg)
+    given = _read_cfg(cfg, adapter.cfg_names)
+    shapes = {name: tensor.shape for name, tensor in without_prefix(weights).items()}
     vit = "obj_encoder.cropped_img_encoder.vit"
-    action = "action_encoder._embed_dict.pose0_position._layer.0.weight"
-    classifier = "action_decoder._decoders.pose0_position.mlps.0.0.weight"
     try:
         size = Size(
-            width=decoder.width,
-            num_layers=decoder.num_layers,
-            num_heads=decoder.num_heads,
+            *given[:3],
             prompt=_prompt(shapes),
-            image_width=shapes.length(f"{vit}.conv1.weight", 0, default=_DEFAULTS.image_width),
-            image_layers=shapes.count(f"{vit}.blocks", default=_DEFAULTS.image_layers),
-            hidden_width=shapes.length(classifier, 0, default=_DEFAULTS.hidden_width),
-            action_width=shapes.length(action, 0, default=_DEFAULTS.action_width),
+            image_width=shapes[f"{vit}.conv1.weight"][0],
+            image_layers=_num_layers(shapes, f"{vit}.blocks"),
+            hidden_width=shapes["action_decoder._decoders.pose0_position.mlps.0.0.weight"][0],
+            action_width=shapes["action_encoder._embed_dict.pose0_position._layer.0.weight"][0],
         )
-        return replace(adapter.build(size), decoder=decoder)
-    except ConfigError as error:
-        raise InputFileError(f"the weights give no valid config: {error}") from error
-
-
-def _decoder(
-    adapter: PublishedAdapter, shapes: _Shapes, cfg: Mapping[str, object]
-) -> DecoderConfig | PrefixDecoderConfig:
-    given = _read_cfg(cfg, adapter.cfg_names)
-    width, num_layers, *heads = given.values()
-    name = adapter.decoder
-    found = (
-        shapes.length(f"{name}.positions_embed.weight", 1, default=width),
-        shapes.count(f"{name}.h", default=num_layers),
-    )
-    wrong = [
-        f"{entry} {given[entry]}, but the weights have {value}"
-        for entry, value in zip(given, found, strict=False)
-        if given[entry] != value
-    ]
-    if wrong:
-        raise InputFileError(f"cfg says {'; '.join(wrong)}. They do not match.")
-    try:
-        kind = PrefixDecoderConfig if name == "transformer.lm" else DecoderConfig
-        return kind(width, num_layers, *heads)
-    except ConfigError as error:
-        raise InputFileError(f"cfg is {given}: {error}") from error
-
-
-def _read_cfg(cfg: Mapping[str, object], names: tuple[str, ...]) -> dict[str, int]:
-    given = {name: cfg.get(name) for name in names}
-    numbers = {name: value for name, value in given.items() if type(value) is int and 0 < value <= MAX_WIDTH}
-    if numbers.keys() != given.keys():
-        wrong = ", ".join(f"{name} {short(value)}" for name, value in given.items() if name not in numbers)
+    except LookupError as error:
         raise InputFileError(
-            f"cfg has {wrong}; it must hold {', '.join(names)} as whole numbers from 1 to {MAX_WIDTH}."
-        )
+            f"the weights lack {error}, which tells sizes, or it has too few axes."
+        ) from error
+    config = adapter.build(size)
+    return replace(config, decoder=type(config.decoder)(*given))
+
+
+def _read_cfg(cfg: Mapping[str, object], names: tuple[str, ...]) -> list[int]:
+    given = {name: cfg.get(name) for name in names}
+    numbers = [value for value in given.values() if type(value) is int]
+    if len(numbers) < len(names):
+        wrong = ", ".join(f"{name} {short(value)}" for name, value in given.items() if type(value) is not int)
+        raise InputFileError(f"cfg has {wrong}; it must hold {', '.join(names)} as whole numbers.")
     return numbers
 
 
-def _prompt(shapes: _Shapes) -> PromptEncoderConfig:
-    defaults, words = _DEFAULTS.prompt, "prompt_embedding._embed_layer.weight"
+def _num_layers(shapes: Iterable[str], stem: str) -> int:
+    """Return the number of layers with this name stem."""
+    pattern = re.compile(re.escape(stem) + r"\.(\d+)\.")
+    return len({match[1] for name in shapes if (match := pattern.match(name))})
+
+
+def _prompt(shapes: Mapping[str, tuple[int, ...]]) -> PromptEncoderConfig:
     attention = f"{T5}.block.0.layer.0.SelfAttention"
-    num_heads = shapes.length(
-        f"{attention}.relative_attention_bias.weight", 1, default=defaults.text.num_heads
-    )
-    inner = defaults.text.num_heads * defaults.text.head_width
-    text = TextEncoderConfig(
-        width=shapes.length(words, 1, default=defaults.text.width),
-        num_layers=shapes.count(f"{T5}.block", default=defaults.text.num_layers),
-        num_heads=num_heads,
-        head_width=shapes.length(f"{attention}.q.weight", 0, default=inner) // max(num_heads, 1),
-        hidden_width=shapes.length(
-            f"{T5}.block.0.layer.1.DenseReluDense.wi.weight", 0, default=defaults.text.hidden_width
-        ),
-    )
+    vocabulary_size, width = shapes["prompt_embedding._embed_layer.weight"]
+    num_heads = shapes[f"{attention}.relative_attention_bias.weight"][1]
+    num_layers = _num_layers(shapes, f"{T5}.block")
     return PromptEncoderConfig(
-        text,
-        image_width=shapes.length("prompt_obj_post_layer.0.weight", 0, default=defaults.image_width),
-        vocabulary_size=shapes.length(words, 0, default=defaults.vocabulary_size),
+        TextEncoderConfig(
+            width,
+            num_layers,
+            num_heads,
+            head_width=shapes[f"{attention}.q.weight"][0] // num_heads,
+            hidden_width=shapes[f"{T5}.block.0.layer.1.DenseReluDense.wi.weight"][0],
+        ),
+        image_width=shapes["prompt_obj_post_layer.0.weight"][0],
+        vocabulary_size=vocabulary_size,
         tokenizer="t5",
         train_words=False,
-        trained_layers=min(TUNED_T5_LAYERS, text.num_layers),
+        trained_layers=min(TUNED_T5_LAYERS, num_layers),
     )

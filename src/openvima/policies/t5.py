@@ -18,7 +18,7 @@ from openvima.errors import (
 )
 from openvima.hub import HubName, fetch, hub_name
 from openvima.imports import import_extra
-from openvima.input_files import as_path, open_regular
+from openvima.input_files import as_path, read_text
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published import T5, T5_RULES, to_ours
@@ -38,7 +38,6 @@ _TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_m
 _WEIGHTS_FILE = "model.safetensors"
 _MAX_TOKENIZER_BYTES = 16 * 2**20  # of each file; those of t5-base have up to 1.4 MB
 _MAX_WORDS = 2**16  # words whose pieces are kept
-_MAX_LISTED = 6  # differences that a message lists
 
 
 class T5Tokenizer:
@@ -117,25 +116,22 @@ def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None)
         InputFileError: The source has no such tokenizer.
         MissingExtraError: A required package is not installed.
     """
+    tokenizer: Tokenizer
     if config.tokenizer == "words":
-        words = WordTokenizer(None if source is None else Vocabulary.read(Path(source)))
-        if words.vocabulary.num_ids > config.vocabulary_size:
-            raise PolicyError(
-                f"the vocabulary {'of the benchmark' if source is None else f'in {source}'} has "
-                f"{words.vocabulary.num_ids} ids, the policy {config.vocabulary_size}; use the vocabulary of "
-                "the policy."
-            )
-        return words
-    if source is None:
+        tokenizer = WordTokenizer(None if source is None else Vocabulary.read(Path(source)))
+        num_ids = tokenizer.vocabulary.num_ids
+    elif source is not None:
+        tokenizer = T5Tokenizer(source)
+        num_ids = tokenizer.vocabulary_size
+    else:
         raise PolicyError(
             "this policy needs the tokenizer of T5, which is not stored with it. Give it as "
             "tokenizer=T5Tokenizer(FOLDER), or store it: `openvima policies convert IN OUT --tokenizer "
             "FOLDER`; 't5-base' instead of a folder fetches it from the Hugging Face Hub."
         )
-    tokenizer = T5Tokenizer(source)
-    if tokenizer.vocabulary_size > config.vocabulary_size:
+    if num_ids > config.vocabulary_size:
         raise PolicyError(
-            f"the tokenizer of {source} has {tokenizer.vocabulary_size} ids, the policy "
+            f"the vocabulary of {source or 'the benchmark'} has {num_ids} ids, the policy "
             f"{config.vocabulary_size}; use the tokenizer of the policy."
         )
     return tokenizer
@@ -165,7 +161,7 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
             tensors[ours[0] if ours else name] = tensor
     kept = ("prompt.words.", "prompt.text.")
     expected = {name: own for name, own in network.state_dict().items() if name.startswith(kept)}
-    if problems := mismatches(tensors, expected, limit=_MAX_LISTED):
+    if problems := mismatches(tensors, expected):
         raise InputFileError(
             f"{file} does not fit the text encoder: {'; '.join(problems)}. "
             f"It needs a T5 1.0: {t5_name(network.config.prompt.text)}."
@@ -180,7 +176,8 @@ def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
         # Without this check transformers would return a vocabulary of special tokens only.
         raise InputFileError(f"{path_or_hub_id} holds no {_TOKENIZER_FILES[0]}.")
     for name in _TOKENIZER_FILES:
-        _check_size(folder / name)
+        if (folder / name).exists():
+            read_text(folder / name, max_bytes=_MAX_TOKENIZER_BYTES)  # no pipe, and not much larger than T5's
     transformers = import_extra("transformers", "T5 needs transformers: pip install 'openvima[t5]'")
     try:
         tokenizer = transformers.T5TokenizerFast.from_pretrained(str(folder), local_files_only=True)
@@ -188,16 +185,6 @@ def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
         raise InputFileError(f"{path_or_hub_id} holds no tokenizer that can be read: {error}") from error
     _check_is_t5(tokenizer, str(path_or_hub_id))
     return tokenizer
-
-
-def _check_size(file: Path) -> None:
-    """Refuse what is no regular file, or much larger than the files of T5; it may be missing."""
-    if not file.exists():
-        return
-    with open_regular(file) as stream:
-        num_bytes = stream.seek(0, 2)
-    if num_bytes > _MAX_TOKENIZER_BYTES:
-        raise InputFileError(f"{file} has {num_bytes} bytes; at most {_MAX_TOKENIZER_BYTES} are read.")
 
 
 def _check_is_t5(tokenizer: "PreTrainedTokenizerFast", source: str) -> None:

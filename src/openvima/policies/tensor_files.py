@@ -1,10 +1,7 @@
 """Files of tensors. Reading those of others executes nothing, and takes no more memory than their size."""
 
 import hashlib
-import os
 import pickle
-import re
-import stat
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -12,15 +9,13 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
-from openvima.atomic_io import FREE_SPACE
-from openvima.errors import InputFileError, StorageError, echo
+from openvima.errors import InputFileError, echo
 from openvima.input_files import one_line, open_regular, read_yaml
 from openvima.policies.naming import CONFIG_FILE
 
 _MAX_LISTED = 5  # names that a message lists
-_SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")  # in messages of safetensors
 
 
 def read_safetensors(file: Path) -> dict[str, torch.Tensor]:
@@ -76,20 +71,12 @@ def read_archive(file: Path, *, classes: Collection[type] = ()) -> Any:
 
 
 def write_safetensors(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
-    """Write a safetensors file, readable for whoever the umask allows; safetensors makes it private.
+    """Write a safetensors file, readable for whoever the umask allows; `save_file` would make it private.
 
     Raises:
         OSError: It cannot be written, for example because the disk is full.
     """
-    try:
-        with file.open("wb") as stream:
-            mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
-        save_file(dict(tensors), file)
-        file.chmod(mode)
-    except SafetensorError as error:
-        if found := _SYSTEM_ERROR.search(str(error)):
-            raise OSError(int(found[1]), os.strerror(int(found[1])), str(file)) from error
-        raise StorageError(f"{file} cannot be written ({one_line(error)}). {FREE_SPACE}") from error
+    file.write_bytes(save(dict(tensors)))
 
 
 def file_digest(file: Path) -> str:
@@ -113,7 +100,7 @@ def check_finite(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
     ]
     if found:
         raise InputFileError(
-            f"{file}: {listed('weights that are not finite', found, limit=_MAX_LISTED)[0]}. The training "
+            f"{file}: {listed('weights that are not finite', found)[0]}. The training "
             "diverged, or the file is damaged; take another checkpoint."
         )
 
@@ -122,10 +109,8 @@ def _comparable(tensor: torch.Tensor) -> torch.Tensor:
     return tensor.float() if tensor.element_size() == 1 else tensor  # 8-bit floats cannot be compared
 
 
-def mismatches(
-    tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor], *, limit: int
-) -> list[str]:
-    """Describe how names, shapes and kinds of tensors differ from a network's, up to `limit` of each."""
+def mismatches(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
+    """Describe how names, shapes and kinds of tensors differ from a network's, up to five of each."""
     wrong = [
         f"{name} is {described(tensors[name].dtype, tensors[name].shape)} instead of "
         f"{described(wanted.dtype, wanted.shape)}"
@@ -137,9 +122,9 @@ def mismatches(
         )
     ]
     return [
-        *listed("missing", [name for name in expected if name not in tensors], limit=limit),
-        *listed("unexpected", [name for name in tensors if name not in expected], limit=limit),
-        *listed("wrong", wrong, limit=limit),
+        *listed("missing", [name for name in expected if name not in tensors]),
+        *listed("unexpected", [name for name in tensors if name not in expected]),
+        *listed("wrong", wrong),
     ]
 
 
@@ -178,12 +163,12 @@ def read_description(folder: Path, kind: str) -> dict[str, Any]:
     return values
 
 
-def listed(what: str, names: Sequence[str], *, limit: int) -> list[str]:
+def listed(what: str, names: Sequence[str]) -> list[str]:
     """Return ["what: first, second and 3 more"], or an empty list without names."""
     if not names:
         return []
-    more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return [f"{what}: {', '.join(map(echo, names[:limit]))}{more}"]
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return [f"{what}: {', '.join(map(echo, names[:_MAX_LISTED]))}{more}"]
 
 
 def described(dtype: torch.dtype, shape: Sequence[int] | None = None) -> str:

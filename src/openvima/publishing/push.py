@@ -167,16 +167,16 @@ def _of_weights(path: Path, sha256: str) -> Results:
 
 
 def _network(folder: Path) -> str:
-    from openvima.policies.build import policy_size
+    from openvima.policies.build import count_parameters, outline_network
     from openvima.policies.checkpoint import read_info
     from openvima.policies.tensor_files import described
 
     info = read_info(folder)
-    size = policy_size(info.config)
+    count, decoder = count_parameters(outline_network(info.config))["total"], info.config.decoder
     values = {
-        "architecture": size.architecture,
-        "parameters": f"{size.parameters.total:,}, of which {size.parameters.trainable:,} were trained",
-        "decoder": f"{size.num_layers} layers, width {size.width}, {size.num_heads} heads",
+        "architecture": info.config.architecture,
+        "parameters": f"{count.total:,}, of which {count.trainable:,} were trained",
+        "decoder": f"{decoder.num_layers} layers, width {decoder.width}, {decoder.num_heads} heads",
         "precision of the weights": described(info.dtype),
         f"SHA-256 of {WEIGHTS_FILE}": info.digest,
     }

@@ -130,7 +130,7 @@ class BatchMaker:
         if self.alternatives:
             drawn, ends = rng.random(), np.cumsum([prob for _, prob in self.alternatives])
             if drawn < ends[-1]:
-                other, _ = self.alternatives[int(np.searchsorted(ends, drawn, side="right"))]
+                other, _ = self.alternatives[np.searchsorted(ends, drawn, side="right")]
                 source = other if other.has(row) else source
         example, prob = source.example(row), self.distractor_prob
         if prob and allows_distractors(example.episode.task) and rng.random() < prob:

@@ -92,19 +92,15 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
             f"preset {config.preset!r} has its own vocabulary and no T5; leave t5 out, or set "
             "model.text_encoder to a T5."
         )
-    for name in _FOR_OBJECTS:
-        if getattr(augmentation, name) and sizes.inputs.tokens == "frames":
+    for_objects = {f"augmentation.{name}": getattr(augmentation, name) for name in _FOR_OBJECTS}
+    for name, value in {**for_objects, "pretraining.steps": config.pretraining.steps}.items():
+        if value and sizes.inputs.tokens == "frames":
             raise ConfigError(
-                f"augmentation.{name} is {getattr(augmentation, name)}, but preset {config.preset!r} takes "
-                f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
+                f"{name} is {value}, but preset {config.preset!r} takes whole frames, as "
+                f"{image_tokens(sizes)!r}; leave it out, or take a preset that takes objects."
             )
-    has_appearance = appearance_width(sizes) > 0
-    if config.pretraining.steps and sizes.inputs.tokens == "frames":
-        raise ConfigError(
-            f"pretraining.steps is {config.pretraining.steps}, but preset {config.preset!r} with image "
-            f"tokens {image_tokens(sizes)!r} encodes no crops; leave it out, or set it to 0."
-        )
     if config.pretraining.steps is None:
+        has_appearance = appearance_width(sizes) > 0
         steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0
         config = replace(config, pretraining=replace(config.pretraining, steps=steps))
     if (
@@ -161,7 +157,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
     Raises:
         InputFileError: T5 or the initial weights are not where the settings say.
         ConfigError: The initial weights are those of a network of other sizes, or lack a tokenizer.
-        PromptError: The texts have too many different words.
+        PromptError: The texts have too many different words, or one that T5 lacks.
         MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
     """
     if ":" in config.preset:
@@ -179,6 +175,8 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         sizes = replace(sizes, prompt=initial.config.prompt)
     if sizes.prompt.tokenizer == "t5":
         tokenizer = _t5_tokenizer(config, sizes, stored)
+        for text in texts:  # a word that T5 lacks is named before the first step
+            tokenizer.encode(text)
     else:
         known = Vocabulary() if stored is None else Vocabulary.read(stored)
         tokenizer = WordTokenizer(known.extended(texts))

@@ -1,7 +1,7 @@
 """Settings of a training run, as nested frozen dataclasses that are validated together."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -14,8 +14,8 @@ from openvima.training.validation import (
     Count,
     Probability,
     Steps,
-    from_settings,
     path_settings,
+    setting_types,
 )
 
 PRETRAINING_STEPS = 400  # of presets with an appearance embedding
@@ -366,8 +366,20 @@ class RunConfig:
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Self:
-        """Make a configuration from settings by dotted name, such as "optimizer.learning_rate"."""
-        return from_settings(cls, settings)
+        """Make a configuration from settings by dotted name, such as "optimizer.learning_rate".
+
+        Raises:
+            ConfigError: A name is no setting, or a value is not allowed.
+        """
+        known = setting_types(cls)
+        if problems := [unknown_name("setting", name, known) for name in settings if name not in known]:
+            raise ConfigError(" ".join(problems))
+        values: dict[str, dict[str, Any]] = {"": {}}
+        for setting, value in settings.items():
+            section, _, name = setting.rpartition(".")
+            values.setdefault(section, {})[name] = value
+        defaults: dict[str, Any] = {field.name: field.default for field in fields(cls)}
+        return cls(**values.pop(""), **{name: replace(defaults[name], **own) for name, own in values.items()})
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that identify the run, nested, as plain values."""

@@ -68,21 +68,21 @@ def _raise_terminated(number: int, frame: object) -> None:
 
 
 @contextmanager
-def end_on_sigterm() -> Iterator[None]:
-    """Let SIGTERM raise `Terminated` within the block, so that workers and files end as with Ctrl-C.
+def exchange_sigterm(old: object, new: Callable[[int, object], None]) -> Iterator[None]:
+    """Handle SIGTERM otherwise within the block.
 
-    In another thread than the main one, and where the caller's program handles the signal itself, it acts as
-    outside of the block.
+    In another thread than the main one, and where another handler than the old one is set, as by the caller's
+    program, it acts as outside of the block.
     """
     in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    if not in_main or signal.getsignal(signal.SIGTERM) != old:
         yield
         return
-    signal.signal(signal.SIGTERM, _raise_terminated)
+    before = signal.signal(signal.SIGTERM, new)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -96,28 +96,11 @@ def open_run(config: RunConfig) -> Iterator[Parallel]:
     with (
         torch_threads(config.runtime.threads),
         join_processes(config.runtime.device) as parallel,
-        end_on_sigterm(),  # not while processes join, a wait that no handler interrupts
+        # As with Ctrl-C workers and files end. Not while processes join, a wait that no handler interrupts.
+        exchange_sigterm(signal.SIG_DFL, _raise_terminated),
         folder_lock(config.out) if parallel.is_first else nullcontext(),
     ):
         yield parallel
-
-
-@contextmanager
-def note_sigterm() -> Iterator[Callable[[], bool]]:
-    """Let SIGTERM end nothing within a block inside of `end_on_sigterm`.
-
-    Yields:
-        A function that tells whether the signal came. Where `end_on_sigterm` has no effect, it comes never.
-    """
-    came: list[int] = []
-    if signal.getsignal(signal.SIGTERM) is not _raise_terminated:
-        yield lambda: False
-        return
-    signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
-    try:
-        yield lambda: bool(came)
-    finally:
-        signal.signal(signal.SIGTERM, _raise_terminated)
 
 
 Metrics = dict[str, float]
@@ -271,16 +254,14 @@ class Trainer:
         if self.progress.step:
             load_named_state(self.learner, optimizer, self.run.optimizer_state())
         self._last = (self.progress.step, time.monotonic())
-        with note_sigterm() as is_terminated:
-            self._take_steps(stage, optimizer, num_steps, is_terminated)
+        came: list[int] = []
+        with exchange_sigterm(_raise_terminated, lambda number, frame: came.append(number)):
+            self._take_steps(stage, optimizer, num_steps, came)
 
     def _take_steps(
-        self,
-        stage: Stage,
-        optimizer: torch.optim.Optimizer,
-        num_steps: int,
-        is_terminated: Callable[[], bool],
+        self, stage: Stage, optimizer: torch.optim.Optimizer, num_steps: int, sigterms: Sequence[int]
     ) -> None:
+        """Take the remaining steps of a stage; after a SIGTERM write a checkpoint and stop."""
         window: list[Metrics] = []
         for step in range(self.progress.step, num_steps):
             window.append(self._step(stage, optimizer, step, num_steps))
@@ -289,7 +270,7 @@ class Trainer:
             logs = saves or (step + 1) % LOG_EVERY == 0
             # Several processes stop after the same step, and so ask each other, when they log anyway.
             may_end = logs or self.parallel.num_ranks == 1
-            ends = may_end and self.parallel.mean({"ends": float(is_terminated())})["ends"] > 0
+            ends = may_end and self.parallel.mean({"ends": float(bool(sigterms))})["ends"] > 0
             if logs or ends:
                 self._log(stage, self.parallel.mean(_mean(window)))
                 window = []

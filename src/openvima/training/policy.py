@@ -1,6 +1,7 @@
 """Training a policy: contrastive pretraining, then behaviour cloning."""
 
 import math
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,6 @@ from openvima.errors import ConfigError
 from openvima.multiprocess import Report
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
-from openvima.training.augmentation.prompts import MOTION_TEXT
 from openvima.training.batches import ExampleSource
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolve, training_texts
@@ -41,7 +41,6 @@ from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
     alternative_source,
     check_scenes,
-    check_words,
     open_demonstrations,
     read_actions,
     repeat_tasks,
@@ -137,20 +136,16 @@ def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> di
     return {**({"boxes": boxes.name} if boxes else {}), **({"held_out": sorted(seen)} if seen else {})}
 
 
+@dataclass(eq=False)
 class _Stages:
     """Builds the stages of a run."""
 
-    def __init__(
-        self,
-        config: TrainingConfig,
-        dataset: Dataset,
-        boxes: Boxes | None,
-        learner: Learner,
-        parallel: Parallel,
-        trainer: Trainer,
-    ) -> None:
-        self.config, self.dataset, self.boxes = config, dataset, boxes
-        self.learner, self.parallel, self.trainer = learner, parallel, trainer
+    config: TrainingConfig
+    dataset: Dataset
+    boxes: Boxes | None
+    learner: Learner
+    parallel: Parallel
+    trainer: Trainer
 
     def planned(self) -> list[PlannedStage]:
         """Return the stages in order."""
@@ -184,9 +179,6 @@ class _Stages:
         self.trainer.report(f"reading {len(self.dataset)} demonstrations")
         caches, config, learner = [cache for cache, _ in self._caches], self.config, self.learner
         if isinstance(learner, PolicyLearner):
-            check_words(caches[0], learner.processor, describes=config.augmentation.describes_objects)
-            if config.augmentation.inverse_dynamics_prob:
-                learner.processor.tokenizer.encode(MOTION_TEXT.format(frames=""))
             if not (config.init_from or self.trainer.progress.step):
                 learner.network.fit_prior(read_actions(self._examples[0]))
             if freezes_crops(learner.network, config):
@@ -228,13 +220,12 @@ class _Stages:
             if variant.boxes is not None:
                 cache = detected_object_cache(self.dataset, variant.boxes, report=self._say, **common)
             else:
-                say = self._say if variant.appearance is None else self._say_rerendering
                 cache = open_object_cache(
                     self.dataset,
                     self.learner.input_kind,
                     appearance=variant.appearance,
                     workers=workers,
-                    report=say,
+                    report=self._say,
                     **common,
                 )
             caches.append((cache, prob))
@@ -245,11 +236,8 @@ class _Stages:
     def _workers(self, most: int) -> int:
         return max(1, min(self.config.runtime.workers, most))
 
-    def _say_rerendering(self, done: int, total: int, note: str) -> None:
-        self._say(done, total, note or "rendering with random appearance")
-
     def _say(self, done: int, total: int, note: str) -> None:
-        self.trainer.report(f"{note or 'extracting objects'}, {done} of {total}")
+        self.trainer.report(f"{note or 'preparing demonstrations'}, {done} of {total}")
 
 
 def scene_tasks(dataset: Dataset) -> list[str]:

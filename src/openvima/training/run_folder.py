@@ -17,7 +17,7 @@ import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -149,8 +149,7 @@ class RunFolder:
                 for name, tensor in values.items()
             }
             write_safetensors(tensors, partial / OPTIMIZER_FILE)
-            progressed = {field: getattr(progress, field) for field in Progress.__slots__}
-            atomic_write_file(partial / STATE_FILE, json.dumps(progressed))
+            atomic_write_file(partial / STATE_FILE, json.dumps(asdict(progress)))
             self._sync(partial)
             shutil.rmtree(final, ignore_errors=True)
             partial.rename(final)

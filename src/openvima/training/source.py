@@ -11,10 +11,7 @@ from openvima.data.object_cache import ObjectCache
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import UNKNOWN_SCENES
 from openvima.errors import ConfigError, DatasetError, unknown_name
-from openvima.perception.preprocessing import split_prompt
-from openvima.policies.processor import Processor
 from openvima.tasks.registry import list_tasks, task_spec
-from openvima.training.augmentation.prompts import text_of
 from openvima.training.batches import BatchOrder, ExampleSource
 from openvima.training.config import LoaderConfig
 from openvima.training.run_folder import held_out_demonstrations
@@ -158,23 +155,6 @@ def read_actions(source: ExampleSource) -> torch.Tensor:
     stride = max(1, len(source) // _PRIOR_DEMONSTRATIONS)
     rows = range(0, len(source), stride)
     return torch.from_numpy(np.concatenate([source[row].episode.actions for row in rows]))
-
-
-def check_words(cache: ObjectCache, processor: Processor, *, describes: bool = False) -> None:
-    """Check before training that T5 has the words of every prompt; other vocabularies are built of them.
-
-    Args:
-        cache: All demonstrations.
-        processor: It has the tokenizer.
-        describes: Whether descriptions take the place of object images.
-
-    Raises:
-        PromptError: A prompt has a word that T5 lacks.
-    """
-    for text in (*cache.texts(), *(map(text_of, cache.descriptions()) if describes else ())):
-        for piece in split_prompt(text):
-            if isinstance(piece, str):
-                processor.tokenizer.encode(piece)
 
 
 def make_order(

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
-from openvima.errors import InputFileError
+from openvima.atomic_io import atomic_write_file
 from openvima.imports import import_extra
 from openvima.input_files import read_text
 from openvima.training.config import RunConfig
@@ -109,10 +109,13 @@ class WandbTracker(Tracker):
         self._wandb: Any = import_extra("wandb", needs)
         folder = run / WANDB_FOLDER
         folder.mkdir(parents=True, exist_ok=True)
+        file = folder / _ID_FILE
+        if not file.exists():
+            atomic_write_file(file, secrets.token_hex(8))
         self._session = self._wandb.init(
             project=project,
             name=run.name,
-            id=_wandb_id(folder / _ID_FILE),
+            id=read_text(file),
             resume="allow",
             dir=str(folder),
             config=dict(settings),
@@ -135,15 +138,3 @@ class WandbTracker(Tracker):
     def close(self) -> None:
         """Upload or write what is left."""
         self._session.finish()
-
-
-def _wandb_id(file: Path) -> str:
-    """Return the id of the run at Weights & Biases, a new one for a new run folder."""
-    try:
-        found = read_text(file).strip()
-    except (OSError, InputFileError):
-        found = ""
-    if not (found.isalnum() and len(found) <= 32):
-        found = secrets.token_hex(8)
-        file.write_text(found, encoding="utf-8")
-    return found

@@ -18,7 +18,6 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.errors import ConfigError
 from openvima.policies.nn.action_head import (
     NUM_BINS,
     ActionHead,
@@ -66,10 +65,6 @@ class AutoregressiveConfig:
     hidden_width: int = 512
     token_std: float = 0.02
     action_width: int = 256
-
-    def __post_init__(self) -> None:
-        if self.token_std <= 0:
-            raise ConfigError(f"autoregressive head: token_std is {self.token_std}; it must be above 0.")
 
 
 class AutoregressiveHead(nn.Module):
@@ -223,13 +218,6 @@ class MixtureConfig:
     num_components: int = 5
     min_std: float = 0.05
 
-    def __post_init__(self) -> None:
-        if self.num_components < 1 or not 0 < self.min_std < 1:
-            raise ConfigError(
-                f"mixture head: num_components is {self.num_components} and min_std {self.min_std}; they "
-                "must be at least 1, and between 0 and 1."
-            )
-
 
 @dataclass(frozen=True, slots=True)
 class RegressionConfig:
@@ -244,12 +232,6 @@ class RegressionConfig:
     hidden_width: int = 512
     action_width: int = 256
     huber_delta: float = 0.05
-
-    def __post_init__(self) -> None:
-        if not 0 < self.huber_delta <= 1:
-            raise ConfigError(
-                f"regression head: huber_delta is {self.huber_delta}; it must be above 0 and at most 1."
-            )
 
 
 class MixtureHead(ActionHead):

@@ -25,6 +25,20 @@ PIXEL_MEAN = (0.3471, 0.3429, 0.3383)
 PIXEL_STD = (0.3011, 0.2961, 0.2956)
 
 
+class PixelEncoder(nn.Module):
+    """Has the constants by which pixels are standardised."""
+
+    pixel_mean: torch.Tensor
+    pixel_std: torch.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name, values in (("pixel_mean", PIXEL_MEAN), ("pixel_std", PIXEL_STD)):
+            # Created on the CPU, so that they exist under `MetaInit`, too.
+            constant = torch.tensor(values, device="cpu").view(3, 1, 1)
+            self.register_buffer(name, constant, persistent=False)
+
+
 @dataclass(frozen=True, slots=True)
 class VitConfig:
     """Sizes of the transformer.
@@ -55,22 +69,15 @@ class VitConfig:
         return (self.image_height // self.patch_size) * (self.image_width // self.patch_size)
 
 
-class VisionTransformer(nn.Module):
+class VisionTransformer(PixelEncoder):
     """Class token, if any, and patches of one image -> pre-norm blocks -> features.
 
     For a 32 × 32 crop in patches of 16: [class, upper left, upper right, lower left, lower right].
     """
 
-    pixel_mean: torch.Tensor
-    pixel_std: torch.Tensor
-
     def __init__(self, config: VitConfig) -> None:
         super().__init__()
         width, scale = config.width, config.width**-0.5
-        # Constants are created on the CPU, so that they exist under `MetaInit`, too.
-        mean, std = torch.tensor(PIXEL_MEAN, device="cpu"), torch.tensor(PIXEL_STD, device="cpu")
-        self.register_buffer("pixel_mean", mean.view(3, 1, 1), persistent=False)
-        self.register_buffer("pixel_std", std.view(3, 1, 1), persistent=False)
         self.patches = nn.Conv2d(3, width, config.patch_size, stride=config.patch_size, bias=False)
         self.class_token = nn.Parameter(torch.randn(width) * scale) if config.class_token else None
         self.positions = nn.Parameter(torch.randn(config.num_patches + config.class_token, width) * scale)
@@ -159,21 +166,14 @@ class ConvConfig:
             raise ConfigError(f"crop encoder: width is {self.width}; it must be a multiple of {_GROUPS}.")
 
 
-class ConvEncoder(nn.Module):
+class ConvEncoder(PixelEncoder):
     """Three layers of stride 2 and one of stride 1, mean and max pooling over 4 × 4 cells, a linear layer.
 
     With `place_channels`, projected channels of each cell are concatenated to the pooled features.
     """
 
-    pixel_mean: torch.Tensor
-    pixel_std: torch.Tensor
-
     def __init__(self, config: ConvConfig) -> None:
         super().__init__()
-        # Constants are created on the CPU, so that they exist under `MetaInit`, too.
-        mean, std = torch.tensor(PIXEL_MEAN, device="cpu"), torch.tensor(PIXEL_STD, device="cpu")
-        self.register_buffer("pixel_mean", mean.view(3, 1, 1), persistent=False)
-        self.register_buffer("pixel_std", std.view(3, 1, 1), persistent=False)
         width = config.width
         self.layers = nn.Sequential(
             _layer(3, width, stride=2),

@@ -96,7 +96,7 @@ def with_distractors(
         other: Distractors come from its first step; the images of both are numbered in one stack.
         rng: Draws how many, and which.
     """
-    count = int(rng.integers(1, MAX_DISTRACTORS + 1))
+    count = rng.integers(1, MAX_DISTRACTORS + 1)
     there = other.objects.select(slice(0, int(other.objects_per_step[0])))
     there = there.select(rng.permutation(len(there)))
     there = there.select(np.asarray(there.masks.all(axis=1)))

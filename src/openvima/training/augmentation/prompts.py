@@ -35,9 +35,10 @@ def images_by_name(prompt: PreprocessedPrompt) -> NamedImages:
 
 
 def with_prompt(
-    episode: PreprocessedEpisode, text: str, images: Mapping[str, tuple[ObjectTable, bool]]
+    episode: PreprocessedEpisode, text: str, images: NamedImages | None = None
 ) -> PreprocessedEpisode:
-    """Return the demonstration with another prompt, which contains some of these images."""
+    """Return the demonstration with another prompt, which contains some of these images, or of its own."""
+    images = images or images_by_name(episode.prompt)
     shown = [images[name] for name in image_names(text)]
     prompt = PreprocessedPrompt(
         text=text,
@@ -66,9 +67,9 @@ def rename_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> Pr
     named = [name for name, (objects, is_scene) in images.items() if len(objects) == 1 and not is_scene]
     if not named or _NOVEL_WORD.search(episode.prompt.text):
         return episode
-    count = int(rng.integers(1, min(MAX_NAMES, len(named)) + 1))
-    chosen = [named[int(number)] for number in rng.permutation(len(named))[:count]]
-    nouns = [NOUNS[int(number)] for number in rng.permutation(len(NOUNS))]
+    count = rng.integers(1, min(MAX_NAMES, len(named)) + 1)
+    chosen = [named[number] for number in rng.permutation(len(named))[:count]]
+    nouns = [NOUNS[number] for number in rng.permutation(len(NOUNS))]
     text = episode.prompt.text
     for name, noun in zip(chosen, nouns, strict=False):
         text = re.sub(rf"(\w+) \{{{name}\}}", lambda found, noun=noun: _noun_phrase(found[1], noun), text)
@@ -79,7 +80,7 @@ def rename_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> Pr
     defined = [
         DEFINITION.format(noun=noun, image=f"{{{name}}}") for name, noun in zip(chosen, nouns, strict=False)
     ]
-    text = " ".join([*(defined[int(number)] for number in rng.permutation(len(defined))), text])
+    text = " ".join([*(defined[number] for number in rng.permutation(len(defined))), text])
     return with_prompt(episode, text, images)
 
 
@@ -126,13 +127,13 @@ def shuffle_sentences(episode: PreprocessedEpisode, rng: np.random.Generator) ->
         else:
             definitions.append(sentence)
     if comparisons:
-        kept = rng.permutation(len(comparisons))[: int(rng.integers(1, len(comparisons) + 1))]
-        definitions += [comparisons[int(number)] for number in kept]
+        kept = rng.permutation(len(comparisons))[: rng.integers(1, len(comparisons) + 1)]
+        definitions += [comparisons[number] for number in kept]
     if not definitions:
         return episode
     blocks = [*definitions, " ".join(instruction)]
-    text = " ".join(blocks[int(number)] for number in rng.permutation(len(blocks)))
-    return with_prompt(episode, text, images_by_name(episode.prompt))
+    text = " ".join(blocks[number] for number in rng.permutation(len(blocks)))
+    return with_prompt(episode, text)
 
 
 MAX_DEFINITIONS = 3
@@ -159,12 +160,12 @@ def with_unused_definitions(
     for kind in (NOUNS, ADJECTIVES):
         free = [word for word in kind if word not in taken]
         used = [word for word in kind if word in said]
-        words |= zip(used, (free[int(n)] for n in rng.permutation(len(free))), strict=False)
-    for index in rng.permutation(len(there))[: int(rng.integers(1, MAX_DEFINITIONS + 1))]:
-        found = _NOVEL_WORD.search(there[int(index)])
+        words |= zip(used, (free[n] for n in rng.permutation(len(free))), strict=False)
+    for index in rng.permutation(len(there))[: rng.integers(1, MAX_DEFINITIONS + 1)]:
+        found = _NOVEL_WORD.search(there[index])
         if found and found[0] in words:
-            sentence = there[int(index)].replace(f" {found[0]} ", f" {words[found[0]]} ")
-            own.insert(int(rng.integers(num_leading + 1)), sentence.replace("{", "{unused_"))
+            sentence = there[index].replace(f" {found[0]} ", f" {words[found[0]]} ")
+            own.insert(rng.integers(num_leading + 1), sentence.replace("{", "{unused_"))
             num_leading += 1
     images = {f"unused_{name}": image for name, image in images_by_name(other.prompt).items()}
     return with_prompt(episode, " ".join(own), images | images_by_name(episode.prompt))
@@ -188,7 +189,7 @@ def turn_comparisons(episode: PreprocessedEpisode, rng: np.random.Generator) -> 
     """
     text, count = _LESS.subn("", episode.prompt.text)
     text = _COMPARISON.sub(r"\3 is \2 than \1", text)
-    return with_prompt(episode, text, images_by_name(episode.prompt)) if count else episode
+    return with_prompt(episode, text) if count else episode
 
 
 def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
@@ -205,8 +206,8 @@ def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> Prepro
         template = task_spec(episode.task).template
     except UnknownTaskError:  # demonstrations of a task that is not installed here
         return episode
-    text = rephrase(episode.prompt.text, template, phrasings[int(rng.integers(len(phrasings)))])
-    return episode if text is None else with_prompt(episode, text, images_by_name(episode.prompt))
+    text = rephrase(episode.prompt.text, template, phrasings[rng.integers(len(phrasings))])
+    return episode if text is None else with_prompt(episode, text)
 
 
 _FORMS = "all {x}. {x}. is a zup {x}"  # plural, articles and colon, which descriptions bring with them
@@ -254,7 +255,7 @@ def with_descriptions(
     if not chosen:
         return episode
     text = with_phrases(episode.prompt.text, {name: episode.descriptions[name] for name in chosen})
-    return with_prompt(episode, text, images_by_name(episode.prompt))
+    return with_prompt(episode, text)
 
 
 def with_synonyms(episode: PreprocessedEpisode, prob: float, rng: np.random.Generator) -> PreprocessedEpisode:

@@ -43,7 +43,7 @@ def with_random_appearance(
     for placement in scene.placements:
         if rng.random() < prob:
             dark = "dark " if rng.random() < 0.25 else ""
-            placement = replace(placement, texture=dark + palette[int(rng.integers(_PALETTE_SIZE))])
+            placement = replace(placement, texture=dark + palette[rng.integers(_PALETTE_SIZE)])
         if rng.random() < prob:
             placement = _with_random_shape(placement, assets, rng, common, settings)
         placements.append(placement)
@@ -102,7 +102,7 @@ def rearrange(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int, 
     movable = [p for p in scene.placements if not p.fixed]
     positions = {p.id: (p.pose.x, p.pose.y) for p in scene.placements}
     if rng.random() < 0.5:
-        others = [movable[int(index)].pose for index in rng.permutation(len(movable))]
+        others = [movable[index].pose for index in rng.permutation(len(movable))]
         positions |= {p.id: _near(other, rng) for p, other in zip(movable, others, strict=True)}
     poses = {
         p.id: Pose((*positions[p.id], p.pose.z), p.pose.rotated(rotations[p.id]).quaternion)
@@ -143,7 +143,7 @@ def with_hard_negatives(
         if original.fixed or not is_eligible or rng.random() >= prob:
             continue
         position = _free_position(placements, rng)
-        kind = _KINDS[int(rng.integers(len(_KINDS)))]
+        kind = _KINDS[rng.integers(len(_KINDS))]
         negative = _change(original, kind, scene.placements, shades, assets, rng)
         if position and negative:
             pose = Pose.planar(*position, rng.uniform(0, 2 * math.pi), z=negative.pose.z)
@@ -170,11 +170,11 @@ def _change(
         return None if shade is None else replace(original, texture=shade)
     if kind == "texture":
         names = [p.texture for p in others if not p.fixed and p.texture != original.texture]
-        return replace(original, texture=names[int(rng.integers(len(names)))]) if names else None
+        return replace(original, texture=names[rng.integers(len(names))]) if names else None
     shapes = [p for p in others if not p.fixed and p.object != original.object]
     if not shapes:
         return None
-    shape = shapes[int(rng.integers(len(shapes)))]
+    shape = shapes[rng.integers(len(shapes))]
     return at_rest(replace(original, object=shape.object, size=shape.size, scale=shape.scale), assets)
 
 
