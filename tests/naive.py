@@ -44,11 +44,10 @@ def cross(origin: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
 
 def draw(
     bodies: list[tuple[TriangleMesh, Pose, int, np.ndarray]], camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colours (3, H, W), object ids and heights (H, W) of bodies before a white ground."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (3, H, W) and object ids (H, W) of bodies before a white ground."""
     rgb = np.full((3, camera.height, camera.width), 255, dtype=np.uint8)
     segm = np.full((camera.height, camera.width), 255, dtype=np.uint8)
-    heights = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
     depth = np.full((camera.height, camera.width), np.inf)
     for mesh, pose, object_id, texture in bodies:
         for corners, normals, uvs in zip(mesh.vertices, mesh.normals, mesh.uvs, strict=True):
@@ -70,9 +69,8 @@ def draw(
                     colour = texel(texture, *(weights @ uvs))
                     rgb[:, row, column] = np.minimum(255, np.floor(intensity * colour.astype(float)))
                     segm[row, column] = object_id
-                    heights[row, column] = weights @ world[:, 2]
                     depth[row, column] = distance
-    return rgb, segm, heights
+    return rgb, segm
 
 
 def label_cells(

@@ -208,7 +208,7 @@ def full_repr(value: Any) -> str:
     return repr(value)
 
 
-def noise(seed: int = 0, shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
+def noise(seed: int = 0) -> dict[str, np.ndarray]:
     """A picture of each view in which every pixel is drawn."""
     rng = np.random.default_rng(seed)
-    return {view: rng.integers(0, 256, (3, *shape), dtype=np.uint8) for view in VIEWS}
+    return {view: rng.integers(0, 256, (3, 128, 256), dtype=np.uint8) for view in VIEWS}

@@ -48,7 +48,6 @@ def test_the_oracle_solves_tasks_by_flat_actions(task: str) -> None:
     [
         (np.zeros(5), r"0\.\]\); it must be an array of 6 floating-point numbers"),
         (np.zeros(6, int), "floating-point"),
-        ([[1], [1, 2]], r"\[\[1\], \[1, 2\]\]; it must be"),
         (np.full(6, np.nan), "nan"),
         (np.array([0, 0, 0, 1.5, 0, 0]), r"1\.5.*each in -1 … 1"),
     ],

@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 
 import openvima
 from openvima.detector.boxes import match, pyramid_anchors
-from openvima.detector.config import FIRST_STRIDE, small
+from openvima.detector.config import FIRST_STRIDE, SMALL
 from openvima.detector.frames import Frame, frame_of
 from openvima.detector.layers import BACKGROUND_IOU
 from openvima.detector.roi_align import box_levels, crop_masks, paste_masks
@@ -35,7 +35,7 @@ def frame() -> Frame:
 
 def draw_anchors(axes: Any, annotated: Frame) -> None:
     """Draw the foreground anchors, coloured by level."""
-    sizes = small()
+    sizes = SMALL
     shapes = [(FRONT.height // (4 * 2**k), FRONT.width // (4 * 2**k)) for k in range(len(sizes.anchor_sizes))]
     levels = pyramid_anchors(sizes.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
     _, labels = match(
@@ -55,7 +55,7 @@ def draw_anchors(axes: Any, annotated: Frame) -> None:
 
 def draw_grids(axes: Any, annotated: Frame) -> None:
     """Draw the RoIAlign grids of the box head, coloured by level."""
-    sizes = small()
+    sizes = SMALL
     boxes = torch.from_numpy(annotated.boxes)
     levels = box_levels(
         boxes, 3, canonical_size=sizes.canonical_size, canonical_level=sizes.canonical_level
@@ -70,7 +70,7 @@ def draw_grids(axes: Any, annotated: Frame) -> None:
 
 def draw_masks(axes: Any, annotated: Frame) -> None:
     """Draw masks resampled to the grid of the mask head and pasted back."""
-    sizes = small()
+    sizes = SMALL
     boxes = torch.from_numpy(annotated.boxes)
     grids = crop_masks(torch.from_numpy(annotated.masks), boxes, size=2 * sizes.mask_pool_size)
     pasted = paste_masks(grids.float(), boxes, height=FRONT.height, width=FRONT.width).numpy()

@@ -66,15 +66,12 @@ def settle(
         texts: Fields with a name or a path as text.
         names: Fields with a tuple of names or paths as text, or with a single one.
     """
-    for name in paths:
-        if isinstance(given := getattr(config, name), str | os.PathLike):
-            object.__setattr__(config, name, as_path(given))
-    for name in texts:
-        if isinstance(given := getattr(config, name), str | os.PathLike):
-            object.__setattr__(config, name, as_text(given))
-    for name in names:
-        if isinstance(given := getattr(config, name), str | os.PathLike | list | tuple):
-            object.__setattr__(config, name, names_of(given))
+    one = str | os.PathLike
+    choices = (paths, one, as_path), (texts, one, as_text), (names, one | list | tuple, names_of)
+    for fields, kinds, convert in choices:
+        for name in fields:
+            if isinstance(given := getattr(config, name), kinds):
+                object.__setattr__(config, name, convert(given))
 
 
 def cache_dir() -> Path:

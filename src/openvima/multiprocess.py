@@ -1,6 +1,6 @@
 """Parallel jobs with one thread each: in processes of this machine, or on a Ray cluster.
 
-Only `ray_imap_unordered` imports Ray: `pip install openvima[scale]`.
+Only the engine "ray" imports Ray: `pip install openvima[scale]`.
 """
 
 import contextlib
@@ -219,7 +219,6 @@ CANCEL_S = 20.0  # for jobs to end after an error or Ctrl-C
 CONNECT_S = 10.0
 RETRIES = 2  # of a job whose machine or process died
 OBJECT_STORE_BYTES = 100 * 2**20  # Ray's default is 30 % of the memory; results are files here
-AUTO = "auto"  # the cluster that this machine belongs to
 
 
 def engine_problems(engine: str, address: str | None) -> Iterator[str]:
@@ -239,36 +238,19 @@ def imap_with_engine(
     address: str | None = None,
     report: Callable[[int], None] | None = None,
 ) -> Iterator[tuple[Any, Any]]:
-    """Apply a job to every item with "processes" of this machine or with "ray".
+    """Apply a job to every item with "processes" of this machine or with "ray", and yield the results.
 
-    Without `num_workers` it is one, or one per CPU of the cluster at `address`.
-    """
-    if engine == "processes":
-        return imap_unordered(job, items, num_workers or 1, report=report)
-    num_workers = num_workers or (1 if address is None else None)
-    return ray_imap_unordered(job, items, num_workers, address=address, report=report)
-
-
-def ray_imap_unordered(
-    job: Job,
-    items: Sequence[Any],
-    num_workers: int | None,
-    *,
-    address: str | None = None,
-    report: Callable[[int], None] | None = None,
-) -> Iterator[tuple[Any, Any]]:
-    """Apply a job to every item on a Ray cluster and yield the results as they finish.
-
-    A job whose machine or process died runs again elsewhere, up to `RETRIES` times, so jobs must be
-    repeatable.
+    A job whose machine or process died runs again elsewhere on a Ray cluster, up to `RETRIES` times, so jobs
+    must be repeatable.
 
     Args:
+        engine: "processes" or "ray".
         job: A function of a module that every machine can import.
         items: Its arguments, taken in order; they and the results are pickled.
-        num_workers: Concurrent jobs; None: one per CPU of the cluster.
-        address: "HOST:PORT" of the cluster's head, "ray://HOST:PORT", or "auto". None uses the Ray
-            session of this process, or starts one on this machine and stops it at the end.
-        report: Called repeatedly with the sum of the counts of finished jobs.
+        num_workers: Concurrent jobs; None: one, or one per CPU of the cluster at `address`.
+        address: "HOST:PORT" of the cluster's head. None uses the Ray session of this process, or starts one
+            on this machine and stops it at the end.
+        report: Called repeatedly with the sum of the counts; with "ray" with that of finished jobs.
 
     Yields:
         An item and its result, as they finish.
@@ -280,7 +262,10 @@ def ray_imap_unordered(
         WorkerError: A job died each time.
         Exception: Any exception of a job; the other jobs are stopped.
     """
-    ray = _import_ray()
+    if engine == "processes":
+        yield from imap_unordered(job, items, num_workers or 1, report=report)
+        return
+    ray, num_workers = _import_ray(), num_workers or (1 if address is None else None)
     with _connected(ray, address, num_workers):
         yield from _run_all(ray, job, items, num_workers or len(items), report or (lambda done: None))
 
@@ -328,11 +313,9 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
 
 def _check_answers(address: str) -> None:
     """Probe a HOST:PORT: Ray itself waits for minutes, then ends the process without an exception."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if address == AUTO:
-        return
+    host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
-        raise ConfigError(f"address is {address!r}; allowed are HOST:PORT, ray://HOST:PORT and {AUTO!r}.")
+        raise ConfigError(f"address is {address!r}; it must be HOST:PORT.")
     try:
         socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
     except (OSError, OverflowError) as error:

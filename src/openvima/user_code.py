@@ -98,14 +98,11 @@ def load_file(path: Path, *, what: str) -> ModuleType:
     if spec is None:
         raise ConfigError(f"{what} names {str(path)!r}, which is no Python file; its name must end in .py.")
     module = importlib.util.module_from_spec(spec)
-    before = sys.modules.get(spec.name)
     sys.modules[spec.name] = module
     try:
         exec(compile(code, path, "exec"), module.__dict__)  # the bytes that the digest is of
     except (Exception, SystemExit) as error:
         del sys.modules[spec.name]
-        if before is not None:
-            sys.modules[spec.name] = before
         raise ConfigError(f"{what} names {str(path)!r}, which raised {described(error)}.") from error
     _loaded[path] = digest, module
     return module

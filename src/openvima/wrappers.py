@@ -66,11 +66,7 @@ class FlatAction(gymnasium.ActionWrapper):
         Raises:
             ActionError: The shape is another, or a value is not in −1 … 1. Nothing was moved.
         """
-        try:
-            values = np.asarray(action)
-        except (TypeError, ValueError, RuntimeError):
-            # Such as nested lists of unequal lengths, or a tensor on a device or with gradients.
-            values = np.empty(0)
+        values = np.asarray(action)
         fits = values.shape == (ACTION_SIZE,) and values.dtype.kind == "f"
         if not fits or not (np.abs(values) <= 1).all():  # also without NaN
             raise ActionError(
@@ -133,23 +129,19 @@ class FlatObservation(gymnasium.ObservationWrapper):
         size = (max_objects + max_prompt_objects) * OBJECT_SIZE + NUM_BUCKETS + 1
         size += TOOL_SIZE * (self._base.control == END_EFFECTOR)
         self.observation_space = spaces.Box(-1, 1, (size,), np.float32)
-        self._prompt = np.zeros(0, np.float32)
+        self._prompt, self._encoded = None, np.zeros(0, np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
-        """Start an episode.
+    def observation(self, observation: Mapping[str, Any]) -> np.ndarray:
+        """Return an observation of the running episode as a vector.
 
         Raises:
             ConfigError: There are more objects than rows.
         """
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._prompt = self._encoded_prompt()
-        return self.observation(observation), info
-
-    def observation(self, observation: Mapping[str, Any]) -> np.ndarray:
-        """Return an observation of the running episode as a vector."""
+        if self._prompt is not self._base.prompt:  # of a new episode
+            self._prompt, self._encoded = self._base.prompt, self._encoded_prompt()
         objects = self._rows([(observe(observation), True)], "max_objects")
         tool = _tool(observation["tool"]) if "tool" in observation else ()
-        return np.concatenate([objects.ravel(), self._prompt, [observation["ee"]], tool], dtype=np.float32)
+        return np.concatenate([objects.ravel(), self._encoded, [observation["ee"]], tool], dtype=np.float32)
 
     def rows(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Split vectors into objects, objects of the prompt, and words with the end effector and the tool.
@@ -226,33 +218,33 @@ shape (3 × max_prompt_images, 64, 128), zeros where there is none |
         }
         parts["words"] = spaces.Box(-1, 1, (num_words,), np.float32)
         self.observation_space = spaces.Dict(parts)
-        self._prompt, self._words = np.zeros(0, np.uint8), np.zeros(0, np.float32)
+        self._prompt, self._images, self._words = None, np.zeros(0, np.uint8), np.zeros(0, np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
-        """Start an episode.
+    def observation(self, observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Return an observation of the running episode as a flat dictionary.
 
         Raises:
             ConfigError: The prompt has more than `max_prompt_images` images.
         """
-        observation, info = self.env.reset(seed=seed, options=options)
+        if self._prompt is not self._base.prompt:  # of a new episode
+            self._prompt = self._base.prompt
+            self._encode_prompt()
+        tool = _tool(observation["tool"]) if "tool" in observation else ()
+        images = {view: _shrunk(image) for view, image in observation["rgb"].items()}
+        words = np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
+        return {**images, "prompt": self._images.copy(), "words": words}
+
+    def _encode_prompt(self) -> None:
         parts = self._base.prompt.sequence()
         images = [part.rgb["top"] for part in parts if not isinstance(part, str)]
         if len(images) > self.max_prompt_images:
             raise ConfigError(
                 f"max_prompt_images is {self.max_prompt_images}, but the prompt has {len(images)}; give more."
             )
-        self._prompt = np.zeros(self.observation_space["prompt"].shape, np.uint8)  # type: ignore[index]
+        self._images = np.zeros(self.observation_space["prompt"].shape, np.uint8)  # type: ignore[index]
         for index, image in enumerate(images):
-            self._prompt[3 * index : 3 * index + 3] = _shrunk(image)
+            self._images[3 * index : 3 * index + 3] = _shrunk(image)
         self._words = _words(parts)
-        return self.observation(observation), info
-
-    def observation(self, observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Return an observation of the running episode as a flat dictionary."""
-        tool = _tool(observation["tool"]) if "tool" in observation else ()
-        images = {view: _shrunk(image) for view, image in observation["rgb"].items()}
-        words = np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
-        return {**images, "prompt": self._prompt.copy(), "words": words}
 
 
 class ProgressReward(gymnasium.Wrapper):

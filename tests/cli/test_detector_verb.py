@@ -41,7 +41,7 @@ def detector(tiny, tmp_path) -> Path:
 
 @pytest.mark.slow
 def test_evaluate_and_show_accept_a_training_run(data, tiny, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
+    monkeypatch.setitem(sizes.DETECTORS, "small", tiny)
     run = tmp_path / "run"
     words = f"--data {data} --out {run} --schedule.steps 1 --loader.batch-size 2 --runtime.device cpu"
     words += " --loader.validation-fraction 0.4 --loader.validation-frames 2"

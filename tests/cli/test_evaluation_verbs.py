@@ -56,7 +56,7 @@ def test_demo_records_low_level_control(tmp_path, capsys):
     assert not path.exists()
     episode = tmp_path / "episode.yaml"
     assert main(["demo", "--episode", str(episode), "--control", "end_effector"]) == 2
-    assert "episodes of a file are played by primitives" in capsys.readouterr().err
+    assert "an episode file is played by primitives" in capsys.readouterr().err
 
 
 def test_evaluate_then_report(tmp_path, capsys):
@@ -90,7 +90,7 @@ def test_jobs_of_an_array_share_an_evaluation(tmp_path, capsys):
     assert capsys.readouterr().out == "0\toracle\trotate\tL1\t0\t1\n1\toracle\trotate\tL2\t0\t1\n"
     assert not (tmp_path / "scores").exists()
     assert main([*words, "--shard-range", "1:1"]) == 2
-    assert "--shard-range is '1:1'; it must be a:b" in capsys.readouterr().err
+    assert "shard_range is '1:1'; it must be a:b" in capsys.readouterr().err
     assert main([*words, "--shard-range", "1:2"]) == 0
     assert "lacks batches of other ranges" in capsys.readouterr().err
     assert main([*words, "--shard-range", "0:1"]) == 0

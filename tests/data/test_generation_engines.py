@@ -11,7 +11,7 @@ import worker_jobs
 from openvima.data import GenerateConfig, generate, plan
 from openvima.data.manifest import is_finished
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.multiprocess import ray_imap_unordered
+from openvima.multiprocess import imap_with_engine
 from small_data_sets import config, contents
 
 
@@ -63,7 +63,7 @@ def test_ray_stopped_by_hand_leaves_whole_files_and_is_continued(
 @pytest.mark.slow
 def test_a_job_of_ray_whose_worker_was_killed_runs_again(ray: ModuleType, tmp_path: Path) -> None:
     paths = [tmp_path / str(k) for k in range(3)]
-    done = list(ray_imap_unordered(worker_jobs.die_at_first, paths, 2))
+    done = list(imap_with_engine("ray", worker_jobs.die_at_first, paths, 2))
     assert sorted(item for item, _ in done) == paths
     assert [path.read_text() for path in paths] == ["done"] * 3
 
@@ -78,13 +78,13 @@ def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     ("address", "message"),
     [
         ("127.0.0.1:9", r"no Ray cluster answers at 127\.0\.0\.1:9"),
-        ("nowhere", "allowed are HOST:PORT"),
+        ("nowhere", "must be HOST:PORT"),
     ],
 )
 def test_a_cluster_that_does_not_answer_is_named(address: str, message: str) -> None:
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match=message):
-        list(ray_imap_unordered(worker_jobs.fail, [0], None, address=address))
+        list(imap_with_engine("ray", worker_jobs.fail, [0], None, address=address))
 
 
 def test_ranges_of_shards_in_any_order_make_the_same_data_set(whole: Path, tmp_path: Path) -> None:

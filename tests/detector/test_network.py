@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from openvima.detector import load_detector, load_extractor
-from openvima.detector.config import resnet50
+from openvima.detector.config import RESNET50
 from openvima.detector.network import (
     FrameDetector,
     Instances,
@@ -118,7 +118,7 @@ def test_resized_shapes_equal_those_of_detectron2(height, width):
     low, high = 800.0, 800.0 * max(height, width) / min(height, width)
     shrink = min(1.0, 1333 / high)
     short, long = int(low * shrink + 0.5), int(high * shrink + 0.5)
-    assert resized_shape(resnet50(), height, width) == ((short, long) if height < width else (long, short))
+    assert resized_shape(RESNET50, height, width) == ((short, long) if height < width else (long, short))
 
 
 @pytest.mark.parametrize(("min_size", "height"), [(30, 64), (100, 64), (10, 65)])  # the last unevenly
@@ -161,7 +161,7 @@ def test_frozen_batch_normalisation_keeps_its_statistics(tiny):
 
 def test_the_published_architecture_has_the_published_number_of_weights():
     with torch.device("meta"):
-        network = MaskRCNN(replace(resnet50(), num_classes=80))
+        network = MaskRCNN(replace(RESNET50, num_classes=80))
     # 44.4 million without the constants of batch normalisation, as counted for Mask R-CNN R50-FPN on COCO
     assert round(sum(parameter.numel() for parameter in network.parameters()) / 1e6, 1) == 44.4
 

@@ -105,12 +105,8 @@ def test_the_object_cache_of_a_detector_equals_its_extractor_on_one_thread(tmp_p
     boxes = plugged_boxes(f"detector={tmp_path / 'detector'}")
     assert pickle.loads(pickle.dumps(boxes)) == boxes
     dataset, threads = Dataset(data, tasks=["rotate"]), torch.get_num_threads()
-    notes = []
-    cache = detected_object_cache(
-        dataset, boxes, folder=tmp_path / "tokens", report=lambda done, total, note: notes.append(note)
-    )
+    cache = detected_object_cache(dataset, boxes, folder=tmp_path / "tokens")
     assert torch.get_num_threads() == threads
-    assert set(notes) == {"detecting objects"}
     extractor = plugged_extractor(f"detector={tmp_path / 'detector'}")
     demo, tokens = dataset[0], cache[0]
     expected = preprocess(demo, "objects", extractor)

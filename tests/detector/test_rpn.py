@@ -18,7 +18,6 @@ from openvima.detector.boxes import (
 )
 from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, RegionProposalNetwork
 from openvima.detector.roi_align import (
-    align_levels,
     box_levels,
     crop_masks,
     paste_masks,
@@ -194,14 +193,17 @@ def test_aligned_features_agree_with_the_naive_twin(sampling_ratio):
     levels = [torch.from_numpy(rng.normal(size=(2, 3, 16 // 2**k, 24 // 2**k))) for k in range(3)]
     low = rng.uniform(-20, 80, (20, 2))
     boxes = torch.from_numpy(np.concatenate([low, low + rng.uniform(0.1, 120, (20, 2))], axis=1))
-    images, indices = torch.arange(20) % 2, torch.arange(20) % 3
-    cells = align_levels(
-        levels, boxes, images, indices, size=3, sampling_ratio=sampling_ratio, first_stride=4
-    )
+    sizes = {"canonical_size": 30, "canonical_level": 1}
+    images, indices = torch.arange(20) % 2, box_levels(boxes, 3, **sizes)
+    assert len(indices.unique()) == 3
+    with torch.no_grad():
+        cells = pyramid_align(
+            levels, boxes, images, size=3, sampling_ratio=sampling_ratio, first_stride=4, **sizes
+        )
     trained = torch.empty_like(cells)
     for level, features in enumerate(levels):
-        rows, sizes = indices == level, {"size": 3, "stride": 4 * 2**level}
-        trained[rows] = roi_align(features, boxes[rows], images[rows], sampling_ratio=sampling_ratio, **sizes)
+        rows, grid = indices == level, {"size": 3, "stride": 4 * 2**level}
+        trained[rows] = roi_align(features, boxes[rows], images[rows], sampling_ratio=sampling_ratio, **grid)
     for number, (box, image, level) in enumerate(zip(boxes, images, indices, strict=True)):
         for channel in range(3):
             expected = naive.roi_align(

@@ -23,7 +23,7 @@ from small_networks import metrics_of
 @pytest.fixture
 def settings(data: Path, tmp_path: Path, tiny, monkeypatch) -> DetectorTrainingConfig:
     """Two steps of a tiny network."""
-    monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
+    monkeypatch.setitem(sizes.DETECTORS, "small", tiny)
     return DetectorTrainingConfig(
         data,
         tmp_path / "run",

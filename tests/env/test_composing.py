@@ -212,7 +212,7 @@ def test_prompts_of_all_languages_are_taken_with_blanks_as_spaces(prompt: str, t
 
 
 def click(scene: Scene, x: float, y: float) -> Hit:
-    hit = first_hit(scene, (x + 0.3, y, 0.5), (-0.3, 0.0, -0.5), load_assets("procedural"))
+    hit = first_hit(scene.placements, (x + 0.3, y, 0.5), (-0.3, 0.0, -0.5), load_assets("procedural"))
     assert hit is not None
     return hit
 

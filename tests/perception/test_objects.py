@@ -30,18 +30,18 @@ ID = 9
 GOLDEN = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model" / "preprocess.npz"
 
 
-def empty(shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
-    return {view: np.ones(shape, np.uint8) for view in VIEWS}
+def empty() -> dict[str, np.ndarray]:
+    return {view: np.ones((128, 256), np.uint8) for view in VIEWS}
 
 
 def seen_in_top(shown: np.ndarray, rgb: dict[str, np.ndarray] | None = None) -> ObjectViews:
-    segm = empty(shown.shape)
+    segm = empty()
     segm["top"][shown] = ID
-    return extract_objects(rgb or noise(shape=shown.shape), segm, [ID])
+    return extract_objects(rgb or noise(), segm, [ID])
 
 
-def rectangle(rows: slice, columns: slice, shape: tuple[int, int] = (128, 256)) -> np.ndarray:
-    shown = np.zeros(shape, bool)
+def rectangle(rows: slice, columns: slice) -> np.ndarray:
+    shown = np.zeros((128, 256), bool)
     shown[rows, columns] = True
     return shown
 
@@ -49,7 +49,7 @@ def rectangle(rows: slice, columns: slice, shape: tuple[int, int] = (128, 256)) 
 @st.composite
 def blobs(draw: st.DrawFn) -> np.ndarray:
     """A few overlapping rectangles and holes, as an object that others hide in part."""
-    shown = np.zeros((48, 72), bool)
+    shown = np.zeros((128, 256), bool)
     for _ in range(draw(st.integers(1, 4))):
         row, column = draw(st.integers(0, 47)), draw(st.integers(0, 71))
         height, width = draw(st.integers(1, 40)), draw(st.integers(2, 60))
@@ -60,7 +60,7 @@ def blobs(draw: st.DrawFn) -> np.ndarray:
 @settings(max_examples=60, derandomize=True)
 @given(blobs())
 def test_crops_boxes_and_grasps_equal_those_of_the_slow_twin(shown: np.ndarray) -> None:
-    rgb = noise(shape=shown.shape)
+    rgb = noise()
     objects = seen_in_top(shown, rgb)
     if shown.sum() < 2:
         assert not objects.masks.any()

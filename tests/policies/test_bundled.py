@@ -67,7 +67,6 @@ def test_quickstart_scores_it_beside_the_policy_that_it_trains(
 ) -> None:
     monkeypatch.setattr(quickstart, "TASKS", ("rotate",))
     monkeypatch.setattr(quickstart, "LEVELS", ("L1",))
-    monkeypatch.setattr(quickstart, "_first_look", lambda *_: None)
     monkeypatch.setattr(quickstart, "_generate", lambda *_: Path("demonstrations"))
     monkeypatch.setattr(quickstart, "_train", lambda *_: bundled)
     monkeypatch.setattr(videos, "recording_jobs", lambda *_: [])  # other tests record

@@ -59,15 +59,12 @@ def at(image: np.ndarray, view: str, point: tuple[float, float, float]) -> np.nd
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_the_bare_table_shows_floor_and_sheet(rasteriser, view) -> None:
-    image = rasteriser.scene(Scene(()), height=True)[view]
+    image = rasteriser.scene(Scene(()))[view]
     assert image.rgb.shape == (3, 128, 256)
     assert image.segm.shape == (128, 256)
     assert set(np.unique(image.segm)) == {0, 1}
     assert set(np.unique(image.rgb[:, image.segm == 0])) == {239}
     assert set(np.unique(image.rgb[:, image.segm == 1])) == {47}
-    assert image.height.dtype == np.float32
-    np.testing.assert_allclose(image.height, np.where(image.segm == 1, 0.0, -0.001), atol=1e-7)
-    assert rasteriser.scene(Scene(()))[view].height is None
 
 
 def test_faces_of_a_red_box_are_lit_by_their_direction(rasteriser) -> None:
@@ -105,15 +102,15 @@ def test_further_bodies_are_drawn_with_their_own_id_and_colour(rasteriser) -> No
 
 def test_images_do_not_depend_on_what_was_drawn_before(rasteriser) -> None:
     scene = TWO_BLOCKS
-    first = rasteriser.scene(scene, height=True)
-    rasteriser.scene(Scene((boxed(5, 0.5, 0.0),)), height=True)
+    first = rasteriser.scene(scene, depth=True)
+    rasteriser.scene(Scene((boxed(5, 0.5, 0.0),)), depth=True)
     rasteriser.scene(scene, enlarge=2)
-    again = rasteriser.scene(scene, height=True)
+    again = rasteriser.scene(scene, depth=True)
     for view in VIEWS:
         for a, b in ((first[view].rgb, again[view].rgb), (first[view].segm, again[view].segm)):
             np.testing.assert_array_equal(a, b)
         assert not np.shares_memory(first[view].rgb, again[view].rgb)
-        np.testing.assert_array_equal(first[view].height, again[view].height)
+        np.testing.assert_array_equal(first[view].depth, again[view].depth)
 
 
 def test_an_object_image_shows_the_object_alone_on_white(rasteriser) -> None:
@@ -297,14 +294,14 @@ def test_rays_from_above_meet_the_topmost_object() -> None:
         around = labels[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
         if (around == labels[row, column]).all():  # not at an outline
             x, y = cell_centres(np.array(row), np.array(column)).tolist()
-            assert object_below(scene, (x, y), PROCEDURAL) == labels[row, column]
+            assert object_below(scene.placements, (x, y), PROCEDURAL) == labels[row, column]
 
 
 def test_a_ray_meets_the_table_beside_objects_and_nothing_above_the_horizon() -> None:
     scene = sample_episode("rotate", seed=0).problem.scene
     assert first_hit((), (0.0, 0.0, 1.0), (1.0, 0.5, -2.0), PROCEDURAL) == Hit(0, (0.5, 0.25, 0.0))
-    assert first_hit(scene, (0.5, 0.0, 1.0), (0.0, 0.0, 1.0), PROCEDURAL) is None
-    assert first_hit(scene, (0.5, 0.0, 1.0), (1.0, 0.0, 0.0), PROCEDURAL) is None
+    assert first_hit(scene.placements, (0.5, 0.0, 1.0), (0.0, 0.0, 1.0), PROCEDURAL) is None
+    assert first_hit(scene.placements, (0.5, 0.0, 1.0), (1.0, 0.0, 0.0), PROCEDURAL) is None
 
 
 def test_a_slanted_ray_meets_the_near_side() -> None:

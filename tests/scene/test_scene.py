@@ -208,16 +208,6 @@ def test_candidates_at_one_place_count_together() -> None:
     assert (place.kind, place.probability) == ("in view", 1.0)
 
 
-def test_the_second_choice_is_another_place_or_another_object() -> None:
-    picked, place, probability = explained([0.9, 0.1], [(0.3, 0.6), (0.5, 0.4)]).second_choice() or (0, 0, 0)
-    assert picked.object_id == 0 and place.position == (0.5, 0.0)  # type: ignore[union-attr]
-    assert probability == pytest.approx(0.36)
-    picked, place, probability = explained([0.6, 0.4], [(0.3, 1.0)]).second_choice() or (0, 0, 0)
-    assert picked.object_id == 1 and place is None  # type: ignore[union-attr]
-    assert probability == pytest.approx(0.4)
-    assert explained([1.0], [(0.3, 1.0)]).second_choice() is None
-
-
 def arrays(**changes: object) -> dict[str, Any]:
     action: dict[str, Any] = {
         "pose0_position": np.array([0.4, 0.1], np.float32),

@@ -1,10 +1,9 @@
 """`openvima demo`: record a video of the oracle or of a policy on one task or on an episode from a file."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-import tyro
-
+from openvima.cli.options import Task
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 if TYPE_CHECKING:
@@ -12,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def main(
-    task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None,
+    task: Task = None,
     *,
     episode: Path | None = None,
     out: Path = Path("demo.mp4"),
@@ -76,12 +75,12 @@ def main(
 
     if (task is None) == (episode is None):
         raise ConfigError("demo takes either a TASK or --episode FILE; `openvima tasks` lists the tasks.")
-    if episode is not None and (seed, level, prompts, task_options) != (0, None, "multimodal", ""):
+    given = seed, level, prompts, task_options, control
+    if episode is not None and given != (0, None, "multimodal", "", "primitives"):
         raise ConfigError(
-            "an episode file says all of --seed, --level, --prompts and --task-options; leave them out."
+            "an episode file is played by primitives and says all of --seed, --level, --prompts and "
+            "--task-options; leave these and --control out."
         )
-    if episode is not None and control != "primitives":
-        raise ConfigError(f"--control is {control}; episodes of a file are played by primitives.")
     level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
@@ -123,6 +122,6 @@ def main(
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
     if not env.episode.problem.goals and not env.outcome.failure:
         ended = outcome.reason
-    steps = "1 step" if outcome.steps == 1 else f"{outcome.steps} steps"
+    steps = f"{outcome.steps} step{'s' * (outcome.steps != 1)}"
     print(f"{out}: {what}, by {policy}: {ended}; {steps}")
     return 0

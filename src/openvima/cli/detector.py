@@ -6,12 +6,13 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from openvima.cli.options import Json, Out
 from openvima.cli.terminal import Report, progress_bar
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from openvima.detector.evaluation import CocoEvaluation
     from openvima.detector.frames import Frame, FrameSampler
 
-Json = Annotated[bool, tyro.conf.arg(name="json")]
 Folder = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DETECTOR")]
 Training = Annotated[DetectorTrainingConfig, tyro.conf.arg(name="")]
 LEVEL = "L3"  # with objects and textures that are not in the training set
@@ -76,11 +76,12 @@ def evaluate(
     from openvima.detector import load_detector
     from openvima.detector.evaluation import evaluate_detector, require_pycocotools
     from openvima.detector.frames import held_out_frames
+    from openvima.policies.base import torch_threads
 
     require_pycocotools()  # fail early
     loaded = load_detector(detector, device=device)
     with (
-        _one_thread(),
+        torch_threads(1),  # so that results are reproducible
         _frames(data, level, frames, held_out, seed) as sampler,
         progress_bar("evaluating") as bar,
     ):
@@ -123,11 +124,12 @@ def show(
     from openvima.detector.evaluation import draw_detections, save_grid
     from openvima.detector.frames import held_out_frames
     from openvima.errors import ConfigError
+    from openvima.policies.base import torch_threads
 
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out is {str(out)!r}; give the name of a PNG file, ending in .png.")
     loaded = load_detector(detector)
-    with _one_thread(), _frames(data, level, frames, None, seed) as sampler:
+    with torch_threads(1), _frames(data, level, frames, None, seed) as sampler:
         images = [
             draw_detections(frame, loaded.detect(frame.rgb, ""))
             for frame in held_out_frames(sampler, frames, seed=seed)
@@ -139,7 +141,7 @@ def show(
 
 def convert(
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")],
-    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")],
+    out: Out,
     *,
     force: bool = False,
 ) -> int:
@@ -206,18 +208,6 @@ def _frames(
         yield FrameSampler(Dataset(Path(folder, "demos")))
 
 
-@contextmanager
-def _one_thread() -> "Iterator[None]":
-    """Compute on one thread, so that results are reproducible."""
-    from openvima.policies.base import require_torch
-
-    require_torch("a detector")
-    from openvima.policies.base import torch_threads
-
-    with torch_threads(1):
-        yield
-
-
 def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
     """Generate enough episodes for the frames."""
     from openvima.data import GenerateConfig, generate
@@ -225,7 +215,7 @@ def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
     config = GenerateConfig(out=folder, level=level, start_seed=seed)
     episodes = -(-frames // (FRAMES_PER_EPISODE * len(config.resolved_tasks())))
     with progress_bar("demonstrations") as report:
-        generate(GenerateConfig(out=folder, level=level, start_seed=seed, episodes=episodes), report)
+        generate(replace(config, episodes=episodes), report)
 
 
 def _counted(frames: "Iterable[Frame]", total: int, report: Report) -> "Iterator[Frame]":

@@ -5,10 +5,11 @@ import sys
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from openvima.cli.options import Json
 from openvima.cli.terminal import (
     parse_list,
     parse_shard_range,
@@ -156,7 +157,7 @@ def main(
     workers: int | None = None,
     out: Path = Path("evaluation"),
     force: bool = False,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: Json = False,
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = EnvironmentOptions(),
     ablation: tyro.conf.OmitArgPrefixes[AblationOptions] = AblationOptions(),
     recording: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions(),

@@ -89,7 +89,7 @@ def _run(verb: str, rest: list[str]) -> int:
 
     try:
         rest = [expand_home(word) for word in rest]
-        module = importlib.import_module(_module(verb))
+        module = importlib.import_module(f"openvima.cli.{verb.replace('-', '_')}")
         commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
         if commands is not None:
             names_none = not rest or (rest[0].startswith("-") and rest[0] not in _HELP)
@@ -111,25 +111,18 @@ def _run(verb: str, rest: list[str]) -> int:
         sys.stderr.close()
         return 1
     except Exception as error:
-        message, status = _explained(error, verb, rest)
+        message, status = _explained(error)
         return _fail(message, status)
 
 
-def _module(verb: str) -> str:
-    return f"openvima.cli.{verb.replace('-', '_')}"
-
-
-def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, int]:
+def _explained(error: Exception) -> tuple[str, int]:
     """Return the line that reports an exception, and the exit status; raise it if it is a bug."""
     name = type(error).__name__
     if lacks_memory(error):
         remedy = "lower the size of batches or the number of workers"
         return f"out of memory; {remedy}. Complete files were kept.", 1
     if isinstance(error, OpenVimaError):
-        from openvima.cli.options import name_options
-
-        message = name_options(str(error), _setting_names(verb, rest))
-        return f"{name}: {message}", 2 if isinstance(error, ValueError | KeyError | ImportError) else 1
+        return f"{name}: {error}", 2 if isinstance(error, ValueError | KeyError | ImportError) else 1
     if not isinstance(error, OSError):
         raise error
     reason = error.strerror or name
@@ -138,18 +131,6 @@ def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, i
     if error.filename is None:
         return f"{name}: {error}", 1
     return f"cannot use {error.filename}: {reason}. Give a path that can be read and written.", 2
-
-
-def _setting_names(verb: str, rest: Sequence[str]) -> list[str]:
-    """Return the names of what the command takes, as errors of the package have them."""
-    from openvima.cli.options import setting_names
-
-    module = importlib.import_module(_module(verb))
-    if hasattr(module, "run"):  # `train`
-        from openvima.training.config import TrainingConfig
-
-        return setting_names(TrainingConfig)
-    return setting_names(module.COMMANDS[rest[0]] if hasattr(module, "COMMANDS") else module.main)
 
 
 @contextmanager

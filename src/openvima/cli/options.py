@@ -1,11 +1,18 @@
-"""Options that are settings of a config class: parsing, a short help, and their names in errors."""
+"""Arguments that several commands take; and options that are settings of a config class."""
 
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import fields, is_dataclass, make_dataclass
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
+
+Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
+Out = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+Policy = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+Repository = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OWNER/NAME")]
+Task = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
+Json = Annotated[bool, tyro.conf.arg(name="json")]
 
 Config = TypeVar("Config")
 
@@ -53,38 +60,3 @@ def _unchecked(default: Any, shown: Collection[str] | None, prefix: str = "") ->
         settings.append((name, hint, value))
     namespace = {"__doc__": kind.__doc__, "__post_init__": lambda self: None}
     return make_dataclass(kind.__name__, settings, bases=(kind,), frozen=True, namespace=namespace)()
-
-
-def setting_names(command: Any, prefix: str = "") -> list[str]:
-    """Return the names of what a command or a config takes, as Python has them, with those of sections."""
-    names = []
-    for name, hint in get_type_hints(command, include_extras=True).items():
-        plain = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-        if is_dataclass(plain):  # an annotated section is one whose name options omit
-            names += setting_names(plain, prefix if hint is not plain else f"{prefix}{name}.")
-        elif name != "return":
-            names.append(prefix + name)
-    return names
-
-
-def name_options(message: str, settings: Collection[str]) -> str:
-    """Name options in a message in place of settings: --loader.batch-size for loader.batch_size.
-
-    Names of one plain word are replaced only where a message tells their value or what to do with them, since
-    it may use the word itself.
-
-    Args:
-        message: A message of the package, which quotes what users gave.
-        settings: Names of settings, see `setting_names`.
-    """
-    special = [re.escape(name) for name in settings if re.search(r"\W|_", name)]
-    plain = [re.escape(name) for name in settings if not re.search(r"\W|_", name)]
-    patterns = [
-        rf"(?<![\w.(='\"`/-])({'|'.join(special)})(?![\w(='\"`/-]|\.\w)",
-        rf"(?:^|(?<=[.;:] )|(?<=\bset )|(?<=\bleave ))({'|'.join(plain)})(?=,? (?:is|to|too|out)\b)",
-    ]
-    for names, pattern in zip((special, plain), patterns, strict=True):
-        if not names:  # the pattern would match anywhere
-            continue
-        message = re.sub(pattern, lambda found: f"--{found[1].replace('_', '-')}", message)
-    return message

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from openvima.cli.options import Out, Policy, Repository
 from openvima.cli.terminal import print_files, print_table
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def list_() -> int:
     return 0
 
 
-def show(policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")]) -> int:
+def show(policy: Policy) -> int:
     """Show one policy: parameter counts by part, and its config.
 
     Example: openvima policies show vima-200m
@@ -80,7 +81,7 @@ def show(policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POL
 
 def convert(
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IN")],
-    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")],
+    out: Out,
     *,
     tokenizer: str | None = None,
     precision: Precision = "float32",
@@ -134,7 +135,7 @@ def convert(
 
 def push_to_hub(
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")],
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OWNER/NAME")],
+    name: Repository,
     *,
     results: Path | None = None,
     licence: str = "mit",

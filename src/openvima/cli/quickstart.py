@@ -1,6 +1,5 @@
 """`openvima quickstart`: the whole way from nothing to a scored policy, in one command."""
 
-import sys
 from pathlib import Path
 
 from openvima.cli.terminal import progress_bar
@@ -47,7 +46,6 @@ def main(
     bundled_folder(SMALL)  # fails before any work if missing
     workers = workers or min(8, num_cpus())
     out.mkdir(parents=True, exist_ok=True)
-    _first_look(out / "first_look.png", seed)
     data = _generate(out / "demonstrations", demonstrations, seed, workers)
     run = _train(data, out / "trained", seed)
     _evaluate(run, out, episodes, seed, workers)
@@ -64,16 +62,6 @@ def _check(**counts: int | None) -> None:
     for name, count in counts.items():
         if count is not None and count < 1:
             raise ConfigError(f"{name} is {count}; it must be at least 1.")
-
-
-def _first_look(path: Path, seed: int) -> None:
-    """Render one episode of the oracle, to check the installation within seconds."""
-    from openvima.env import TabletopEnv
-    from openvima.evaluation.recording import save_episode_image
-
-    env = TabletopEnv("visual_manipulation", level="train")
-    save_episode_image(env, path, seed=seed)
-    print(f"First look: the oracle solves an episode, see {path}", file=sys.stderr)
 
 
 def _generate(folder: Path, demonstrations: int, seed: int, workers: int) -> Path:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from openvima.cli.options import Json
 from openvima.cli.terminal import parse_list
 
 
@@ -19,7 +20,7 @@ def main(
     compare: str | None = None,
     runs: tuple[Path, ...] = (),
     published: bool = True,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: Json = False,
 ) -> int:
     """Write the report of one or several evaluations, as one HTML file that needs nothing else.
 

@@ -4,13 +4,12 @@ import logging
 import os
 import sys
 from dataclasses import asdict
-from typing import Annotated
 
-import tyro
+from openvima.cli.options import Policy
 
 
 def main(
-    policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")],
+    policy: Policy,
     *,
     port: int = 8000,
     host: str = "127.0.0.1",

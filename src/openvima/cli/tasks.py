@@ -1,10 +1,9 @@
 """`openvima tasks`: list the tasks."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
+from openvima.cli.options import Task
 from openvima.cli.terminal import print_table
 from openvima.tasks.options import option_descriptions
 from openvima.tasks.registry import oracle_record
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def main(
-    name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None,
+    name: Task = None,
     *,
     level: str | None = None,
 ) -> int:

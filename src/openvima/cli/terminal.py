@@ -1,7 +1,7 @@
 """What commands read and print: options that hold several values, streams of any encoding, progress, tables.
 
 Progress is shown on stderr: bars for `report(done, total, note)` callbacks. Where stderr is no terminal,
-these are lines: one at each stage, one a minute and one at the end.
+these are lines: one at the start, one a minute and one at the end.
 """
 
 import io
@@ -49,7 +49,7 @@ def accept_any_text() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-LINE_S = 60.0  # between two lines of a stage, where stderr is no terminal
+LINE_S = 60.0  # between two lines, where stderr is no terminal
 
 
 @contextmanager
@@ -79,12 +79,12 @@ def progress_bar(label: str) -> Iterator[Report]:
     from rich.table import Column
 
     columns = (
-        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+        "{task.description}",
         BarColumn(bar_width=16),
-        MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        TimeElapsedColumn(table_column=Column(no_wrap=True)),
-        TimeRemainingColumn(compact=True, table_column=Column(no_wrap=True)),
-        TextColumn("left", table_column=Column(no_wrap=True)),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(compact=True),
+        "left",
         TextColumn("{task.fields[note]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
     )
     progress = Progress(*columns, console=console, refresh_per_second=4, expand=True)
@@ -101,7 +101,7 @@ def progress_bar(label: str) -> Iterator[Report]:
 
 
 def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> Report:
-    """Return a progress callback that prints lines: at each stage, once a minute, and at the end.
+    """Return a progress callback that prints lines: at the start, once a minute, and at the end.
 
     Args:
         label: What is being done, in a word or two.
@@ -110,24 +110,20 @@ def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> R
     Returns:
         A callback `report(done, total, note)`.
     """
-    stage, stages_ended, shown_s, start = None, set[str](), 0.0, (0.0, 0)
+    start: tuple[float, int] | None = None
+    shown_s, is_ended = 0.0, False
 
     def report(done: int, total: int, note: str) -> None:
-        nonlocal stage, shown_s, start
-        now_s, before = clock(), stage
-        word = note.partition(" ")[0].rstrip(":,")
-        stage = word if any(map(str.isalpha, word)) else ""
-        if stage != before:
+        nonlocal start, shown_s, is_ended
+        now_s, was_ended, is_ended = clock(), is_ended, done == total
+        if start is None:
             start = now_s, done
-        is_end = done == total and stage not in stages_ended
-        if stage != before or is_end or now_s - shown_s >= LINE_S:
-            shown_s = now_s
-            if done == total:
-                stages_ended.add(stage)
-            seconds, new = now_s - start[0], done - start[1]
-            left = f", {timedelta(seconds=round(seconds / new * (total - done)))} left" if new > 0 else ""
-            text = f"{label}: {done:,} of {total:,}{left}{f'; {note}' if note else ''}"
-            print(text, file=sys.stderr, flush=True)
+        elif now_s - shown_s < LINE_S and (was_ended or not is_ended):
+            return
+        shown_s, seconds, new = now_s, now_s - start[0], done - start[1]
+        left = f", {timedelta(seconds=round(seconds / new * (total - done)))} left" if new > 0 else ""
+        text = f"{label}: {done:,} of {total:,}{left}{f'; {note}' if note else ''}"
+        print(text, file=sys.stderr, flush=True)
 
     return report
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from openvima.cli.options import name_options, parse_config, setting_names
+from openvima.cli.options import parse_config
 from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 
@@ -161,10 +161,8 @@ class _Lines(logging.Handler):
     """Writes to what stderr is now: above the progress bar, while one is shown."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        from openvima.training import TrainingConfig
-
         prefix = "openvima: warning: " if record.levelno >= logging.WARNING else ""
-        print(prefix + name_options(record.getMessage(), setting_names(TrainingConfig)), file=sys.stderr)
+        print(prefix + record.getMessage(), file=sys.stderr)
 
 
 def _num_processes(config: "TrainingConfig") -> int:

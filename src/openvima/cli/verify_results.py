@@ -1,22 +1,19 @@
 """`openvima verify-results`: confirm an evaluation from its recorded actions."""
 
 import json
-from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from openvima.cli.options import Folder, Json
 from openvima.cli.terminal import progress_bar
 
 MAX_SHOWN = 20
 
 
 def main(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    folder: Folder,
     *,
     workers: int = 1,
     assets: str | None = None,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: Json = False,
 ) -> int:
     """Confirm every outcome of an evaluation without its policy.
 

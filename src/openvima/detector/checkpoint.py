@@ -1,29 +1,23 @@
 """Checkpoints of detectors: folders with `model.safetensors` and `config.yaml`, and files of Detectron2.
 
 Those of Detectron2 are Mask R-CNNs with ResNet-50 and FPN, such as VIMA's detector. Only tensors and plain
-values are read; nothing in the file is executed. Detectron2's config under "cfg" decides preprocessing and
-thresholds where the file contains it. Defaults are Detectron2's: BGR, shorter side 800 pixels.
+values are read; nothing in the file is executed. Preprocessing and thresholds are Detectron2's defaults: BGR,
+shorter side 800 pixels.
 """
 
 import re
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from reprlib import repr as short
-from typing import Any
 
-import numpy as np
 import torch
 import yaml
 
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
-from openvima.detector.config import DetectorConfig, resnet50
-from openvima.detector.layers import BOX_WEIGHTS, PROPOSAL_WEIGHTS
+from openvima.detector.config import RESNET50, DetectorConfig
 from openvima.detector.network import MaskRCNN
 from openvima.errors import ConfigError, InputFileError
-from openvima.policies.config_fields import check_limits
 from openvima.policies.naming import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
 from openvima.policies.nn.layers import MetaInit
 from openvima.policies.tensor_files import (
@@ -165,34 +159,6 @@ _OTHERS = (
     (r"roi_heads\.mask_head\.deconv", "mask_head.deconv"),
     (r"roi_heads\.mask_head\.predictor", "mask_head.mask_logits"),
 )
-# Settings of Detectron2 by path, and our fields.
-_SETTINGS = {
-    "INPUT.MIN_SIZE_TEST": "min_size",
-    "INPUT.MAX_SIZE_TEST": "max_size",
-    "INPUT.FORMAT": "channel_order",
-    "MODEL.PIXEL_MEAN": "pixel_mean",
-    "MODEL.PIXEL_STD": "pixel_std",
-    "MODEL.ANCHOR_GENERATOR.SIZES": "anchor_sizes",
-    "MODEL.RPN.PRE_NMS_TOPK_TEST": "rpn_pre_nms_top_n",
-    "MODEL.RPN.POST_NMS_TOPK_TEST": "rpn_post_nms_top_n",
-    "MODEL.RPN.NMS_THRESH": "rpn_nms_iou",
-    "MODEL.ROI_BOX_HEAD.POOLER_SAMPLING_RATIO": "roi_sampling_ratio",
-    "MODEL.ROI_HEADS.SCORE_THRESH_TEST": "score_threshold",
-    "MODEL.ROI_HEADS.NMS_THRESH_TEST": "nms_iou",
-    "TEST.DETECTIONS_PER_IMAGE": "max_detections",
-}
-_STRIDE_FIRST = "MODEL.RESNETS.STRIDE_IN_1X1"
-# Settings with a single supported value.
-_FIXED: dict[str, Any] = {
-    "MODEL.ANCHOR_GENERATOR.ASPECT_RATIOS": [[0.5, 1.0, 2.0]],
-    "MODEL.ANCHOR_GENERATOR.OFFSET": 0.0,
-    "MODEL.FPN.FUSE_TYPE": "sum",
-    "MODEL.RPN.BBOX_REG_WEIGHTS": PROPOSAL_WEIGHTS,
-    "MODEL.ROI_BOX_HEAD.BBOX_REG_WEIGHTS": BOX_WEIGHTS,
-    "MODEL.ROI_BOX_HEAD.POOLER_TYPE": "ROIAlignV2",
-    "MODEL.ROI_MASK_HEAD.POOLER_TYPE": "ROIAlignV2",
-}
-_CLASSES_OF_SETTINGS = ("detectron2.config.config", "fvcore.common.config", "yacs.config")
 # Constants that follow from our config, and counters without effect.
 _IGNORED = re.compile(r"pixel_(mean|std)|.*anchor_generator\..*|.*num_batches_tracked")
 
@@ -207,46 +173,33 @@ def load_detectron2(file: str | Path) -> MaskRCNN:
         The network in float32, in evaluation mode.
 
     Raises:
-        InputFileError: The file is missing, damaged or no checkpoint, it contains code, or its weights or
-            settings belong to another architecture.
+        InputFileError: The file is missing, damaged or no checkpoint, it contains code, or its weights belong
+            to another architecture.
     """
     file = Path(file)
-    values = _values_in(file)
-    weights, settings = _weights_in(values, file), values.get("cfg")
-    try:
-        config = detectron2_config(weights, settings if isinstance(settings, Mapping) else None)
-        check_limits(config, "detector")
-    except (TypeError, ValueError, LookupError, RuntimeError) as error:  # settings may be anything
-        raise InputFileError(f"{file} contains invalid settings: {error}") from error
+    weights = _weights_in(file)
     tensors = from_detectron2(weights)
     check_finite(tensors, file)
-    return build_network(config, tensors, source=file)
+    return build_network(detectron2_config(weights), tensors, source=file)
 
 
-def detectron2_config(
-    weights: Mapping[str, torch.Tensor],
-    settings: Mapping[str, Any] | None = None,
-) -> DetectorConfig:
+def detectron2_config(weights: Mapping[str, torch.Tensor]) -> DetectorConfig:
     """Return the config that matches these weights: ResNet-50 with their number of classes.
 
     Args:
         weights: Detectron2's state dict; `pixel_mean` and `pixel_std` are used if present.
-        settings: Detectron2's nested config; missing values have Detectron2's defaults.
 
     Raises:
-        InputFileError: The weights are not a Mask R-CNN's, or a setting is not supported.
+        InputFileError: The weights are not a Mask R-CNN's.
     """
     if _CLASS_WEIGHTS not in weights:
         raise InputFileError(f"there are no weights {_CLASS_WEIGHTS}; a Mask R-CNN of Detectron2 has them.")
-    config = replace(
-        resnet50(), num_classes=len(weights[_CLASS_WEIGHTS]) - 1, **_translate_settings(settings or {})
-    )
     stored = {
-        name: tuple(float(value) for value in weights[name].flatten())
+        name: tuple(weights[name].flatten().tolist())
         for name in ("pixel_mean", "pixel_std")
         if name in weights
     }
-    return replace(config, **stored)  # type: ignore[arg-type]  # three numbers each
+    return replace(RESNET50, num_classes=len(weights[_CLASS_WEIGHTS]) - 1, **stored)
 
 
 def from_detectron2(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -256,44 +209,6 @@ def from_detectron2(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tens
         for name, tensor in weights.items()
         if not _IGNORED.fullmatch(name)
     }
-
-
-def _translate_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Translate Detectron2's settings to fields of `DetectorConfig`."""
-    for path, expected in _FIXED.items():
-        value = _setting(settings, path)
-        if value is not None and _as_list(value) != _as_list(expected):
-            raise InputFileError(f"{path} is {short(value)}; only {expected!r} is supported.")
-    chosen = {
-        own: value for path, own in _SETTINGS.items() if (value := _setting(settings, path)) is not None
-    }
-    for name in ("pixel_mean", "pixel_std"):
-        if name in chosen:
-            chosen[name] = tuple(float(number) for number in chosen[name])
-    if "anchor_sizes" in chosen:
-        if any(len(sizes) != 1 for sizes in chosen["anchor_sizes"]):
-            raise InputFileError(
-                f"anchors have sizes {short(chosen['anchor_sizes'])}; only one per level is supported."
-            )
-        chosen["anchor_sizes"] = tuple(float(sizes[0]) for sizes in chosen["anchor_sizes"])
-    if "channel_order" in chosen:
-        chosen["channel_order"] = str(chosen["channel_order"]).lower()
-    if "min_size" in chosen:
-        chosen["min_size"] = chosen["min_size"] or None  # 0 disables resizing
-    if (stride_in_1x1 := _setting(settings, _STRIDE_FIRST)) is not None:
-        chosen["backbone"] = replace(resnet50().backbone, stride_in_1x1=stride_in_1x1)
-    return chosen
-
-
-def _setting(settings: Mapping[str, Any], path: str) -> Any:
-    value: Any = settings
-    for name in path.split("."):
-        value = value.get(name) if isinstance(value, Mapping) else None
-    return value
-
-
-def _as_list(value: Any) -> Any:
-    return [_as_list(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def _translate_name(name: str) -> str:
@@ -310,34 +225,17 @@ def _translate_name(name: str) -> str:
     return name
 
 
-def _class_of_settings(module: str) -> type:
-    """A stand-in for Detectron2's config class of a module, which torch unpickles as a plain mapping."""
-    return type("CfgNode", (), {"__module__": module, "__new__": lambda cls: OrderedDict()})
-
-
-def _values_in(file: Path) -> Mapping[str, Any]:
+def _weights_in(file: Path) -> dict[str, torch.Tensor]:
     if not file.exists():
         raise InputFileError(f"there is no file {file}.")
     try:
-        values = read_archive(file, classes=[*map(_class_of_settings, _CLASSES_OF_SETTINGS)])
+        values = read_archive(file)
     except InputFileError as error:
         raise InputFileError(
             f"{error} Nothing in it was executed. Give a .pth file of torch; of a training checkpoint, save "
             'only the entry "model".'
         ) from error
-    if not isinstance(values, Mapping):
-        raise InputFileError(f"{file} contains a {type(values).__name__} instead of weights by name.")
-    return values
-
-
-def _weights_in(values: Mapping[str, Any], file: Path) -> dict[str, torch.Tensor]:
-    values = values.get("model", {name: value for name, value in values.items() if name != "cfg"})
-    if not isinstance(values, Mapping) or not values:
-        raise InputFileError(f"{file} contains no weights by name.")
-    tensors = {
-        str(name): torch.from_numpy(value) if isinstance(value, np.ndarray) else value
-        for name, value in values.items()
-    }
-    if others := [name for name, value in tensors.items() if not isinstance(value, torch.Tensor)]:
-        raise InputFileError(f"{file} contains more than weights: {', '.join(others[:5])}.")
-    return tensors
+    values = values.get("model", values) if isinstance(values, Mapping) else values
+    if not isinstance(values, Mapping) or not all(isinstance(each, torch.Tensor) for each in values.values()):
+        raise InputFileError(f"{file} contains no weights by name, or more than these.")
+    return {str(name): tensor for name, tensor in values.items()}

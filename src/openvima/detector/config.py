@@ -1,6 +1,7 @@
 """Sizes of a detector, as a frozen dataclass that validates itself."""
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -113,7 +114,7 @@ class DetectorConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested dictionaries of plain values."""
-        return _plain(asdict(self))
+        return json.loads(json.dumps(asdict(self)))  # tuples become lists
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> "DetectorConfig":
@@ -125,19 +126,19 @@ class DetectorConfig:
         return build_config(DetectorConfig, values, "detector")
 
 
-def small() -> DetectorConfig:
-    """0.57 M parameters, for frames of 128 × 256 pixels; trains from scratch within an hour on two cores."""
-    backbone = BackboneConfig(
+# 0.57 M parameters, for frames of 128 × 256 pixels; trains from scratch within an hour on two cores.
+# Half of the objects are 22 to 25 pixels high and 24 to 26 wide. With these anchors 13 per object have an IoU
+# of 0.5; with sizes 16, 32 and 64 it was 5.5.
+SMALL = DetectorConfig(
+    BackboneConfig(
         block="basic", depths=(1, 1, 1), widths=(32, 64, 128), stem_width=16, stem_kernel=5, fpn_width=32
-    )
-    # Half of the objects are 22 to 25 pixels high and 24 to 26 wide. With these sizes 13 anchors per object
-    # have an IoU of 0.5; with 16, 32 and 64 it was 5.5.
-    return DetectorConfig(backbone, anchor_sizes=(20.0, 28.0, 60.0), mask_head_widths=(32, 32))
-
-
-def resnet50() -> DetectorConfig:
-    """44 M parameters: ResNet-50 with FPN, in the default configuration of Detectron2."""
-    backbone = BackboneConfig(
+    ),
+    anchor_sizes=(20.0, 28.0, 60.0),
+    mask_head_widths=(32, 32),
+)
+# 44 M parameters: ResNet-50 with FPN, in the default configuration of Detectron2.
+RESNET50 = DetectorConfig(
+    BackboneConfig(
         block="bottleneck",
         depths=(3, 4, 6, 3),
         widths=(256, 512, 1024, 2048),
@@ -147,26 +148,22 @@ def resnet50() -> DetectorConfig:
         extra_level=True,
         frozen_batch_norm=True,
         stride_in_1x1=True,
-    )
-    return DetectorConfig(
-        backbone,
-        anchor_sizes=(32.0, 64.0, 128.0, 256.0, 512.0),
-        rpn_foreground_iou=0.7,
-        min_size=800,
-        channel_order="bgr",
-        pixel_mean=(103.53, 116.28, 123.675),
-        pixel_std=(1.0, 1.0, 1.0),
-        rpn_pre_nms_top_n=1000,
-        rpn_post_nms_top_n=1000,
-        canonical_size=224.0,
-        canonical_level=2,
-        roi_sampling_ratio=0,
-        box_head_widths=(1024, 1024),
-        mask_head_widths=(256, 256, 256, 256),
-    )
-
-
-DETECTORS: dict[str, Callable[[], DetectorConfig]] = {"small": small, "resnet50": resnet50}
+    ),
+    anchor_sizes=(32.0, 64.0, 128.0, 256.0, 512.0),
+    rpn_foreground_iou=0.7,
+    min_size=800,
+    channel_order="bgr",
+    pixel_mean=(103.53, 116.28, 123.675),
+    pixel_std=(1.0, 1.0, 1.0),
+    rpn_pre_nms_top_n=1000,
+    rpn_post_nms_top_n=1000,
+    canonical_size=224.0,
+    canonical_level=2,
+    roi_sampling_ratio=0,
+    box_head_widths=(1024, 1024),
+    mask_head_widths=(256, 256, 256, 256),
+)
+DETECTORS = {"small": SMALL, "resnet50": RESNET50}
 
 
 def detector_config(name: str) -> DetectorConfig:
@@ -177,10 +174,4 @@ def detector_config(name: str) -> DetectorConfig:
     """
     if name not in DETECTORS:
         raise ConfigError(unknown_name("detector", name, DETECTORS))
-    return DETECTORS[name]()
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    return list(value) if isinstance(value, tuple) else value
+    return DETECTORS[name]

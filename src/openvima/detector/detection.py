@@ -142,8 +142,8 @@ class Detections:
         found = Detections(np.zeros((len(masks), 4), np.int64), masks, scores)
         large = np.count_nonzero(masks, axis=(1, 2)) >= MIN_PIXELS
         for number in np.flatnonzero(large):
-            rows, columns = np.nonzero(masks[number])
-            found.boxes[number] = columns.min(), rows.min(), columns.max(), rows.max()
+            rows, columns = (np.flatnonzero(masks[number].any(axis=axis)) for axis in (1, 0))
+            found.boxes[number] = columns[0], rows[0], columns[-1], rows[-1]
         return found.select(large)
 
 

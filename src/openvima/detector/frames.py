@@ -8,8 +8,8 @@ import numpy as np
 from openvima.data.reader import Dataset
 from openvima.data.rerender import with_random_appearance
 from openvima.data.schema import VIEWS
+from openvima.detector.detection import Detections
 from openvima.errors import DatasetError
-from openvima.perception.objects import MIN_PIXELS
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
 
 _NUM_IDS = 256
@@ -45,12 +45,9 @@ def frame_of(rgb: np.ndarray, segm: np.ndarray, ids: Sequence[int] | np.ndarray)
 
 def frame_of_masks(rgb: np.ndarray, masks: np.ndarray) -> Frame:
     """Annotate an image from masks, shape (N, H, W), bool; too small ones are dropped."""
-    masks = masks[np.count_nonzero(masks, axis=(1, 2)) >= MIN_PIXELS]
-    boxes = np.zeros((len(masks), 4), np.float32)
-    for index, mask in enumerate(masks):
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        boxes[index] = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
-    return Frame(rgb, boxes, masks)
+    found = Detections.from_masks(masks)
+    assert found.masks is not None  # as given
+    return Frame(rgb, (found.boxes + np.array([0, 0, 1, 1])).astype(np.float32), found.masks)
 
 
 class FrameSampler:

@@ -26,7 +26,6 @@ from openvima.detector.layers import (
     mask_loss,
 )
 from openvima.detector.roi_align import paste_masks, pyramid_align
-from openvima.errors import ShapeError
 from openvima.policies.base import usable_device
 from openvima.policies.nn.layers import TensorRecord
 
@@ -113,20 +112,19 @@ class MaskRCNN(nn.Module):
         true_boxes = [own.boxes.to(inputs.dtype) * scale for own in targets]
         losses = self.rpn.losses(predictions, true_boxes, generator)
         proposals = self.rpn.propose(predictions, height=height, width=width)
-        samples = [
+        samples = (
             _sample_proposals(torch.cat([boxes, own]), own, sampled=sampled, generator=generator)
             for boxes, own in zip(proposals, true_boxes, strict=True)
-        ]
-        # Foreground proposals come first, image after image; then the background.
-        boxes = torch.cat([s.foreground for s in samples] + [s.background for s in samples])
-        counts = [len(s.foreground) for s in samples] + [len(s.background) for s in samples]
-        indices = (
-            torch.arange(len(samples)).repeat(2).repeat_interleave(torch.tensor(counts)).to(boxes.device)
         )
+        foregrounds, backgrounds, matches = zip(*samples, strict=True)
+        # Foreground proposals come first, image after image; then the background.
+        boxes = torch.cat([*foregrounds, *backgrounds])
+        counts = torch.tensor([len(each) for each in (*foregrounds, *backgrounds)])
+        indices = torch.arange(len(targets)).repeat(2).repeat_interleave(counts).to(boxes.device)
         logits, deltas = self.box_head(self._pool(levels, boxes, indices, self.config.box_pool_size))
-        matched = torch.cat([own[s.matches] for own, s in zip(true_boxes, samples, strict=True)])
+        matched = torch.cat([own[rows] for own, rows in zip(true_boxes, matches, strict=True)])
         losses |= box_losses(logits, deltas, proposals=boxes, boxes=matched)
-        masks = torch.cat([own.masks[s.matches] for own, s in zip(targets, samples, strict=True)])
+        masks = torch.cat([own.masks[rows] for own, rows in zip(targets, matches, strict=True)])
         foreground = boxes[: len(matched)]
         pooled = self._pool(levels, foreground, indices[: len(matched)], self.config.mask_pool_size)
         losses["mask"] = mask_loss(self.mask_head(pooled), proposals=foreground / scale, masks=masks)
@@ -202,23 +200,15 @@ def resized_shape(config: DetectorConfig, height: int, width: int) -> tuple[int,
     return math.floor(height * scale + 0.5), math.floor(width * scale + 0.5)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _SampledProposals:
-    """Sampled proposals of one image; `matches` are the indices of the foreground boxes' objects."""
-
-    foreground: torch.Tensor
-    background: torch.Tensor
-    matches: torch.Tensor
-
-
 def _sample_proposals(
     proposals: torch.Tensor, objects: torch.Tensor, *, sampled: int, generator: torch.Generator
-) -> _SampledProposals:
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Sample proposals of one image: foreground, background, and indices of the foreground's objects."""
     indices, labels = match(proposals, objects, low=FOREGROUND_IOU, high=FOREGROUND_IOU)
     foreground, background = subsample(
         labels, count=sampled, positive_fraction=POSITIVE_FRACTION, generator=generator
     )
-    return _SampledProposals(proposals[foreground], proposals[background], indices[foreground])
+    return proposals[foreground], proposals[background], indices[foreground]
 
 
 class FrameDetector:
@@ -247,9 +237,6 @@ class FrameDetector:
         Args:
             rgb: Shape (3, H, W), uint8.
             view: "front" or "top"; not used.
-
-        Raises:
-            ShapeError: The image has another shape or dtype.
         """
         return self.detect_batch([rgb])[0]
 
@@ -260,15 +247,7 @@ class FrameDetector:
         Args:
             frames: Shape (3, H, W), uint8, each. Detections are the same, bit by bit, whatever the even
                 number of images; those in a single image differ by rounding.
-
-        Raises:
-            ShapeError: An image has another shape or dtype.
         """
-        for rgb in frames:
-            if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3:
-                raise ShapeError(
-                    f"the image is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W)."
-                )
         images = torch.from_numpy(np.stack(frames)).to(self.device)
         # Networks that enlarge their images have large features.
         size = len(images) if self.network.config.min_size is None else 1

@@ -8,11 +8,11 @@ FILE.py:FUNCTION               the same, from a Python file
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 from openvima.data.chat_settings import SEGMENTATION
 from openvima.data.object_cache import Boxes, ObjectCache, open_object_cache
@@ -20,7 +20,6 @@ from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.detector.detection import MATCHING_VERSION, DetectedObjects
 from openvima.errors import ConfigError
-from openvima.multiprocess import Report
 from openvima.perception.objects import (
     GROUND_TRUTH,
     AheadExtractor,
@@ -31,7 +30,7 @@ from openvima.perception.objects import (
 from openvima.policies.base import torch_threads
 from openvima.policies.naming import WEIGHTS_FILE, checkpoint_folder
 from openvima.scene import PromptImage
-from openvima.user_code import call_function, is_code, load_function, source_hash
+from openvima.user_code import call_function, is_code, source_hash
 
 DETECTOR = "detector"
 _FORM = (
@@ -41,38 +40,24 @@ _FORM = (
 _DIGEST_BYTES = 5  # in cache folder names
 
 
-def extractor_maker(source: str) -> Callable[[], object]:
-    """Return the function that makes an extractor.
+def plugged_extractor(source: str) -> ObjectExtractor:
+    """Make an extractor that tolerates observations without detections.
 
     Args:
         source: One of the forms above.
 
     Raises:
-        ConfigError: There is no such module, file or function.
-        InputFileError: There is no trained detector.
-    """
-    folder = _folder_of(source)
-    if folder is not None:
-        return partial(load_extractor, folder)
-    if not is_code(source):
-        raise ConfigError(f"boxes is {source!r}; give {_FORM}.")
-    load_function(source, what="boxes")
-    return partial(call_function, source, what="boxes")
-
-
-def plugged_extractor(source: str) -> ObjectExtractor:
-    """Make an extractor that tolerates observations without detections.
-
-    Raises:
-        ConfigError: There is no such function, or it returns something else.
+        ConfigError: There is no such module, file or function, or the function returns something else.
         InputFileError: There is no trained detector, or it is damaged.
     """
-    extractor = extractor_maker(source)()
+    if (folder := _folder_of(source)) is not None:
+        return PluggedExtractor(load_extractor(folder))
+    extractor = call_function(source, what="boxes")
     if not (hasattr(extractor, "in_observation") and hasattr(extractor, "in_prompt_image")):
         raise ConfigError(
             f"{source} returned a {type(extractor).__name__}; it must return an ObjectExtractor."
         )
-    return PluggedExtractor(cast(ObjectExtractor, extractor))  # it has both methods
+    return PluggedExtractor(extractor)
 
 
 def chat_extractor(boxes: str) -> ObjectExtractor | None:
@@ -104,21 +89,12 @@ def plugged_boxes(source: str, *, fraction: float = 1.0) -> Boxes:
         values = [sizes, least, MATCHING_VERSION, weights]
         name, content = DETECTOR, json.dumps(values, sort_keys=True).encode()
     else:
-        extractor_maker(source)  # says which forms are allowed
         name, content = source.rpartition(":")[2], source_hash(source, what="boxes").encode()
     digest = hashlib.blake2b(content, digest_size=_DIGEST_BYTES).hexdigest()
     return Boxes(f"{name}-{digest}", partial(plugged_extractor, source), fraction)
 
 
-def detected_object_cache(
-    dataset: Dataset,
-    boxes: Boxes,
-    *,
-    folder: Path | None = None,
-    workers: int = 1,
-    report: Report | None = None,
-    timeout_s: float = 0.0,
-) -> ObjectCache:
+def detected_object_cache(dataset: Dataset, boxes: Boxes, **options: Any) -> ObjectCache:
     """Open the object cache of a detector and fill in missing files.
 
     The detector computes on one thread, so that the files do not depend on the number of workers.
@@ -126,21 +102,15 @@ def detected_object_cache(
     Args:
         dataset: The demonstrations.
         boxes: The detector, from `plugged_boxes`.
-        folder: As in `open_object_cache`.
-        workers: As in `open_object_cache`.
-        report: As in `open_object_cache`.
-        timeout_s: As in `open_object_cache`.
+        **options: Others of `open_object_cache`.
 
     Raises:
         ConfigError: The detector returns something else than objects.
         DatasetError: The folder is not writable.
         FolderLockedError: Another process writes the cache.
     """
-    say = report and (lambda done, total, note: report(done, total, "detecting objects"))
     with torch_threads(1):
-        return open_object_cache(
-            dataset, folder=folder, boxes=boxes, workers=workers, report=say, timeout_s=timeout_s
-        )
+        return open_object_cache(dataset, boxes=boxes, **options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +146,15 @@ def _visible(found: ObjectViews) -> ObjectViews:
 
 
 def _folder_of(source: str) -> Path | None:
-    """The folder of a trained detector; None for other forms."""
+    """The folder of a trained detector; None for a function.
+
+    Raises:
+        ConfigError: The source has none of the forms.
+        InputFileError: There is no such folder.
+    """
     name, _, folder = source.partition("=")
-    return detector_folder(folder or None) if name == DETECTOR else None
+    if name == DETECTOR:
+        return detector_folder(folder or None)
+    if not is_code(source):
+        raise ConfigError(f"boxes is {source!r}; give {_FORM}.")
+    return None

@@ -15,35 +15,6 @@ from openvima.detector.boxes import box_area
 from openvima.detector.kernels import align, paste
 
 
-def is_cpu_inference(tensor: torch.Tensor) -> bool:
-    """Return whether these layers compute with a tensor: it is in main memory, and needs no gradients."""
-    return tensor.device.type == "cpu" and not torch.is_grad_enabled()
-
-
-def align_levels(
-    levels: Sequence[torch.Tensor],
-    boxes: torch.Tensor,
-    images: torch.Tensor,
-    indices: torch.Tensor,
-    *,
-    size: int,
-    sampling_ratio: int,
-    first_stride: int,
-) -> torch.Tensor:
-    """Apply RoIAlign as `pyramid_align` does; `indices` (R,) are the levels of the boxes."""
-    pooled = torch.empty(len(boxes), levels[0].shape[1], size, size, dtype=levels[0].dtype)
-    arrays = boxes.numpy(), images.numpy(), indices.numpy()
-    for level, features in enumerate(levels):
-        stride = first_stride * 2**level
-        align(_channels_last(features), *arrays, level, stride, sampling_ratio, pooled.numpy())
-    return pooled
-
-
-def _channels_last(x: torch.Tensor) -> np.ndarray:
-    """Map (B, C, H, W) to (B, H, W, C)."""
-    return x.permute(0, 2, 3, 1).contiguous().numpy()
-
-
 def roi_align(
     features: torch.Tensor,
     boxes: torch.Tensor,
@@ -112,19 +83,21 @@ def pyramid_align(
         Shape (R, C, size, size).
     """
     indices = box_levels(boxes, len(levels), canonical_size=canonical_size, canonical_level=canonical_level)
-    if is_cpu_inference(boxes):
-        sizes = {"size": size, "sampling_ratio": sampling_ratio, "first_stride": first_stride}
-        return align_levels(levels, boxes, images, indices, **sizes)
     result = levels[0].new_zeros(len(boxes), levels[0].shape[1], size, size)
+    is_cpu_inference = boxes.device.type == "cpu" and not torch.is_grad_enabled()
     for level, features in enumerate(levels):
-        chosen = (indices == level).nonzero()[:, 0]
-        if len(chosen):
+        stride, chosen = first_stride * 2**level, (indices == level).nonzero()[:, 0]
+        if is_cpu_inference:
+            arrays = (each.numpy() for each in (boxes, images, indices))
+            pixels = features.permute(0, 2, 3, 1).contiguous().numpy()
+            align(pixels, *arrays, level, stride, sampling_ratio, result.numpy())
+        elif len(chosen):
             pooled = roi_align(
                 features,
                 boxes[chosen],
                 images[chosen],
                 size=size,
-                stride=first_stride * 2**level,
+                stride=stride,
                 sampling_ratio=sampling_ratio,
             )
             result = result.index_put((chosen,), pooled)

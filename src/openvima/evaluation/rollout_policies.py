@@ -296,7 +296,7 @@ def one_thread(batch: Batch) -> Iterator[None]:
 
 
 def load_own_rollout_policy(
-    source: str, *, boxes: str = "", trust_code: bool = False, temperature: float = 0.0, **options: Any
+    source: str, *, boxes: str = "", trust_code: bool = False, **options: Any
 ) -> RolloutPolicy:
     """Load a policy that nobody else has a reference to, with episodes of its own.
 
@@ -304,8 +304,6 @@ def load_own_rollout_policy(
         source: As for `openvima evaluate --policy`.
         boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
         trust_code: Run the code that a run folder names.
-        temperature: 0 for greedy decoding. Above 0 actions of networks are sampled, with logits divided by
-            it.
         **options: `device`, `precision` and `vlm`, as in `Batch`.
 
     Raises:
@@ -314,11 +312,6 @@ def load_own_rollout_policy(
     PolicySource(source, source, trust_code).check()
     if source == ORACLE:
         return OracleRolloutPolicy()
-    if temperature and PolicyRef.parse(source).kind not in (RANDOM, "remote", "code", "vlm"):
-        require_torch(f"policy {source!r}")
-        import torch
-
-        options |= {"temperature": temperature, "generator": torch.Generator().manual_seed(0)}
     return _rollout_policy(build_policy(source, boxes=boxes, trust_code=trust_code, **options), "", source)
 
 

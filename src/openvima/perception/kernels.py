@@ -37,20 +37,6 @@ def object_extents(segm, extents, num_pixels):
 
 
 @njit
-def square_crop(rgb, xmin, xmax, ymin, ymax, square):
-    """Copy the inclusive box into `square` (3, S, S), which is zero, with the shorter side centred."""
-    width = xmax - xmin + 1
-    height = ymax - ymin + 1
-    size = max(width, height)
-    left = (size - width) // 2
-    top = (size - height) // 2
-    for channel in range(3):
-        for row in range(height):
-            for column in range(width):
-                square[channel, top + row, left + column] = rgb[channel, ymin + row, xmin + column]
-
-
-@njit
 def halve_frame(frame, half):
     """Average 2 × 2 pixels of `frame` (3, 2 H, 2 W) into `half` (3, H, W), halves rounded up."""
     for channel in range(half.shape[0]):
@@ -70,10 +56,7 @@ def resize_square(square, size, scratch, crop):
     `scratch` is float64 of shape (32, size) at least.
     """
     if size == CROP_SIZE:
-        for channel in range(3):
-            for row in range(CROP_SIZE):
-                for column in range(CROP_SIZE):
-                    crop[channel, row, column] = square[channel, row, column]
+        crop[:] = square[:, :size, :size]
     elif size == 2 * CROP_SIZE:
         halve_frame(square, crop)
     elif size > CROP_SIZE:

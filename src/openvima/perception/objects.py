@@ -18,7 +18,6 @@ from openvima.perception.kernels import (
     most_interior_pixel,
     object_extents,
     resize_square,
-    square_crop,
 )
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import BACKGROUND_ID, END_EFFECTORS, FIRST_OBJECT_ID, PromptImage
@@ -27,6 +26,7 @@ MAX_OBJECTS = 64  # of an image; the hardest scenes of the benchmark have 9
 MIN_PIXELS = 2  # an object that shows fewer pixels in a view counts as hidden there
 FRONT, TOP = VIEWS.index("front"), VIEWS.index("top")
 _NUM_IDS = 256  # of a segmentation
+_BY_VIEW = ("crops", "boxes", "masks", "grasps")  # of objects, with an axis for the view
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,26 +52,15 @@ class ObjectViews:
 
     def select(self, slots: np.ndarray) -> "ObjectViews":
         """Return the objects of the given slots (indices or booleans), in that order."""
-        return ObjectViews(
-            self.ids[slots],
-            self.crops[:, slots],
-            self.boxes[:, slots],
-            self.masks[:, slots],
-            self.grasps[:, slots],
-        )
+        return ObjectViews(self.ids[slots], *(getattr(self, name)[:, slots] for name in _BY_VIEW))
 
     @staticmethod
     def concatenate(images: Sequence["ObjectViews"]) -> "ObjectViews":
         """Put the objects of several images into one record, image after image."""
         if not images:
             return make_hidden_objects()
-        return ObjectViews(
-            np.concatenate([image.ids for image in images]),
-            np.concatenate([image.crops for image in images], axis=1),
-            np.concatenate([image.boxes for image in images], axis=1),
-            np.concatenate([image.masks for image in images], axis=1),
-            np.concatenate([image.grasps for image in images], axis=1),
-        )
+        by_view = (np.concatenate([getattr(each, name) for each in images], axis=1) for name in _BY_VIEW)
+        return ObjectViews(np.concatenate([each.ids for each in images]), *by_view)
 
     def visible(self) -> np.ndarray:
         """Whether each object shows in some view, shape (N,), bool."""
@@ -185,8 +174,8 @@ def extract_objects(
     """Cut the given objects out of the images of both views.
 
     Args:
-        rgb: View name to image, shape (3, H, W), uint8.
-        segm: View name to object ids, shape (H, W), uint8.
+        rgb: View name to image, shape (3, 128, 256), uint8.
+        segm: View name to object ids, shape (128, 256), uint8.
         object_ids: Which segmentation values are objects, in the order of the slots.
 
     Returns:
@@ -201,7 +190,7 @@ def extract_objects(
         raise PolicyError(
             f"object ids are {echo(str(ids.tolist()))}; they must lie in 0 … 255, as segmentations do."
         )
-    return _cut_out(_measure(rgb, segm), ids)
+    return _cut_out(_measure(camera_frames(rgb, "rgb"), segm), ids)
 
 
 def observe(observation: Mapping) -> ObjectViews:
@@ -281,10 +270,9 @@ def camera_frames(rgb: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndar
     """
     frames = by_view(rgb, what)
     for view in VIEWS:
-        shape = _check_rgb(view, frames[view]).shape
-        expected = (3, CAMERAS[view].height, CAMERAS[view].width)
-        if shape != expected:
-            raise ShapeError(f"rgb {view!r} has shape {shape}; it must be {expected}, to measure boxes in.")
+        frame, expected = frames[view], (3, CAMERAS[view].height, CAMERAS[view].width)
+        if frame.dtype != np.uint8 or frame.shape != expected:
+            raise ShapeError(f"rgb {view!r} is {frame.dtype} {frame.shape}; it must be uint8 {expected}.")
     return frames
 
 
@@ -313,11 +301,13 @@ def crop_box(rgb: np.ndarray, extent: Sequence[int]) -> tuple[np.ndarray, np.nda
         The crop, shape (3, 32, 32), uint8, and the box, shape (4,), int64.
     """
     xmin, xmax, ymin, ymax = extent
-    size = max(xmax - xmin, ymax - ymin) + 1
+    width, height = xmax - xmin + 1, ymax - ymin + 1
+    size = max(width, height)
+    left, top = (size - width) // 2, (size - height) // 2
     square = np.zeros((3, size, size), np.uint8)
+    square[:, top : top + height, left : left + width] = rgb[:, ymin : ymax + 1, xmin : xmax + 1]
     scratch = np.empty((CROP_SIZE, size))
     crop = np.empty((3, CROP_SIZE, CROP_SIZE), np.uint8)
-    square_crop(rgb, xmin, xmax, ymin, ymax, square)
     resize_square(square, size, scratch, crop)
     return crop, np.array([(xmin + xmax) // 2, (ymin + ymax) // 2, ymax - ymin, xmax - xmin])
 
@@ -332,15 +322,15 @@ class _Measured:
     num_pixels: np.ndarray
 
 
-def _measure(rgb: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray]) -> list[_Measured]:
+def _measure(frames: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray]) -> list[_Measured]:
     views = []
-    frames, segmentations = by_view(rgb, "rgb"), by_view(segm, "segm")
-    for view in VIEWS:
-        frame = _check_rgb(view, frames[view])
-        ids = _check_segm(view, segmentations[view], frame.shape[1:])
+    for view, ids in by_view(segm, "segm").items():
+        shape = frames[view].shape[1:]
+        if ids.dtype != np.uint8 or ids.shape != shape:
+            raise ShapeError(f"segm {view!r} is {ids.dtype} {ids.shape}; it must be uint8 {shape}.")
         extents, num_pixels = np.empty((_NUM_IDS, 4), np.int64), np.empty(_NUM_IDS, np.int64)
         object_extents(ids, extents, num_pixels)
-        views.append(_Measured(frame, ids, extents, num_pixels))
+        views.append(_Measured(frames[view], ids, extents, num_pixels))
     return views
 
 
@@ -373,15 +363,3 @@ def interior_pixel(segm: np.ndarray, extent: np.ndarray, *, value: int) -> np.nd
     pixel = np.empty(2, np.int64)
     most_interior_pixel(segm, value, extent, distance, pixel)
     return pixel
-
-
-def _check_rgb(view: str, rgb: np.ndarray) -> np.ndarray:
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3:
-        raise ShapeError(f"rgb {view!r} is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W).")
-    return rgb
-
-
-def _check_segm(view: str, segm: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    if segm.dtype != np.uint8 or segm.shape != shape:
-        raise ShapeError(f"segm {view!r} is {segm.dtype} {segm.shape}; it must be uint8 {shape}.")
-    return segm

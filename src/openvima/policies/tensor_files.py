@@ -33,12 +33,11 @@ def read_safetensors(file: Path) -> dict[str, torch.Tensor]:
     return tensors
 
 
-def read_archive(file: Path, *, classes: Collection[type] = ()) -> Any:
+def read_archive(file: Path) -> Any:
     """Read an archive of tensors and plain values, as `torch.save` writes it.
 
     Args:
         file: The archive.
-        classes: Further classes that it may name, and call without arguments.
 
     Raises:
         OSError: The file cannot be read.
@@ -52,8 +51,7 @@ def read_archive(file: Path, *, classes: Collection[type] = ()) -> Any:
                 if archive.testzip():
                     raise zipfile.BadZipFile
             stream.seek(0)
-            with torch.serialization.safe_globals([*classes]):
-                return torch.load(stream, map_location="cpu", weights_only=True)
+            return torch.load(stream, map_location="cpu", weights_only=True)
         except (InputFileError, MemoryError):
             raise
         except zipfile.BadZipFile:

@@ -41,22 +41,28 @@ def texel_index(u: float, v: float, height: int, width: int) -> tuple[int, int]:
 
 
 @njit
+def _row_times(matrix: np.ndarray, row: int, x: float, y: float, z: float) -> float:
+    """First three entries of a row of a matrix times a vector."""
+    return matrix[row, 0] * x + matrix[row, 1] * y + matrix[row, 2] * z
+
+
+@njit
 def project_vertices(
     vertices: np.ndarray,  # (V, 3) float64, body frame
     pose: np.ndarray,  # (3, 4) float64, world from body
     camera: np.ndarray,  # (4, 4) float64, see Camera.matrix
-    screen: np.ndarray,  # (≥ V, 4) float64, result: X, Y up, depth in micrometres, world z in metres
-) -> None:
-    """Move vertices to their place in the world and onto the image plane."""
+) -> np.ndarray:
+    """Return where vertices are on the image plane, (V, 3) float64: X, Y up, depth in micrometres."""
+    screen = np.empty(vertices.shape)
     focal, half_width, half_height = camera[3, 0], camera[3, 1], camera[3, 2]
     for i in range(vertices.shape[0]):
         vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        x = pose[0, 0] * vx + pose[0, 1] * vy + pose[0, 2] * vz + pose[0, 3]
-        y = pose[1, 0] * vx + pose[1, 1] * vy + pose[1, 2] * vz + pose[1, 3]
-        z = pose[2, 0] * vx + pose[2, 1] * vy + pose[2, 2] * vz + pose[2, 3]
-        right = camera[0, 0] * x + camera[0, 1] * y + camera[0, 2] * z + camera[0, 3]
-        up = camera[1, 0] * x + camera[1, 1] * y + camera[1, 2] * z + camera[1, 3]
-        away = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z
+        x = _row_times(pose, 0, vx, vy, vz) + pose[0, 3]
+        y = _row_times(pose, 1, vx, vy, vz) + pose[1, 3]
+        z = _row_times(pose, 2, vx, vy, vz) + pose[2, 3]
+        right = _row_times(camera, 0, x, y, z) + camera[0, 3]
+        up = _row_times(camera, 1, x, y, z) + camera[1, 3]
+        away = _row_times(camera, 2, x, y, z)
         distance = away + camera[2, 3]
         inverse = 1.0 / distance if distance > 0.0 else math.nan  # NaN fails every comparison: not drawn
         screen[i, 0] = half_width + focal * right * inverse
@@ -64,7 +70,7 @@ def project_vertices(
         # Grows with the distance as −1/distance does, so that it is linear on the screen, yet is as good as a
         # length about the middle of the scene: without the constant of 1000 m its digits suffice.
         screen[i, 2] = MICROMETRES * camera[2, 3] * away * inverse
-        screen[i, 3] = z
+    return screen
 
 
 @njit
@@ -72,14 +78,13 @@ def select_triangles(
     corners: np.ndarray,  # (F, 3) int32, indices into points
     points: np.ndarray,  # (V, ≥ 2) float64: across and upwards; the front of triangles turns left
     min_area: float,  # smaller doubled areas are left out
-    selected: np.ndarray,  # (≥ F + 1) int32, result: indices of the triangles, in order
-) -> int:
-    """List the triangles that show their front and may cover a whole-numbered point; return how many.
+) -> np.ndarray:
+    """Return the indices of triangles that show their front and may cover a whole-numbered point, in order.
 
     Most triangles of a fine mesh do neither. The list is built without branches, which the CPU could not
     predict: that saves a fifth of the time of the largest meshes.
     """
-    count = 0
+    count, selected = 0, np.empty(corners.shape[0] + 1, np.int32)
     for f in range(corners.shape[0]):
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
         ax, ay = points[a, 0], points[a, 1]
@@ -90,7 +95,7 @@ def select_triangles(
         low_y, high_y = _range_of(ay, by, cy)
         selected[count] = f
         count += (area > min_area) & (np.ceil(low_x) <= high_x) & (np.ceil(low_y) <= high_y)
-    return count
+    return selected[:count]
 
 
 @njit
@@ -119,12 +124,9 @@ def draw_triangles(
     camera: np.ndarray,  # (4, 4) float64, see Camera.matrix
     texture: np.ndarray,  # (h, w, 3) uint8
     object_id: int,
-    screen: np.ndarray,  # (≥ V, 4) float64, scratch
-    selected: np.ndarray,  # (≥ F + 1) int32, scratch
     depth: np.ndarray,  # (H, W) float64, micrometres, smaller is nearer
     rgb: np.ndarray,  # (3, H, W) uint8
     segm: np.ndarray,  # (H, W) uint8
-    heights: np.ndarray,  # (H, W) float32, or (0, 0) if not wanted
 ) -> None:
     """Draw one body into one image, over what is there already.
 
@@ -136,9 +138,8 @@ def draw_triangles(
     """
     image_height, image_width = segm.shape
     texture_height, texture_width = texture.shape[0], texture.shape[1]
-    project_vertices(vertices, pose, camera, screen)
-    for k in range(select_triangles(corners, screen, camera[3, 3], selected)):
-        f = selected[k]
+    screen = project_vertices(vertices, pose, camera)
+    for f in select_triangles(corners, screen, camera[3, 3]):
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
         ax, ay = screen[a, 0], screen[a, 1]
         bx, by = screen[b, 0], screen[b, 1]
@@ -184,9 +185,9 @@ def draw_triangles(
                     if length > 0.0:
                         nx, ny, nz = nx / length, ny / length, nz / length
                     intensity = light_intensity(
-                        pose[0, 0] * nx + pose[0, 1] * ny + pose[0, 2] * nz,
-                        pose[1, 0] * nx + pose[1, 1] * ny + pose[1, 2] * nz,
-                        pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz,
+                        _row_times(pose, 0, nx, ny, nz),
+                        _row_times(pose, 1, nx, ny, nz),
+                        _row_times(pose, 2, nx, ny, nz),
                     )
                 u = weight_a * uvs[f, 0, 0] + weight_b * uvs[f, 1, 0] + weight_c * uvs[f, 2, 0]
                 v = weight_a * uvs[f, 0, 1] + weight_b * uvs[f, 1, 1] + weight_c * uvs[f, 2, 1]
@@ -196,10 +197,6 @@ def draw_triangles(
                     rgb[channel, row, column] = np.uint8(min(255.0, lit))
                 depth[row, column] = pixel_depth
                 segm[row, column] = object_id
-                if heights.shape[0] > 0:
-                    heights[row, column] = (
-                        weight_a * screen[a, 3] + weight_b * screen[b, 3] + weight_c * screen[c, 3]
-                    )
 
 
 @njit
@@ -212,8 +209,6 @@ def stamp_triangles(
     origin_y: float,  # y of the centre of row 0, m
     cell: float,  # m
     ceiling: float,  # surfaces at this height or above are left out, m
-    points: np.ndarray,  # (≥ V, 3) float64, scratch: column, row, height
-    selected: np.ndarray,  # (≥ F + 1) int32, scratch
     labels: np.ndarray,  # (rows, columns) int16
     heights: np.ndarray,  # (rows, columns) float32
 ) -> None:
@@ -222,16 +217,14 @@ def stamp_triangles(
     Of equal heights the later one counts. Rows run along y, columns along x.
     """
     num_rows, num_columns = labels.shape
+    points = np.empty(vertices.shape)  # column, row, height
     for i in range(vertices.shape[0]):
         vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        x = pose[0, 0] * vx + pose[0, 1] * vy + pose[0, 2] * vz + pose[0, 3]
-        y = pose[1, 0] * vx + pose[1, 1] * vy + pose[1, 2] * vz + pose[1, 3]
-        points[i, 0] = (x - origin_x) / cell
-        points[i, 1] = (y - origin_y) / cell
-        points[i, 2] = pose[2, 0] * vx + pose[2, 1] * vy + pose[2, 2] * vz + pose[2, 3]
+        points[i, 0] = (_row_times(pose, 0, vx, vy, vz) + pose[0, 3] - origin_x) / cell
+        points[i, 1] = (_row_times(pose, 1, vx, vy, vz) + pose[1, 3] - origin_y) / cell
+        points[i, 2] = _row_times(pose, 2, vx, vy, vz) + pose[2, 3]
 
-    for k in range(select_triangles(corners, points, 0.0, selected)):
-        f = selected[k]
+    for f in select_triangles(corners, points, 0.0):
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
         ax, ay = points[a, 0], points[a, 1]
         bx, by = points[b, 0], points[b, 1]
@@ -309,30 +302,6 @@ def magnify(mesh: TriangleMesh, factor: float) -> TriangleMesh:
     return TriangleMesh(mesh.vertices * factor, mesh.normals, mesh.uvs)
 
 
-class KernelBuffers:
-    """Working memory of the kernels, grown to the largest mesh; not thread-safe."""
-
-    def __init__(self) -> None:
-        self._points = np.empty((0, 4))
-        self._selected = np.empty(0, dtype=np.int32)
-
-    def arrays(self, mesh: IndexedMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return buffers for vertices, (≥ V, 4) float64, and triangle indices, (≥ F + 1,) int32."""
-        if len(mesh.vertices) > len(self._points):
-            self._points = np.empty((len(mesh.vertices), 4))
-        if len(mesh.corners) >= len(self._selected):
-            self._selected = np.empty(len(mesh.corners) + 1, dtype=np.int32)
-        return self._points, self._selected
-
-
 def matrix_3x4(pose: Pose) -> np.ndarray:
     """Return a pose as rotation and translation, shape (3, 4), float64."""
-    x, y, z, w = pose.quaternion
-    px, py, pz = pose.position
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), px],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), py],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), pz],
-        ]
-    )
+    return np.column_stack([pose.matrix(), pose.position])

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.render.kernels import KernelBuffers, index_mesh, matrix_3x4, stamp_triangles
+from openvima.render.kernels import index_mesh, matrix_3x4, stamp_triangles
 from openvima.scene import WORKSPACE_LOW, Placement, Scene
 
 CELL_M = 0.003125
@@ -40,7 +40,6 @@ def stamp(raster: np.ndarray, heights: np.ndarray, placement: Placement, assets:
     mesh = index_mesh(assets.geometry(placement.object, placement.size, placement.scale).visual)
     x, y, _, _ = placement.pose.quaternion
     is_level = x == 0 and y == 0
-    points, selected = KernelBuffers().arrays(mesh)
     stamp_triangles(
         mesh.vertices,
         mesh.upward if is_level else mesh.corners,
@@ -50,8 +49,6 @@ def stamp(raster: np.ndarray, heights: np.ndarray, placement: Placement, assets:
         _ORIGIN[1],
         CELL_M,
         CEILING_M,
-        points,
-        selected,
         raster,
         heights,
     )

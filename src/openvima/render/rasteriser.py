@@ -1,9 +1,8 @@
-"""Rasteriser of scenes and prompts: colours, object ids and heights, bit-identical on every machine."""
+"""Rasteriser of scenes and prompts: colours, object ids and depth, bit-identical on every machine."""
 
 import math
-import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,7 +13,6 @@ from openvima.render.camera import CAMERAS, VIEWS, Camera, View, channels_last
 from openvima.render.kernels import (
     MICROMETRES,
     IndexedMesh,
-    KernelBuffers,
     draw_triangles,
     index_mesh,
     magnify,
@@ -24,7 +22,6 @@ from openvima.scene import (
     BACKGROUND_ID,
     FLOOR_ID,
     SHEET_ID,
-    ObjectImage,
     ObjectRecord,
     PhotoImage,
     Placement,
@@ -74,14 +71,12 @@ class Image:
     Args:
         rgb: Colours, shape (3, H, W), uint8, row 0 on top.
         segm: Object ids, shape (H, W), uint8; 0 floor, 1 sheet, 255 background.
-        height: Metres above the table, shape (H, W), float32; NaN for background. None unless requested.
         depth: Metres from the camera plane, along the optical axis, shape (H, W), float32; infinite for
             background. None unless requested.
     """
 
     rgb: np.ndarray
     segm: np.ndarray
-    height: np.ndarray | None = None
     depth: np.ndarray | None = None
 
 
@@ -102,7 +97,6 @@ class Rasteriser:
         scene: Scene,
         *,
         views: Sequence[View] = VIEWS,
-        height: bool = False,
         depth: bool = False,
         extra: Sequence[Drawable] = (),
         enlarge: int = 1,
@@ -112,7 +106,6 @@ class Rasteriser:
         Args:
             scene: The scene; of coinciding surfaces, the larger id is visible.
             views: Cameras, in the order of the result.
-            height: Whether to return height maps too.
             depth: Whether to return depth images too.
             extra: Further bodies, drawn before the objects.
             enlarge: Factor on the resolution of 128 × 256 pixels, for videos.
@@ -126,7 +119,7 @@ class Rasteriser:
             ConfigError: `enlarge` is below 1.
         """
         bodies = [*extra, *(self._drawable(placement) for placement in scene.placements)]
-        return self._draw(bodies, views, height=height, depth=depth, enlarge=enlarge, table=True)
+        return self._draw(bodies, views, depth=depth, enlarge=enlarge, table=True)
 
     def prompt(self, prompt: Prompt) -> RenderedPrompt:
         """Render all images of a prompt in both views.
@@ -138,36 +131,27 @@ class Rasteriser:
         return RenderedPrompt(prompt.text, images)
 
     def _prompt_image(self, name: str, fill: PromptFill) -> PromptImage:
-        if isinstance(fill, ObjectImage):
-            return self._object_image(name, fill)
-        return self._scene_image(name, fill) if isinstance(fill, SceneImage) else _photo_image(name, fill)
+        if isinstance(fill, PhotoImage):
+            return _photo_image(name, fill)
+        if isinstance(fill, SceneImage):
+            kind, placements, magnification = "scene", fill.scene.placements, 1.0
+        else:
+            kind, magnification = "object", fill.magnification
+            placements = (replace(fill.placement, id=0, pose=PROMPT_POSE),)
+        bodies = [self._drawable(placement, magnification) for placement in placements]
+        drawn = self._draw(bodies, VIEWS, table=kind == "scene")
+        rgb, segm = (
+            {view: getattr(image, part) for view, image in drawn.items()} for part in ("rgb", "segm")
+        )
+        records = tuple(ObjectRecord(each.id, each.object, each.texture) for each in placements)
+        return PromptImage(name, kind, rgb, segm, records)
 
-    def _object_image(self, name: str, fill: ObjectImage) -> PromptImage:
-        placement = fill.placement
-        body = self._drawable(placement, pose=PROMPT_POSE, object_id=0, magnification=fill.magnification)
-        drawn = self._draw([body], VIEWS, table=False)
-        records = (ObjectRecord(0, placement.object, placement.texture),)
-        return PromptImage(name, "object", _rgb_of(drawn), _segm_of(drawn), records)
-
-    def _scene_image(self, name: str, fill: SceneImage) -> PromptImage:
-        placements = fill.scene.placements
-        drawn = self._draw([self._drawable(placement) for placement in placements], VIEWS, table=True)
-        records = tuple(ObjectRecord(p.id, p.object, p.texture) for p in placements)
-        return PromptImage(name, "scene", _rgb_of(drawn), _segm_of(drawn), records)
-
-    def _drawable(
-        self,
-        placement: Placement,
-        *,
-        pose: Pose | None = None,
-        object_id: int | None = None,
-        magnification: float = 1.0,
-    ) -> Drawable:
+    def _drawable(self, placement: Placement, magnification: float = 1.0) -> Drawable:
         mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
         return Drawable(
             mesh if magnification == 1 else magnify(mesh, magnification),
-            placement.pose if pose is None else pose,
-            placement.id if object_id is None else object_id,
+            placement.pose,
+            placement.id,
             self.assets.texture(placement.texture),
         )
 
@@ -177,7 +161,6 @@ class Rasteriser:
         views: Sequence[View],
         *,
         table: bool,
-        height: bool = False,
         depth: bool = False,
         enlarge: int = 1,
     ) -> dict[View, Image]:
@@ -185,18 +168,12 @@ class Rasteriser:
         images: dict[View, Image] = {}
         for view in views:
             empty = _empty_canvas(CAMERAS[view].enlarged(enlarge), table)
-            buffer = _MEMORY.depth(empty.segm.shape)
-            np.copyto(buffer, empty.depth)
-            heights = empty.height.copy() if height else _NO_HEIGHTS
-            canvas = _Canvas(empty.camera, empty.rgb.copy(), empty.segm.copy(), heights, buffer)
+            canvas = _Canvas(empty.camera, empty.rgb.copy(), empty.segm.copy(), empty.depth.copy())
             for body in prepared:
                 _draw_body(body, canvas)
-            distances = _distances(buffer, CAMERAS[view]) if depth else None
-            images[view] = Image(canvas.rgb, canvas.segm, heights if height else None, distances)
+            distances = _distances(canvas.depth, CAMERAS[view]) if depth else None
+            images[view] = Image(canvas.rgb, canvas.segm, distances)
         return images
-
-
-_NO_HEIGHTS = np.empty((0, 0), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,25 +183,8 @@ class _Canvas:
     camera: np.ndarray
     rgb: np.ndarray
     segm: np.ndarray
-    height: np.ndarray
     depth: np.ndarray
 
-
-class _WorkingMemory(threading.local):
-    """Buffers of all rasterisers of a thread: shared, they stay in the CPU's cache where these take turns."""
-
-    def __init__(self) -> None:
-        self.buffers = KernelBuffers()
-        self._depth: dict[tuple[int, ...], np.ndarray] = {}
-
-    def depth(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the depth buffer of a shape, float64."""
-        if shape not in self._depth:
-            self._depth[shape] = np.empty(shape)
-        return self._depth[shape]
-
-
-_MEMORY = _WorkingMemory()
 
 _Prepared = tuple[IndexedMesh, np.ndarray, np.ndarray, int]  # mesh, pose, texture, id
 
@@ -261,11 +221,9 @@ def _draw_body(body: _Prepared, canvas: _Canvas) -> None:
         canvas.camera,
         texture,
         object_id,
-        *_MEMORY.buffers.arrays(mesh),
         canvas.depth,
         canvas.rgb,
         canvas.segm,
-        canvas.height,
     )
 
 
@@ -276,7 +234,6 @@ def _empty_canvas(camera: Camera, table: bool) -> _Canvas:
         camera.matrix(),
         np.full((3, *shape), 255, dtype=np.uint8),
         np.full(shape, BACKGROUND_ID, dtype=np.uint8),
-        np.full(shape, np.nan, dtype=np.float32),
         np.full(shape, np.inf),
     )
     if table:
@@ -322,11 +279,3 @@ def _checked_id(object_id: int) -> int:
 def front_above_top(images: Mapping[View, Image]) -> np.ndarray:
     """Return the colours of both views in one image, the front view above, shape (2 · H, W, 3), uint8."""
     return np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
-
-
-def _rgb_of(images: dict[View, Image]) -> dict[str, np.ndarray]:
-    return {view: image.rgb for view, image in images.items()}
-
-
-def _segm_of(images: dict[View, Image]) -> dict[str, np.ndarray]:
-    return {view: image.segm for view, image in images.items()}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.scene import Placement, Scene
+from openvima.scene import Placement
 
 TABLE = 0  # object id of the table itself
 _ABOVE_M = 1.0
@@ -27,7 +27,7 @@ class Hit:
 
 
 def first_hit(
-    placements: Scene | Iterable[Placement],
+    placements: Iterable[Placement],
     origin: Sequence[float],
     direction: Sequence[float],
     assets: Assets,
@@ -35,7 +35,7 @@ def first_hit(
     """Return the first thing that a ray hits: an object, or else the plane of the table at z = 0.
 
     Args:
-        placements: A scene, or its objects.
+        placements: The objects.
         origin: Start of the ray in metres, shape (3,).
         direction: Its direction, of any length above 0, shape (3,).
         assets: Asset pack.
@@ -47,7 +47,7 @@ def first_hit(
     nearest, object_id = -start[2] / ray[2] if ray[2] else np.inf, TABLE
     if nearest < 0:
         nearest = np.inf
-    for placement in placements.placements if isinstance(placements, Scene) else placements:
+    for placement in placements:
         visual = assets.geometry(placement.object, placement.size, placement.scale).visual
         corners = placement.pose.transform(visual.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
         distance = _nearest(corners, start, ray)
@@ -59,11 +59,11 @@ def first_hit(
     return Hit(object_id, (x, y, z))
 
 
-def object_below(placements: Scene | Iterable[Placement], point: tuple[float, float], assets: Assets) -> int:
+def object_below(placements: Iterable[Placement], point: tuple[float, float], assets: Assets) -> int:
     """Return the id of the topmost object at a point of the table; 0 if there is none.
 
     Args:
-        placements: A scene, or its objects.
+        placements: The objects.
         point: x, y in metres.
         assets: Asset pack.
     """

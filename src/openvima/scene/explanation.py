@@ -96,23 +96,6 @@ class Explanation:
                 joined.append(each)
         return sorted(joined, key=lambda each: -each.probability)
 
-    def second_choice(self) -> tuple[ObjectProbability, PlaceProbability | None, float] | None:
-        """Return the second most probable action of a policy that points.
-
-        Returns:
-            The object that it picks, where it places it, and its probability. The place is None if it picks
-            another object than the action: place candidates are scored for the picked object alone. None if
-            there is no second choice.
-        """
-        picks = sorted(self.objects, key=lambda each: -each.probability)
-        places = self.distinct_places()
-        choices: list[tuple[ObjectProbability, PlaceProbability | None, float]] = []
-        if picks and len(places) > 1:
-            choices.append((picks[0], places[1], picks[0].probability * places[1].probability))
-        if len(picks) > 1:
-            choices.append((picks[1], None, picks[1].probability))
-        return max(choices, key=lambda choice: choice[-1], default=None)
-
     def heat_map(self, pose: str) -> np.ndarray:
         """Return the probabilities of the positions of one pose, for policies over bins.
 

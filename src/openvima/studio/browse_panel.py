@@ -14,7 +14,6 @@ from openvima.env.tabletop import VideoFrame
 from openvima.errors import DatasetError, PolicyError
 from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode, success_rates
 from openvima.evaluation.results import FILE_NAME, Results
-from openvima.evaluation.rollout_policies import RolloutPolicy
 from openvima.input_files import as_path
 from openvima.render import channels_last
 from openvima.sim.ur5 import HOME
@@ -58,8 +57,7 @@ class BrowsePanel:
         self._failures = gui.add_checkbox("failures only", True)
         self._outcome = gui.add_dropdown("episode", [_NONE])
         self._source = gui.add_text("weights", "", hint="run folder; empty: found by the hash of its weights")
-        works = {"live": self._replay, "recorded actions": self._replay_recorded}
-        self.session.add_buttons("play again", works)
+        self.session.add_buttons("play again", {"live": self._replay})
         self._reason = gui.add_markdown("")
         for choice in (self._policy, self._ablation):
             choice.on_update(self.session.callback(self._show_matrix))
@@ -171,13 +169,6 @@ class BrowsePanel:
         except PolicyError as error:
             self.session.warn(str(error))
             policy = found.recorded_policy()
-        self._play(found, policy)
-
-    def _replay_recorded(self) -> None:
-        found = self._evaluated()
-        self._play(found, found.recorded_policy())
-
-    def _play(self, found: EvaluatedEpisode, policy: RolloutPolicy) -> None:
         self._reason.content = f"**Recorded**: {found}."
         self.session.choose_assets(found.batch.env_config.assets)
         self.session.open(found.sample(), policy, compat=found.batch.env_config.compat)

@@ -252,7 +252,7 @@ class BrowserSession:
         self.current: EpisodeSession | None = None
         self.compared: EpisodeSession | None = None  # the same episode by another policy, in lockstep
         self.policy: RolloutPolicy | None = None  # the chosen one
-        self.policy_name, self.temperature, self.speed = YOU, 0.0, 1.0
+        self.policy_name, self.speed = YOU, 1.0
         self._running = self._newest = threading.Event()  # set to end the work submitted with it
         self.editing = False  # whether clicks select objects to edit, instead of acting
         self.prompt_weights: list[tuple[Colour, np.ndarray]] = []  # attention to draw below the prompt
@@ -330,8 +330,8 @@ class BrowserSession:
         """Load a policy for this browser alone; `YOU` gives None."""
         if name == YOU:
             return None
-        options = {"device": self.config.device, "trust_code": self.config.trust_code}
-        return load_own_rollout_policy(name, temperature=self.temperature, **options)
+        config = self.config
+        return load_own_rollout_policy(name, device=config.device, trust_code=config.trust_code)
 
     def choose_policy(self, name: str) -> None:
         """Let a policy decide from here on."""

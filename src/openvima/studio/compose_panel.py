@@ -216,9 +216,12 @@ class ComposePanel:
         name = self._names()[object_id]
         if event.phase == "start":
             self.session.submit(lambda: self._show(name))
+            return
+        pose = (*hit.point[:2], self._present()[name].yaw_deg)
+        if event.phase == "end":
+            self.session.interrupt(lambda: self._move(pose))
         else:
-            pose = (*hit.point[:2], self._present()[name].yaw_deg)
-            self._drag_to(pose, is_end=event.phase == "end")
+            self.session.submit(lambda: self._preview(pose))
 
     def _show(self, selected: str) -> None:
         """Select an object."""
@@ -232,12 +235,6 @@ class ComposePanel:
         if self._selected.value != _NONE and self._scene is not None:
             chosen = self._scene[self._selected.value]
             self._pose.value, self._scale.value = (*chosen.position, chosen.yaw_deg), chosen.scale
-
-    def _drag_to(self, pose: tuple[float, float, float], *, is_end: bool) -> None:
-        if is_end:
-            self.session.interrupt(lambda: self._move(pose))
-        else:
-            self.session.submit(lambda: self._preview(pose))
 
     def _preview(self, pose: tuple[float, float, float]) -> None:
         current, x, y, yaw_deg = self.session.current, *pose

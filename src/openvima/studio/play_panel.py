@@ -18,13 +18,12 @@ from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, Pose
 from openvima.scene.action import pose_after
 from openvima.scene.explanation import Explanation
 from openvima.studio.browser_session import YOU, BrowserSession, Table, clicked_action, hit_of
-from openvima.tasks import list_tasks, sample_episode, task_spec
+from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.sampling import MAX_SEED
 from openvima.video.explanation import (
     HEAT_COLOURS,
     LEAST_SHOWN,
     PICK,
-    PLACE,
     attention_rows,
     draw_panel,
     heat_opacity,
@@ -93,17 +92,8 @@ class PlayPanel:
         level = level if level in levels else levels[0]
         self._level.options, self._level.value = levels, level
         self.session.choose_assets(self._assets.value)
-        config = self.session.env_config
-        episode = sample_episode(
-            task,
-            level=level,
-            seed=min(int(self._seed.value), MAX_SEED),
-            domain="user",
-            assets=self.session.assets,
-            compat=config.compat,
-            prompts=config.prompts,
-            **config.options(task),
-        )
+        seed = min(int(self._seed.value), MAX_SEED)
+        episode = self.session.env_config.sample(task, level, seed, domain="user")
         self.session.open(episode, self.session.policy)
         self._choose_policy()
 
@@ -145,9 +135,8 @@ class UserPanel:
         gui = session.gui
         with session.tabs.add_tab("You", viser.Icon.HAND_CLICK):
             self._help = gui.add_markdown("")
-            self._acts = gui.add_checkbox("act by clicks", True)
             self._turn = gui.add_slider("turn (degrees)", -180, 180, 5, 0)
-            works = {"turn in place": self._turn_in_place, "cancel": self._forget, "undo": self._undo}
+            works = {"turn in place": self._turn_in_place, "cancel": self._forget}
             session.add_buttons("", {**works, "next seed": lambda: session.next_seed()})
             self._record = gui.add_markdown("")
         self._turn.on_update(session.callback(self._preview))
@@ -159,12 +148,12 @@ class UserPanel:
         session.on_change(self._show)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        if self._acts.value and not self.session.editing:
+        if not self.session.editing:
             self.session.submit(lambda: self._click(event))
 
     def _dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
         """Act from where an object was grabbed to where it is let go."""
-        if not self._acts.value or self.session.editing:
+        if self.session.editing:
             return
         if event.phase == "start":
             self._grabbed = Hit(object_id, event.start_position)
@@ -213,11 +202,6 @@ class UserPanel:
     def _turn_in_place(self) -> None:
         if self._first is not None:
             self._act(self._first, self._first)
-
-    def _undo(self) -> None:
-        current = self.session.current
-        if current is not None and current.num_steps:
-            self.session.back(current.num_steps - 1)
 
     def _preview(self) -> None:
         """Mark the first click, and show the picked object as it will be turned."""
@@ -287,21 +271,14 @@ class WhyPanel:
         gui = session.gui
         with session.tabs.add_tab("Why", viser.Icon.QUESTION_MARK):
             self._shown = gui.add_checkbox("show why", False, hint="what the policy considers next")
-            hint = "0 takes the most probable action; above, actions are sampled"
-            self._temperature = gui.add_slider("temperature", 0.0, 2.0, 0.1, 0.0, hint=hint)
             names = (_NOBODY, *BUNDLED, "oracle", "random", *session.config.policies)
             self._other = gui.add_dropdown("compare with", names, hint="on the same episode, in lockstep")
             self._text = gui.add_markdown("")
             blank = np.full((1, 1, 3), 255, np.uint8)
             self._images = [gui.add_image(blank, visible=False) for _ in range(2)]
         self._shown.on_update(session.callback(session.changed))
-        self._temperature.on_update(session.callback(self._choose_temperature))
         self._other.on_update(session.callback(self._choose_other))
         session.on_change(self._show)
-
-    def _choose_temperature(self) -> None:
-        self.session.temperature = self._temperature.value
-        self.session.choose_policy(self.session.policy_name)
 
     def _choose_other(self) -> None:
         name = self._other.value
@@ -333,7 +310,6 @@ class WhyPanel:
                     self._add_heat_maps(table, proposal.explanation)
                 else:
                     self._explain(table, run, proposal.explanation)
-                    lines.append(self._second_choice(table, run, proposal.explanation))
                 panels.append(draw_panel(run.scene, self.session.assets, proposal.explanation))
                 rows = attention_rows(proposal.explanation)
                 self.session.prompt_weights = self.session.prompt_weights or rows
@@ -382,20 +358,6 @@ class WhyPanel:
                 pose, opacity = pose_after(placement.pose, moved), 0.12 + 0.4 * place.probability
                 ghost = table.add_ghost(f"why/{number}", placement, pose=pose, opacity=opacity)
                 self._nodes.append(ghost)
-
-    def _second_choice(self, table: Table, run: EpisodeSession, explanation: Explanation) -> str:
-        """Say which action was the second most probable, and draw a thin arrow if its place is known."""
-        choice = explanation.second_choice()
-        if choice is None or choice[-1] < LEAST_SHOWN:
-            return "No other action has a probability of 1 %."
-        picked, place, probability = choice
-        names = {p.id: f"the {p.texture} {p.object}" for p in run.scene.placements}
-        what = names.get(picked.object_id, "an object")
-        said = f"Second most probable, {percent(probability)}: pick {what}"
-        if place is None:
-            return f"{said}."
-        self._add_arrow(table, "second", Action.planar(picked.grasp, place.position), PLACE)
-        return f"{said}, place it at ({place.position[0]:.2f}, {place.position[1]:.2f}) m: the blue arrow."
 
     def _add_label(self, table: Table, name: str, text: str, position: tuple[float, float]) -> None:
         at, name = (*position, _LABEL_Z_M), f"{table.root}/why/label_{name}"

@@ -8,7 +8,7 @@ import contextlib
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
@@ -230,11 +230,10 @@ def png(image: Image.Image) -> bytes:
 
 def _clip(record: dict[str, Any], folder: Path) -> Clip:
     prompt = tuple(part if isinstance(part, str) else _bytes(part["png"]) for part in record.pop("prompt"))
-    poster = _bytes(record.pop("poster"))
-    clip = Clip(**record, prompt=prompt, video=b"", poster=poster)
+    clip = Clip(**{**record, "poster": _bytes(record["poster"])}, prompt=prompt, video=b"")
     if Path(clip.file_name).name != clip.file_name:
         raise ValueError(f"{echo(repr(clip.file_name))} leads out of the folder")
-    return Clip(**record, prompt=prompt, poster=poster, video=(folder / clip.file_name).read_bytes())
+    return replace(clip, video=(folder / clip.file_name).read_bytes())
 
 
 def _text(content: bytes) -> str:

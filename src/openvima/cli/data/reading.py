@@ -4,12 +4,10 @@ import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-
+from openvima.cli.options import Folder, Json
 from openvima.cli.terminal import print_table, progress_bar
-from openvima.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -20,10 +18,10 @@ _BAR_WIDTH = 40
 
 
 def info(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    folder: Folder,
     *,
     details: bool = False,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: Json = False,
 ) -> int:
     """Print counts, sizes, histograms and provenance of a folder of demonstrations.
 
@@ -131,13 +129,13 @@ if TYPE_CHECKING:
 
 
 def verify(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    folder: Folder,
     *,
-    replay: str = "1",
+    replay: int | Literal["all"] = 1,
     workers: int = 1,
     seed: int = 0,
     assets: str | None = None,
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    as_json: Json = False,
 ) -> int:
     """Verify demonstrations: checksums, schema, values, and replayed episodes.
 
@@ -161,7 +159,7 @@ def verify(
     from openvima.data.verification import verify as verify_folder
 
     folder = data_folder(folder)
-    config = VerifyConfig(_number(replay), seed=seed, assets=assets, workers=workers)
+    config = VerifyConfig(None if replay == "all" else replay, seed=seed, assets=assets, workers=workers)
     with progress_bar("verifying") as report:
         found = verify_folder(folder, config, report)
     if as_json:
@@ -171,32 +169,14 @@ def verify(
     return 0 if found.is_clean else 1
 
 
-def _number(replay: str) -> int | None:
-    """Read `--replay`.
-
-    Raises:
-        ConfigError: It is neither a number nor "all".
-    """
-    if replay == "all":
-        return None
-    if not replay.isdecimal():
-        raise ConfigError(f"--replay is {replay!r}; give a number of episodes a task, 0 for none, or all.")
-    return int(replay)
-
-
 def _text(found: "Verification") -> Iterator[str]:
     yield (
         f"{found.folder}: {found.num_shards:,} shards, {found.num_episodes:,} episodes compared with their "
         f"hashes, {found.num_replayed:,} replayed"
     )
     yield from (f"note: {note}" for note in found.notes)
-    yield _number_of_problems(found)
+    count = len(found.problems)
+    yield "no problems" if found.is_clean else f"{count} problem{'s' * (count > 1)}"
     for problem in found.problems:
         yield f"  {problem.file}: {problem.cause}"
     yield from (f"  → {remedy}" for remedy in sorted({problem.remedy for problem in found.problems}))
-
-
-def _number_of_problems(found: "Verification") -> str:
-    if found.is_clean:
-        return "no problems"
-    return "1 problem" if len(found.problems) == 1 else f"{len(found.problems)} problems"

@@ -7,13 +7,14 @@ from typing import Annotated, Literal
 
 import tyro
 
+from openvima.cli.options import Folder, Out, Repository
 from openvima.cli.terminal import parse_list, parse_tasks, print_files, progress_bar
 from openvima.data.chat_settings import DEFAULT_ENLARGE, ChatView, Points
 
 
 def sample(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    folder: Folder,
+    out: Out,
     *,
     fraction: float | None = None,
     episodes: int | None = None,
@@ -52,8 +53,8 @@ def sample(
 
 
 def split(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    folder: Folder,
+    out: Out,
     *,
     splits: str,
     tasks: str = "all",
@@ -128,7 +129,7 @@ def merge(
 
 def import_published(
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    out: Out,
     *,
     tasks: str = "all",
     episodes: int | None = None,
@@ -182,8 +183,8 @@ def import_published(
 
 
 def export_lerobot(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    folder: Folder,
+    out: Out,
     *,
     tasks: str = "all",
     pixels: Literal["yuv444p", "yuv420p"] = "yuv444p",
@@ -221,8 +222,8 @@ def export_lerobot(
 
 
 def export_chat(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    folder: Folder,
+    out: Out,
     *,
     format: Literal["messages", "llava"] = "messages",
     tasks: str = "all",
@@ -278,7 +279,7 @@ def export_chat(
 
 
 def preprocess(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    folder: Folder,
     *,
     kind: Literal["objects", "frames"] = "objects",
     boxes: str | None = None,
@@ -316,8 +317,6 @@ def preprocess(
     from openvima.detector.plugins import detected_object_cache, plugged_boxes
     from openvima.errors import ConfigError
 
-    if boxes is not None and kind == "frames":
-        raise ConfigError(f"boxes is {boxes!r}, but whole frames have none; leave --boxes or --kind out.")
     if rerendered is not None and (boxes is not None or rerendered < 0):
         raise ConfigError(f"rerendered is {rerendered}; it must be 0 or more, and without --boxes.")
     if not 0 <= fraction <= 1 or (fraction < 1 and boxes is None):
@@ -325,23 +324,21 @@ def preprocess(
             f"fraction is {fraction:g}; it must lie between 0 and 1, and needs --boxes below 1."
         )
     dataset = Dataset(folder)
+    options = {"kind": kind, "folder": out, "workers": workers}
     with progress_bar("object cache") as report:
         if boxes is None:
-            cache = open_object_cache(
-                dataset, kind, folder=out, appearance=rerendered, workers=workers, report=report
-            )
+            cache = open_object_cache(dataset, **options, appearance=rerendered, report=report)
         else:
-            cache = detected_object_cache(
-                dataset, plugged_boxes(boxes, fraction=fraction), folder=out, workers=workers, report=report
-            )
+            found = plugged_boxes(boxes, fraction=fraction)
+            cache = detected_object_cache(dataset, found, **options, report=report)
     print(f"the object cache of {len(cache):,} demonstrations is ready.", file=sys.stderr)
     print(cache.folder)
     return 0
 
 
 def push_to_hub(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
-    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OWNER/NAME")],
+    folder: Folder,
+    name: Repository,
     *,
     private: bool = False,
     dry_run: bool = False,
