@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.errors import brief_repr
+from openvima.errors import ActionError, brief_repr, echo
 from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
 from openvima.scene.action import END_EFFECTOR, PRIMITIVES, STAY, ToolCommand, steps_per_primitive
 from openvima.sim.tool_path import PathFollower, onward_path, tool_path
@@ -32,6 +32,16 @@ class VideoFrame:
     joints: np.ndarray
 
     __repr__ = brief_repr
+
+
+def _arrays(action: Action | ToolCommand) -> Any:
+    """Return the arrays of an action, whose values its constructor does not check."""
+    try:
+        return action.to_arrays() if isinstance(action, Action) else action.to_array()
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        raise ActionError(
+            f"the action is {echo(repr(action))}; its values must be numbers. Nothing was moved."
+        ) from None
 
 
 @dataclass(slots=True, eq=False)
@@ -87,7 +97,7 @@ class PrimitiveRun:
         Raises:
             ActionError: It is invalid.
         """
-        arrays: Any = action.to_arrays() if isinstance(action, Action) else action
+        arrays: Any = _arrays(action) if isinstance(action, Action) else action
         return Action.from_arrays(arrays)
 
     def step(self, action: Any, *, realtime: bool) -> None:
@@ -157,7 +167,7 @@ class ToolRun(PrimitiveRun):
         Raises:
             ActionError: It is invalid.
         """
-        return ToolCommand.from_array(action.to_array() if isinstance(action, ToolCommand) else action)
+        return ToolCommand.from_array(_arrays(action) if isinstance(action, ToolCommand) else action)
 
     def step(self, action: ToolCommand, *, realtime: bool) -> None:
         """Follow a checked command; evaluate the goals where a manipulation has ended."""
