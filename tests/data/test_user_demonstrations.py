@@ -34,7 +34,8 @@ def clicked(episode: Episode, rng: random.Random) -> list[Action]:
         target, base = (episode.problem.scene[i] for i in (goal.object_id, goal.relative_to))
         x, y, z = target.pose.position
         origin = x + rng.uniform(-0.01, 0.01) + 0.6, y + rng.uniform(-0.01, 0.01), z + 0.8
-        hit = first_hit(episode.problem.scene, origin, (-0.6, 0.0, -0.8), load_assets("procedural"))
+        placements = episode.problem.scene.placements
+        hit = first_hit(placements, origin, (-0.6, 0.0, -0.8), load_assets("procedural"))
         assert hit is not None and hit.object_id == target.id
         place = (base.pose.x + rng.uniform(-0.01, 0.01), base.pose.y + rng.uniform(-0.01, 0.01))
         actions.append(Action.planar(hit.point[:2], place))

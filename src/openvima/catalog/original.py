@@ -163,7 +163,7 @@ class OriginalAssets:
     name = "original"
 
     def __init__(self, source: str | Path) -> None:
-        self.folder = find_pack(source)
+        self.folder = imported_pack() if source == imported_folder() else find_pack(source)
 
     def __repr__(self) -> str:
         return f"OriginalAssets({str(self.folder)!r})"

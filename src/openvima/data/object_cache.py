@@ -188,11 +188,6 @@ class CacheFile:
         """Return the length of a list in each row, shape (N,), int64."""
         return np.diff(self._lists[column][0])
 
-    def texts(self, name: str) -> set[str]:
-        """Return the different texts of a column."""
-        values = self._scalars[name]
-        return {text for value in values for text in ([value] if isinstance(value, str) else value)}
-
 
 def write_cache_file(
     path: Path, episodes: Sequence[PreprocessedEpisode], kind: InputKind, source: str, variant: str = ""
@@ -359,14 +354,6 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     def image_counts(self) -> np.ndarray:
         """Return the number of images of each episode, shape (N,), int64."""
         return self._gather(lambda file: file.counts("images"))
-
-    def texts(self) -> set[str]:
-        """Return the different prompts, with their placeholders; "" stands for those that are left out."""
-        return {text for file in self._files.values() for text in file.texts("text")}
-
-    def descriptions(self) -> set[str]:
-        """Return the different descriptions of object images."""
-        return {text for file in self._files.values() for text in file.texts("descriptions")} - {""}
 
     def _gather(self, read: Callable[[CacheFile], np.ndarray]) -> np.ndarray:
         """Read numbers of all rows of all files, and put them into the order of the episodes."""

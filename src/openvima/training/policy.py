@@ -182,6 +182,7 @@ class _Stages:
             if not (config.init_from or self.trainer.progress.step):
                 learner.network.fit_prior(read_actions(self._examples[0]))
             if freezes_crops(learner.network, config):
+                self.trainer.report("encoding the images of all demonstrations")
                 freeze_crops(learner, caches, self.parallel)
         module = self.parallel.wrap(learner)
         training, validation = self._examples
