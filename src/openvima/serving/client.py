@@ -190,7 +190,7 @@ class RemotePolicy(Policy):
         """Return the error for a refusal; that of a policy names no address, since results keep it."""
         if text.startswith(POLICY_FAILED):
             return PolicyRaisedError(f"the policy on the server raised {echo(text[len(POLICY_FAILED) :])}")
-        if re.match(r"(Policy|Prompt|Detection|Shape|Action)Error: ", text):
+        if re.match(r"(Policy|Prompt|Shape|Action)Error: ", text):
             return PolicyError(f"the policy on the server refuses: {echo(text)}")
         return ServerError(f"{self.url} refuses: {echo(text)}")
 
