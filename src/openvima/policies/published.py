@@ -391,19 +391,19 @@ def _num_layers(shapes: Iterable[str], stem: str) -> int:
 
 def _prompt(shapes: Mapping[str, tuple[int, ...]]) -> PromptEncoderConfig:
     attention = f"{T5}.block.0.layer.0.SelfAttention"
-    vocabulary_size, width = shapes["prompt_embedding._embed_layer.weight"]
+    words = shapes["prompt_embedding._embed_layer.weight"]
     num_heads = shapes[f"{attention}.relative_attention_bias.weight"][1]
     num_layers = _num_layers(shapes, f"{T5}.block")
     return PromptEncoderConfig(
         TextEncoderConfig(
-            width,
+            words[1],
             num_layers,
             num_heads,
-            head_width=shapes[f"{attention}.q.weight"][0] // num_heads,
+            head_width=shapes[f"{attention}.q.weight"][0] // max(num_heads, 1),  # the file may say 0
             hidden_width=shapes[f"{T5}.block.0.layer.1.DenseReluDense.wi.weight"][0],
         ),
         image_width=shapes["prompt_obj_post_layer.0.weight"][0],
-        vocabulary_size=vocabulary_size,
+        vocabulary_size=words[0],
         tokenizer="t5",
         train_words=False,
         trained_layers=min(TUNED_T5_LAYERS, num_layers),
