@@ -108,6 +108,20 @@ def open_regular(file: Path) -> BufferedReader:
     return os.fdopen(descriptor, "rb")
 
 
+def read_bytes(file: Path, *, max_bytes: int) -> bytes:
+    """Read a regular file of limited size.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+        InputFileError: It is no regular file, or longer than `max_bytes`.
+    """
+    with open_regular(file) as stream:
+        content = stream.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise InputFileError(f"{file} has more than {max_bytes:,} bytes, the most that is read.")
+    return content
+
+
 def read_text(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Read a regular UTF-8 file of limited size.
 
@@ -115,12 +129,8 @@ def read_text(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
         OSError: There is no such file, or it cannot be read.
         InputFileError: It is no regular file, longer than `max_bytes`, or no UTF-8.
     """
-    with open_regular(file) as stream:
-        content = stream.read(max_bytes + 1)
-    if len(content) > max_bytes:
-        raise InputFileError(f"{file} has more than {max_bytes} bytes, the most that is read.")
     try:
-        return content.decode("utf-8")
+        return read_bytes(file, max_bytes=max_bytes).decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputFileError(f"{file} is no UTF-8 text ({error.reason} at byte {error.start}).") from None
 
@@ -163,13 +173,9 @@ def read_png(file: Path, *, max_bytes: int, max_side: int) -> "PIL.Image.Image":
         InputFileError: There is no such file, it is no regular file, too large, or no PNG file.
     """
     try:
-        with open_regular(file) as stream:
-            content = stream.read(max_bytes + 1)
-    except InputFileError:
-        raise
+        content = read_bytes(file, max_bytes=max_bytes)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputFileError(f"{str(file)!r} cannot be read: {reason}.") from None
+        raise InputFileError(f"{str(file)!r} cannot be read: {one_line(error)}.") from None
     return decode_png(content, repr(str(file)), max_bytes=max_bytes, max_side=max_side)
 
 

@@ -15,7 +15,6 @@ from openvima.evaluation.ablations import (
     ablate,
     ablated_environment,
     applies_to,
-    canonical_ablation,
 )
 from openvima.evaluation.config import cells, plan
 from openvima.evaluation.prompt_ablations import NEUTRAL_PROMPT, gibberish, masked, swapped
@@ -144,16 +143,15 @@ def test_words_follow_from_the_episode_and_change_nothing_for_who_ignores_them(a
 
 
 def test_several_at_once_are_one_ablation_in_one_spelling():
-    assert canonical_ablation("noisy_boxes:3+masked_words:.50") == "masked_words:0.5+noisy_boxes:3"
     env, _ = begun("visual_manipulation")
     both = ablate(env, "masked_words:0.5+noisy_boxes:3")
     assert both.prompt.text == ablate(env, "masked_words:0.5").prompt.text
     assert both.jitter is not None
     config = EvaluationConfig(
-        ("mine=a",), ablations=("masked_words:.2", "masked_words:0.20", "gibberish_words")
+        ("mine=a",), ablations=("masked_words:.2", "masked_words:0.20", "noisy_boxes:3+masked_words:.50")
     )
-    assert config.ablations == ("masked_words:0.2", "gibberish_words")
-    assert config.record()["ablations"] == ["masked_words:0.2", "gibberish_words"]
+    assert config.ablations == ("masked_words:0.2", "masked_words:0.5+noisy_boxes:3")
+    assert config.record()["ablations"] == list(config.ablations)
 
 
 def test_moved_boxes_follow_from_the_episode_and_change_the_actions_of_networks_on_objects():
@@ -175,19 +173,18 @@ def test_moved_boxes_follow_from_the_episode_and_change_the_actions_of_networks_
     ("ablation", "message"),
     [
         ("masked_word:0.2", "Did you mean 'masked_words'"),
-        ("masked_words", "needs a rate, such as masked_words:0.2"),
-        ("masked_words:-1", "must be a number from 0 to 1"),
-        ("masked_words:1.5", "must be a number from 0 to 1"),
-        ("masked_words:nan", "must be a number"),
-        ("noisy_boxes:2.5", "must be an integer from 1 to 32"),
-        ("num_distractors:99", "must be an integer from 0 to 6"),
-        ("gibberish_words:0.2", "gibberish_words takes no rate"),
-        ("no_prompt+random", "random stands alone"),
+        ("masked_words", "write masked_words:0.2, with a number from 0 to 1"),
+        ("masked_words:-1", "a number from 0 to 1"),
+        ("masked_words:1.5", "a number from 0 to 1"),
+        ("masked_words:nan", "a number from 0 to 1"),
+        ("noisy_boxes:2.5", "an integer from 1 to 32"),
+        ("num_distractors:99", "an integer from 0 to 6"),
+        ("gibberish_words:0.2", r"write gibberish_words\."),
+        ("no_prompt+random", "and alone all, random, oracle"),
         ("text_prompts+paraphrased_prompts", "exclude each other"),
         ("detected_boxes+noisy_boxes:3", "exclude each other"),
         ("masked_words:0.2+masked_words:0.4", "exclude each other"),
         ("swapped_attribute+held_out_phrasings", "exclude each other"),
-        ("", "empty"),
     ],
 )
 def test_ablations_that_cannot_be_are_refused_in_one_line(ablation, message):
@@ -227,9 +224,7 @@ def test_environments_change_for_the_tasks_that_have_the_form_or_the_option():
     ]
 
 
-def test_an_environment_that_is_so_already_or_fits_no_task_is_an_error():
-    with pytest.raises(ConfigError, match="text_prompts changes nothing"):
-        ablated_environment("text_prompts", EnvConfig(prompts="text"))
+def test_an_ablation_that_fits_no_task_is_an_error():
     with pytest.raises(
         ConfigError, match=r"text_prompts applies to none of the tasks rearrange; it does to .*rotate"
     ):
@@ -380,7 +375,7 @@ def test_a_detector_that_finds_nothing_fails_its_episodes_and_stops_nobody(rows)
 
 
 def test_a_missing_detector_is_named_before_anything_is_played(tmp_path):
-    with pytest.raises(ConfigError, match="no such module"):
+    with pytest.raises(ConfigError, match="No module named 'no_such_module'"):
         evaluate(replace(CONFIG, boxes="no_such_module:make", out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 

@@ -138,5 +138,5 @@ def test_ablations_with_rates_are_named_after_their_policy_and_paired_where_scen
     for other in ("a@10:30", "a:num_distractors:3"):
         with pytest.raises(ConfigError, match="no episode in common"):
             compare(results, crowded, other)
-    with pytest.raises(UnknownPolicyError, match=r"Did you mean 'masked_words:0\.2'"):
+    with pytest.raises(UnknownPolicyError, match=r"Did you mean 'a@10:30:masked_words:0\.2'"):
         compare(results, "a@10:30:masked_word:0.2", "a@10:30")

@@ -54,7 +54,6 @@ def test_all_problems_of_the_settings_are_named_together():
     [
         ({"ablations": ("no_promt",)}, "Did you mean 'no_prompt'"),
         ({"ablations": ("detected_boxes",)}, "needs a detector"),
-        ({"boxes": "extractor:make"}, "only the ablation detected_boxes"),
         ({"precision": "float16"}, "allowed are float64, float32, bfloat16"),
         ({"engine": "threads"}, "allowed are processes and ray"),
     ],
@@ -73,6 +72,7 @@ def test_each_ablation_is_played_by_the_policies_that_it_takes_something_from():
 
 
 def test_boxes_are_detected_under_their_ablation_only_and_not_by_servers():
+    assert EvaluationConfig(("mine=a",), boxes="extractor:make").ablations == ("detected_boxes",)
     policies = ("mine=runs/a", "far=ws://127.0.0.1:8000")
     config = EvaluationConfig(
         policies, ("rotate",), ("L1",), 1, ablations=("all",), boxes="extractor.py:make"

@@ -12,7 +12,7 @@ from openvima.env import EnvConfig
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, save_episode_image
-from openvima.evaluation.evaluated_episode import evaluated_episode, find_source, success_rates
+from openvima.evaluation.evaluated_episode import evaluated_episode, find_source
 from openvima.evaluation.recording import record_episode
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
@@ -44,7 +44,6 @@ def test_an_episode_ends_again_as_it_did(evaluation: Path, policy: str) -> None:
         (again,) = play([env], [episode], rollout_policy)
         assert again == found.outcome
     assert str(found).startswith("rotate, L1, seed 61: ")
-    assert success_rates(Results.read(evaluation), policy)["rotate"]["L1"] in (0.0, 0.5, 1.0)
 
 
 def test_a_run_is_found_by_its_weights(evaluation: Path, tmp_path: Path) -> None:

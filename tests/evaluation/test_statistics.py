@@ -178,7 +178,7 @@ def test_swapping_the_policies_mirrors_the_interval(counts):
     difference, (low, high) = mean_difference(counts)
     assert -1 <= low <= difference <= high <= 1
     assert high - low > 0.1 or sum(each.episodes for each in counts) > 9
-    mirrored, interval = mean_difference([count.swapped for count in counts])
+    mirrored, interval = mean_difference([PairCounts(both, b, a, neither) for both, a, b, neither in counts])
     assert mirrored == -difference
     assert interval == pytest.approx((-high, -low), abs=1e-9)
 

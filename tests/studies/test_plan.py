@@ -88,7 +88,6 @@ def test_every_study_can_be_planned_at_every_scale(name: str, scale: str) -> Non
     [
         ((), "at least one"),
         ((Run("a"), Run("a")), "other labels"),
-        ((Run("a", data_fraction=0.0),), "data_fraction"),
     ],
 )
 def test_runs_that_cannot_be_are_refused(runs: tuple[Run, ...], message: str) -> None:

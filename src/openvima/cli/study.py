@@ -85,7 +85,7 @@ def main(
     how = {"device": device, "workers": workers, "engine": engine, "address": address}
     if dry_run:
         found = plan_study(study, inputs, out, seeds=seeds, **how)
-        check_plan(found, inputs)
+        check_plan(found)
         _print_plan(found)
         return 0
     with progress_bar("stages") as bar:

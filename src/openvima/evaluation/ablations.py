@@ -21,10 +21,11 @@ from openvima.env.config import EnvConfig
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ConfigError, echo, unknown_name
 from openvima.evaluation.prompt_ablations import (
+    IN_CONTEXT_TASKS,
     NEUTRAL_PROMPT,
     demonstrated,
     gibberish,
-    has_phrasings,
+    held_out_phrasings,
     in_context_prompt,
     in_held_out_phrasing,
     masked,
@@ -36,7 +37,7 @@ from openvima.evaluation.prompt_ablations import (
 )
 from openvima.evaluation.sources import ORACLE, RANDOM
 from openvima.perception.boxes import BoxJitter
-from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
+from openvima.scene import PromptImage, RenderedPrompt
 from openvima.tasks.options import MAX_DISTRACTORS, TaskOptions
 from openvima.tasks.sampling import check_task_options, make_rng, takes_prompts
 
@@ -113,45 +114,46 @@ def shuffled(env: TabletopEnv, seen: AblatedInput, rng: np.random.Generator) -> 
     The order in which a prompt lists the objects of an image stays: a policy that ignores ids and their order
     acts exactly as before.
     """
-    prompt = seen.prompt
     id_map = _permutation({placement.id for placement in env.episode.problem.scene.placements}, rng)
-    scenes = [image for image in prompt.images.values() if image.kind == "scene"]
+    scenes = [image for image in seen.prompt.images.values() if image.kind == "scene"]
     # One permutation for all images, as in the environment: an object keeps its id from frame to frame.
     prompt_id_map = _permutation({record.object_id for image in scenes for record in image.objects}, rng)
-    images = {
-        name: _relabelled(image, prompt_id_map) if image.kind == "scene" else image
-        for name, image in prompt.images.items()
-    }
-    return replace(seen, prompt=RenderedPrompt(prompt.text, images), id_map=id_map)
+
+    def relabelled(image: PromptImage) -> PromptImage:
+        records = tuple(
+            replace(record, object_id=int(prompt_id_map[record.object_id])) for record in image.objects
+        )
+        return replace(image, segm=renumbered(image.segm, prompt_id_map), objects=records)
+
+    changed = _with_images(seen, lambda image: relabelled(image) if image.kind == "scene" else image)
+    return replace(changed, id_map=id_map)
 
 
-def with_shuffled_prompt_objects(prompt: RenderedPrompt, rng: np.random.Generator) -> RenderedPrompt:
+def with_shuffled_prompt_objects(seen: AblatedInput, rng: np.random.Generator) -> AblatedInput:
     """Let each prompt image list its objects in an order of its own; an object keeps its id."""
-    images = {
-        name: replace(image, objects=tuple(image.objects[k] for k in rng.permutation(len(image.objects))))
-        for name, image in prompt.images.items()
-    }
-    return replace(prompt, images=images)
+
+    def shuffled(image: PromptImage) -> PromptImage:
+        order = rng.permutation(len(image.objects))
+        return replace(image, objects=tuple(image.objects[k] for k in order))
+
+    return _with_images(seen, shuffled)
 
 
 def jittered(seen: AblatedInput, pixels: int, rng: np.random.Generator) -> AblatedInput:
     """Move the borders of all boxes, in prompt images and observations."""
     jitter = BoxJitter(pixels, rng)
-    images = {name: jitter.prompt_image(image) for name, image in seen.prompt.images.items()}
-    return replace(seen, prompt=RenderedPrompt(seen.prompt.text, images), jitter=jitter)
+    return replace(_with_images(seen, jitter.prompt_image), jitter=jitter)
+
+
+def _with_images(seen: AblatedInput, change: Callable[[PromptImage], PromptImage]) -> AblatedInput:
+    images = {name: change(image) for name, image in seen.prompt.images.items()}
+    return replace(seen, prompt=replace(seen.prompt, images=images))
 
 
 def _permutation(ids: set[int], rng: np.random.Generator) -> np.ndarray:
     table = np.arange(256, dtype=np.uint8)
     table[sorted(ids)] = rng.permutation(sorted(ids))
     return table
-
-
-def _relabelled(image: PromptImage, id_map: np.ndarray) -> PromptImage:
-    records = tuple(
-        ObjectRecord(int(id_map[record.object_id]), record.object, record.texture) for record in image.objects
-    )
-    return replace(image, segm=renumbered(image.segm, id_map), objects=records)
 
 
 DETECTED_BOXES = "detected_boxes"
@@ -198,7 +200,7 @@ class InputAblation:
         description: What the policy gets, in one sentence.
         change: Changes the inputs of an episode.
         environment: Changes the settings of the environment.
-        takes: Whether it applies to a task, given the changed settings; None for all tasks.
+        takes: Whether it applies to a task, given the changed settings.
         rate: The rate it takes; None for none.
         exclusive: What only one ablation of several can set: "prompts" (their form), "words" or "boxes".
         changes_scenes: Whether a seed stands for another scene.
@@ -206,9 +208,9 @@ class InputAblation:
 
     name: str
     description: str
-    change: Change | None = None
-    environment: Callable[[EnvConfig, float], EnvConfig] | None = None
-    takes: Callable[[str, EnvConfig], bool] | None = None
+    change: Change = lambda env, seen, rate, rng: seen
+    environment: Callable[[EnvConfig, float], EnvConfig] = lambda env_config, rate: env_config
+    takes: Callable[[str, EnvConfig], bool] = lambda task, env_config: True
     rate: Rate | None = None
     exclusive: str = ""
     changes_scenes: bool = False
@@ -284,6 +286,7 @@ INPUT_ABLATIONS = {
             IN_CONTEXT,
             "The prompt is edited to contain an example from the task's own prompt, as in MIDAS.",
             lambda env, seen, rate, rng: AblatedInput(in_context_prompt(seen.prompt, env.task)),
+            takes=lambda task, env_config: task in IN_CONTEXT_TASKS,
             exclusive="prompts",
         ),
         InputAblation(
@@ -295,7 +298,7 @@ INPUT_ABLATIONS = {
                     seen.prompt, text=in_held_out_phrasing(seen.prompt.text, env.episode.task, rng)
                 ),
             ),
-            takes=lambda task, env_config: has_phrasings(task),
+            takes=lambda task, env_config: task in held_out_phrasings(),
             exclusive="words",
         ),
         InputAblation(
@@ -335,7 +338,7 @@ INPUT_ABLATIONS = {
         InputAblation(
             "shuffled_prompt_objects",
             "Each prompt image lists its objects in an order of its own.",
-            lambda env, seen, rate, rng: replace(seen, prompt=with_shuffled_prompt_objects(seen.prompt, rng)),
+            lambda env, seen, rate, rng: with_shuffled_prompt_objects(seen, rng),
         ),
         InputAblation(
             DETECTED_BOXES,
@@ -371,10 +374,9 @@ def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
     """
     seen, episode = AblatedInput(env.prompt), env.episode
     for part in ablation_parts(ablation):
-        if part.ablation.change is not None:
-            purpose = f"control {part.ablation.name}"
-            rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, purpose)
-            seen = part.ablation.change(env, seen, part.rate, rng)
+        purpose = f"control {part.ablation.name}"
+        rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, purpose)
+        seen = part.ablation.change(env, seen, part.rate, rng)
     return seen
 
 
@@ -382,15 +384,10 @@ def ablated_environment(ablation: str, env_config: EnvConfig) -> EnvConfig:
     """Return the settings of the environment under an ablation; most leave them as they are.
 
     Raises:
-        ConfigError: As for `ablation_parts`, or the settings are those already.
+        ConfigError: As for `ablation_parts`.
     """
     for part in ablation_parts(ablation):
-        if part.ablation.environment is not None:
-            before, env_config = env_config, part.ablation.environment(env_config, part.rate)
-            if env_config == before:
-                raise ConfigError(
-                    f"ablation {part} changes nothing: the environment has these settings already."
-                )
+        env_config = part.ablation.environment(env_config, part.rate)
     return env_config
 
 
@@ -402,10 +399,7 @@ def applies_to(ablation: str, task: str, env_config: EnvConfig) -> bool:
         task: Name of the task.
         env_config: Settings under the ablation, from `ablated_environment`.
     """
-    return all(
-        part.ablation.takes is None or part.ablation.takes(task, env_config)
-        for part in ablation_parts(ablation)
-    )
+    return all(part.ablation.takes(task, env_config) for part in ablation_parts(ablation))
 
 
 def scenes_of(ablation: str) -> str:
@@ -421,15 +415,6 @@ def scenes_of(ablation: str) -> str:
 def names_in(text: str) -> list[str]:
     """Return the parts of an ablation's name without their rates; they need not be known."""
     return [part.partition(":")[0].strip() for part in text.split("+")]
-
-
-def canonical_ablation(text: str) -> str:
-    """Return the one spelling of an ablation: `masked_words:.20` is "masked_words:0.2".
-
-    Raises:
-        ConfigError: As for `ablation_parts`.
-    """
-    return "+".join(map(str, ablation_parts(text)))
 
 
 @lru_cache
@@ -457,24 +442,14 @@ def ablation_parts(text: str) -> tuple[RatedAblation, ...]:
 def _rated(text: str) -> RatedAblation:
     name, colon, rate = text.partition(":")
     ablation = INPUT_ABLATIONS.get(name)
-    if name in MORE_ABLATIONS:
-        raise ConfigError(
-            f"ablation {name} stands alone, got {echo(repr(text))} among others or with a rate."
-        )
     if ablation is None:
-        allowed = ", ".join([*map(_form, INPUT_ABLATIONS.values()), *MORE_ABLATIONS])
-        raise ConfigError(
-            unknown_name("ablation", name, [*INPUT_ABLATIONS, *MORE_ABLATIONS], f"Allowed: {allowed}.")
-        )
-    if ablation.rate is None:
-        if colon:
-            raise ConfigError(f"ablation {name} takes no rate, got {echo(repr(text))}.")
-        return RatedAblation(ablation)
-    if not colon:
-        raise ConfigError(f"ablation {name} needs a rate, such as {name}:{ablation.rate.example}.")
-    number = ablation.rate.parse(rate)
-    if number is None:
-        raise ConfigError(f"ablation {echo(repr(text))}: the rate must be {ablation.rate}.")
+        alone = ", ".join(MORE_ABLATIONS)
+        allowed = f"Allowed: {', '.join(map(_form, INPUT_ABLATIONS.values()))}; and alone {alone}."
+        raise ConfigError(unknown_name("ablation", name, INPUT_ABLATIONS, allowed))
+    number = ablation.rate.parse(rate) if ablation.rate else 0
+    if number is None or (colon and not ablation.rate):
+        kind = f", with {ablation.rate}" if ablation.rate else ""
+        raise ConfigError(f"ablation {echo(repr(text))}: write {_form(ablation)}{kind}.")
     return RatedAblation(ablation, number)
 
 

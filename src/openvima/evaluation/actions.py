@@ -3,17 +3,18 @@
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
 from openvima.data.shard import DAMAGE_ERRORS
-from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
+from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, one_line
 from openvima.evaluation.results import Row
 from openvima.evaluation.rollout_policies import Decision, Observation, RolloutPolicy
-from openvima.input_files import open_regular
+from openvima.input_files import read_bytes
 from openvima.scene import ACTION_SHAPES, Action
 from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES, ToolCommand
 
@@ -56,22 +57,16 @@ class ActionRecorder:
                 steps.append(numbers)
         return decisions
 
-    @property
-    def near_ties(self) -> Sequence[bool]:
-        """Those of the policy."""
-        return getattr(self._policy, "near_ties", ())
-
-    @property
-    def modalities(self) -> tuple[str, ...]:
-        """What the policy asks observations to hold."""
-        return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
+    def __getattr__(self, name: str) -> Any:  # `near_ties` and `modalities`, where the policy has them
+        return getattr(self._policy, name)
 
 
 class ActionReplay:
     """A rollout policy that replays recorded actions; where none is left it gives an `OracleError`."""
 
     def __init__(self, actions: Sequence[np.ndarray]) -> None:
-        self._actions, self._left = actions, [iter(steps) for steps in actions]
+        self._actions = actions
+        self._left: list[Iterator[np.ndarray]] = []
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start with the first actions; nothing is read from the environments."""
@@ -122,11 +117,7 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
     """
     path = folder / ACTIONS_NAME
     try:
-        with open_regular(path) as stream:
-            content = stream.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise DatasetError(f"{path} has more than {_MAX_BYTES} bytes, the most that is read.")
-        table = pa.ipc.open_file(content).read_all()
+        table = pa.ipc.open_file(read_bytes(path, max_bytes=_MAX_BYTES)).read_all()
         width = next(width for width, schema in _SCHEMAS.items() if table.schema.equals(schema))
         seeds = table.column(0).to_numpy()
         numbers = table.column(1).combine_chunks().flatten().to_numpy(zero_copy_only=False)
@@ -134,16 +125,13 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
         raise DatasetError(
             f"there is no {path}; evaluations of this version write it. Evaluate again with --force."
         ) from None
-    except DatasetError:
-        raise
     except (StopIteration, *DAMAGE_ERRORS) as error:
         raise DatasetError(f"{path} is damaged ({one_line(error)}).") from None
     numbers = numbers.reshape(-1, width)
-    counts = [outcome.steps for row in rows for outcome in row.outcomes]
-    if len(numbers) != sum(counts) or min(counts, default=0) < 0:
-        raise DatasetError(f"{path} has {len(numbers)} steps, but results.json counts {sum(counts)}.")
-    if not np.array_equal(seeds, np.repeat([o.seed for row in rows for o in row.outcomes], counts)):
-        raise DatasetError(f"{path} has steps of other seeds than results.json.")
+    outcomes = [outcome for row in rows for outcome in row.outcomes]
+    counts = [max(0, outcome.steps) for outcome in outcomes]
+    if not np.array_equal(seeds, np.repeat([outcome.seed for outcome in outcomes], counts)):
+        raise DatasetError(f"{path} has other steps than results.json counts.")
     episodes = iter(np.split(numbers, np.cumsum(counts)[:-1]))
     return {i: [next(episodes) for _ in row.outcomes] for i, row in enumerate(rows)}, _digest(seeds, numbers)
 

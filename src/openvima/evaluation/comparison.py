@@ -114,11 +114,10 @@ def _rows(evaluations: Mapping[str, Results], names: Mapping[str, Mapping[str, s
             joined[key] = _join_rows(joined[key], row) if key in joined else row
     policies = list(dict.fromkeys(row.policy for row in joined.values()))
     ablations = list(dict.fromkeys(row.ablation for row in joined.values()))
-    tasks = list(dict.fromkeys(row.task for row in joined.values()))
 
     def place(row: Row) -> tuple[int, ...]:
         level = LEVELS.index(row.level) if row.level in LEVELS else len(LEVELS)
-        return policies.index(row.policy), ablations.index(row.ablation), level, tasks.index(row.task)
+        return policies.index(row.policy), ablations.index(row.ablation), level
 
     return tuple(sorted(joined.values(), key=place))
 
@@ -180,19 +179,9 @@ class Difference:
     p_holm: float
 
     @property
-    def episodes(self) -> int:
-        """Number of episodes of both policies."""
-        return sum(pair.episodes for pair in self.pairs)
-
-    @property
-    def only_a(self) -> int:
-        """Number of episodes that only the first policy solved."""
-        return sum(pair.only_a for pair in self.pairs)
-
-    @property
-    def only_b(self) -> int:
-        """Number of episodes that only the second policy solved."""
-        return sum(pair.only_b for pair in self.pairs)
+    def total(self) -> PairCounts:
+        """Outcomes of all its tasks and levels."""
+        return PairCounts.sum(self.pairs)
 
     @property
     def verdict(self) -> Verdict:
@@ -213,12 +202,12 @@ class Difference:
         return {
             "level": self.level or "all",
             "task": self.task or "mean",
-            "episodes": self.episodes,
+            "episodes": self.total.episodes,
             "rates": [round(self.rate_a, 6), round(self.rate_b, 6)],
             "difference": round(self.difference, 6),
             "interval": [round(end, 6) for end in self.interval],
-            "only_a": self.only_a,
-            "only_b": self.only_b,
+            "only_a": self.total.only_a,
+            "only_b": self.total.only_b,
             "p_mcnemar": self.p_value,
             "p_mcnemar_mid": self.p_mid,
             "p_holm": self.p_holm,
@@ -327,20 +316,13 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 
 def _rows_of(results: Results, name: str) -> dict[tuple[str, str], Row]:
     """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
-    known = results.policy_names()
-    # Both names may hold a separator, as in mine@10:30 and masked_words:0.2.
-    begun = [each for each in known if f"{name}{ABLATION_SEPARATOR}".startswith(each + ABLATION_SEPARATOR)]
-    policy = max(begun, key=len, default=name.partition(ABLATION_SEPARATOR)[0])
-    ablation = name[len(policy) + 1 :]
-    if policy not in known:
-        raise UnknownPolicyError(unknown_name("policy", policy, known))
-    of_policy = [row for row in results.rows if row.policy == policy]
-    rows = [row for row in of_policy if row.ablation == ablation]
-    if ablation and not rows:
-        ablations = dict.fromkeys(row.ablation for row in of_policy if row.ablation)
-        raise UnknownPolicyError(unknown_name(f"ablation of {policy}", ablation, ablations))
+    rows: dict[str, list[Row]] = {}
+    for row in results.rows:
+        rows.setdefault(ABLATION_SEPARATOR.join(filter(None, (row.policy, row.ablation))), []).append(row)
+    if name not in rows:
+        raise UnknownPolicyError(unknown_name("policy", name, rows))
     order = results.levels()
-    return {(row.level, row.task): row for row in sorted(rows, key=lambda row: order.index(row.level))}
+    return {(row.level, row.task): row for row in sorted(rows[name], key=lambda row: order.index(row.level))}
 
 
 def _pair(a: Row, b: Row) -> PairCounts | None:
@@ -354,7 +336,8 @@ def _pair(a: Row, b: Row) -> PairCounts | None:
 
 def _difference(level: str, task: str, pairs: tuple[PairCounts, ...]) -> Difference:
     difference, interval = mean_difference(pairs)
-    p_value, p_mid = mcnemar(sum(pair.only_a for pair in pairs), sum(pair.only_b for pair in pairs))
+    total = PairCounts.sum(pairs)
+    p_value, p_mid = mcnemar(total.only_a, total.only_b)
     return Difference(
         level=level,
         task=task,

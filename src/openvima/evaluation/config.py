@@ -25,15 +25,14 @@ from openvima.evaluation.ablations import (
     ablated_environment,
     ablation_parts,
     applies_to,
-    canonical_ablation,
     names_in,
 )
-from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS, no_edited_prompt
+from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import PolicySource, policy_sources
 from openvima.input_files import settle
 from openvima.multiprocess import engine_problems
-from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
+from openvima.policies.naming import ORACLE, RANDOM
 from openvima.scene.action import steps_per_primitive
 from openvima.serving.chat import DEFAULT_VLM, VlmConfig
 from openvima.serving.lerobot import lerobot_server
@@ -79,7 +78,7 @@ class EvaluationConfig:
             several joined by "+"; "random" and "oracle", which are added as policies; or "all", for
             `openvima.evaluation.ablations.ABLATIONS` and both policies. They are kept in one spelling. With
             "in_context" all tasks are those that have an edited prompt.
-        boxes: For the ablation "detected_boxes": "detector" for the bundled one,
+        boxes: For the ablation "detected_boxes", which it implies: "detector" for the bundled one,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
         engine: "processes" of this machine, or "ray".
@@ -118,6 +117,12 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         settle(self, paths=("out",), texts=("python",), names=("policies", "tasks", "levels", "ablations"))
+        is_implied = self.boxes is not None and "all" not in self.ablations and not self.uses(DETECTED_BOXES)
+        spelled = [
+            name if name in MORE_ABLATIONS else "+".join(map(str, ablation_parts(name)))
+            for name in filter(None, (*self.ablations, *[DETECTED_BOXES] * is_implied))
+        ]
+        object.__setattr__(self, "ablations", tuple(dict.fromkeys(spelled)))
         problems = [
             f"{name} is {value}; it must be at least {least}."
             for name, value, least in (
@@ -135,34 +140,15 @@ class EvaluationConfig:
             for name, values in (("policy", self.policies), ("tasks", self.tasks), ("levels", self.levels))
             if not values
         ]
-        if problems := [*problems, *self._unknown_names(), *self._contradictions()]:
+        if problems := [*problems, *self._contradictions()]:
             raise ConfigError(" ".join(problems))
-        spelled = (n if n in MORE_ABLATIONS else canonical_ablation(n) for n in self.ablations)
-        object.__setattr__(self, "ablations", tuple(dict.fromkeys(spelled)))
 
-    def _unknown_names(self) -> Iterator[str]:
-        for name in self.ablations:
-            try:
-                if name not in MORE_ABLATIONS and not ablation_parts(name):
-                    yield "an ablation is empty; leave it out."
-            except ConfigError as error:
-                yield str(error)
+    def _contradictions(self) -> Iterator[str]:
         if self.precision is not None and self.precision not in PRECISIONS:
             yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
         yield from engine_problems(self.engine, self.address)
-
-    def _contradictions(self) -> Iterator[str]:
-        if self.python is not None and not any(
-            one.kind == "lerobot" for one in policy_sources(self.policies)
-        ):
-            yield f"python is {self.python!r}, but no policy is lerobot:PATH."
-        takes_boxes = self.uses(DETECTED_BOXES)
-        if takes_boxes and self.boxes is None:
+        if self.boxes is None and self.uses(DETECTED_BOXES):
             yield f"ablation {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
-        if self.uses(IN_CONTEXT):
-            yield from filter(None, (no_edited_prompt(task) for task in self.tasks if task != "all"))
-        if self.boxes is not None and not (takes_boxes or "all" in self.ablations):
-            yield f"boxes is {self.boxes!r}, which only the ablation {DETECTED_BOXES} plugs in; ask for it."
 
     @property
     def sources(self) -> tuple[PolicySource, ...]:
@@ -210,16 +196,14 @@ class EvaluationConfig:
             ConfigError: `python` cannot be started, or as for `policy_sources`.
             ServerError: A policy cannot be served.
         """
-        sources = policy_sources(self.policies) if self.python else ()
-        if not any(source.kind == "lerobot" for source in sources):
+        if self.python is None:
             yield self
             return
-        assert self.python is not None
         with ExitStack() as stack:
             policies = []
-            for source in sources:
+            for source in policy_sources(self.policies):
                 where = source.source
-                if PolicyRef.parse(where).kind == "lerobot":
+                if source.kind == "lerobot":
                     where = stack.enter_context(lerobot_server(where, self.python, device=self.device))
                 policies.append(f"{source.name}={where}")
             yield replace(self, policies=tuple(policies), python=None)
@@ -251,6 +235,12 @@ class EvaluationConfig:
 
     def record(self) -> dict[str, object]:
         """Settings that the results depend on, as plain JSON values."""
+        unless_usual = {
+            "device": "" if self.device == DEFAULT_DEVICE else self.device,
+            "precision": self.precision,
+            "ablations": list(self.ablations),
+            "boxes": self.boxes,
+        }
         return {
             "policies": [source.name for source in self.sources],
             "tasks": list(self.tasks),
@@ -260,10 +250,7 @@ class EvaluationConfig:
             "domain": "eval",
             "batch": self.batch,
             **self.env_config.record(),
-            **({} if self.device == DEFAULT_DEVICE else {"device": self.device}),
-            **({"precision": self.precision} if self.precision else {}),
-            **({"ablations": list(self.ablations)} if self.ablations else {}),
-            **({"boxes": self.boxes} if self.boxes else {}),
+            **{name: value for name, value in unless_usual.items() if value},
         }
 
 
@@ -300,6 +287,11 @@ class Batch:
     boxes: str = ""
     trust_code: bool = False
     vlm: VlmConfig = DEFAULT_VLM
+
+    @property
+    def cell(self) -> tuple[str, str, str, str]:
+        """Policy, ablation, task and level: what a row of the results is of."""
+        return self.policy, self.ablation, self.task, self.level
 
     @property
     def seeds(self) -> range:
@@ -349,21 +341,20 @@ def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]
         for task in tasks
         if level in task_spec(task).levels
     ]
-    asked = ", ".join(config.levels)
-    stranded = [task for task in tasks if task not in {task for task, _ in pairs}]
-    if stranded and "all" not in config.tasks:
-        where = "; ".join(f"{task} exists at {', '.join(task_spec(task).levels)}" for task in stranded)
-        raise ConfigError(f"nothing to play at {asked}: {where}. Change --levels or leave the task out.")
-    if not pairs:
-        raise ConfigError(f"{asked} hold none of the tasks; `openvima tasks` shows the levels of each task.")
-    check_task_options(tuple(dict.fromkeys(task for task, _ in pairs)), config.env_config.task_options)
+    played = dict.fromkeys(task for task, _ in pairs)
+    stranded = [task for task in tasks if task not in played]
+    if not pairs or (stranded and "all" not in config.tasks):
+        raise ConfigError(
+            f"nothing to play: {', '.join(stranded)} at {', '.join(config.levels)}; `openvima tasks` shows "
+            "the levels of each task."
+        )
+    check_task_options(tuple(played), config.env_config.task_options)
     ablated = ablated_environment(ablation, config.env_config)
     kept = [(task, level) for task, level in pairs if applies_to(ablation, task, ablated)]
     if not kept:
-        tasks = list(dict.fromkeys(task for task, _ in pairs))
         others = [task for task in list_tasks() if applies_to(ablation, task, ablated)]
         raise ConfigError(
-            f"ablation {ablation} applies to none of the tasks {', '.join(tasks)}; it does to "
+            f"ablation {ablation} applies to none of the tasks {', '.join(played)}; it does to "
             f"{', '.join(others)}."
         )
     return kept
@@ -394,16 +385,14 @@ def plan(config: EvaluationConfig) -> list[Batch]:
     ]
 
 
-def rows_of(
-    batches: Sequence[Batch], outcomes: Mapping[Batch, tuple[EpisodeOutcome, ...]]
-) -> tuple[Row, ...]:
-    """Join the batches of each policy, ablation, task and level."""
-    joined: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
-    for batch in batches:
-        cell = (batch.policy, batch.ablation, batch.task, batch.level)
-        joined.setdefault(cell, []).extend(outcomes[batch])
-    factor = steps_per_primitive(batches[0].env_config.control) if batches else 1
+def rows_of(outcomes: Mapping[Batch, Sequence[EpisodeOutcome]]) -> tuple[Row, ...]:
+    """Join the batches of each policy, ablation, task and level; they are given in their order."""
+    joined: dict[tuple[str, str, str, str], tuple[EpisodeOutcome, ...]] = {}
+    factor = 1
+    for batch, played in outcomes.items():
+        factor = steps_per_primitive(batch.env_config.control)
+        joined[batch.cell] = (*joined.get(batch.cell, ()), *played)
     return tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps * factor, tuple(played), ablation)
+        Row(policy, task, level, task_spec(task).oracle_max_steps * factor, played, ablation)
         for (policy, ablation, task, level), played in joined.items()
     )

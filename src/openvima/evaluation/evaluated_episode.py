@@ -11,8 +11,8 @@ from openvima.evaluation.ablations import DETECTED_BOXES, ablated_environment
 from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.results import EpisodeOutcome, Results
-from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
-from openvima.evaluation.sources import NAMED_POLICIES, PolicySource, weights_hash
+from openvima.evaluation.rollout_policies import RolloutPolicy, load_own_rollout_policy
+from openvima.evaluation.sources import NAMED_POLICIES, weights_hash
 from openvima.evaluation.verification import recorded_env_config
 from openvima.policies.naming import BUNDLED, CHECKPOINTS_FOLDER, UNTRAINED
 from openvima.policies.presets import PRESETS
@@ -54,7 +54,7 @@ class EvaluatedEpisode:
 
         Raises:
             PolicyError: Nobody knows where the policy is, or the detector is code, which is not trusted.
-            UnknownPolicyError, InputFileError, ServerError: As for `load_rollout_policy`.
+            UnknownPolicyError, InputFileError, ServerError: As for `load_own_rollout_policy`.
         """
         if not self.batch.source:
             raise PolicyError(
@@ -66,8 +66,16 @@ class EvaluatedEpisode:
                 f"the results name code as their detector, boxes {echo(repr(self.batch.boxes))}; if you "
                 "trust it, allow it with --trust-code. The recorded actions can be played without."
             )
-        PolicySource(self.batch.policy, self.batch.source, self.batch.trust_code).check()
-        return load_rollout_policy(self.batch, own=True)
+        batch = self.batch
+        return load_own_rollout_policy(
+            batch.source,
+            ablation=batch.ablation,
+            name=batch.policy,
+            boxes=batch.boxes,
+            trust_code=batch.trust_code,
+            device=batch.device,
+            precision=batch.precision,
+        )
 
     def recorded_policy(self) -> RolloutPolicy:
         """Return what repeats the recorded actions, without the policy.
@@ -78,15 +86,6 @@ class EvaluatedEpisode:
         if self.actions is None:
             raise PolicyError("the evaluation kept no actions; name the policy's weights to play it again.")
         return ActionReplay([self.actions])
-
-
-def success_rates(results: Results, policy: str, ablation: str = "") -> dict[str, dict[str, float]]:
-    """Return the success rate of a policy by task and level, from 0 to 1."""
-    rates: dict[str, dict[str, float]] = {}
-    for row in results.rows:
-        if (row.policy, row.ablation) == (policy, ablation):
-            rates.setdefault(row.task, {})[row.level] = row.rate
-    return rates
 
 
 def evaluated_episode(

@@ -26,7 +26,7 @@ from functools import cache
 import numpy as np
 
 from openvima.env.tabletop import TabletopEnv
-from openvima.errors import ConfigError, OracleError, PromptError, SamplingError, echo, unknown_name
+from openvima.errors import OracleError, PromptError, SamplingError, echo
 from openvima.policies.tokenizer import UNKNOWN, benchmark_vocabulary
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, ObjectRecord, Prompt, RenderedPrompt
@@ -187,14 +187,11 @@ def in_context_prompt(prompt: RenderedPrompt, task: str) -> RenderedPrompt:
 
     Args:
         prompt: The task's own prompt.
-        task: Name of the task.
+        task: One of `IN_CONTEXT_TASKS`.
 
     Raises:
-        ConfigError: The task has no edited prompt.
         PromptError: The prompt is not one of that task.
     """
-    if problem := no_edited_prompt(task):
-        raise ConfigError(problem)
     text, names = prompt.text, tuple(prompt.images)
     if task == "twist":
         found = _TEXTURE.search(text)
@@ -209,13 +206,6 @@ def in_context_prompt(prompt: RenderedPrompt, task: str) -> RenderedPrompt:
 
 def _slots(names: tuple[str, ...]) -> str:
     return " ".join(f"{{{name}}}" for name in names)
-
-
-def no_edited_prompt(task: str) -> str:
-    """Return why a task has no in-context evaluation; empty if it has one."""
-    if task in IN_CONTEXT_TASKS:
-        return ""
-    return unknown_name("in-context evaluation of task", task, IN_CONTEXT_TASKS)
 
 
 def demonstrated(env: TabletopEnv) -> RenderedPrompt:
@@ -249,11 +239,6 @@ def demonstrated(env: TabletopEnv) -> RenderedPrompt:
 def held_out_phrasings() -> Phrasings:
     """Return the phrasings by task."""
     return read_phrasings("openvima.evaluation", "phrasings.yaml")
-
-
-def has_phrasings(task: str) -> bool:
-    """Whether a task has held-out phrasings."""
-    return task in held_out_phrasings()
 
 
 def in_held_out_phrasing(text: str, task: str, rng: np.random.Generator) -> str:

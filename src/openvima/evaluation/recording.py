@@ -1,7 +1,7 @@
 """Episodes as videos and images, and online evaluation of checkpoints during training."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +17,13 @@ from openvima.evaluation.rollout_policies import (
     OracleRolloutPolicy,
     PromptedRolloutPolicy,
     RolloutPolicy,
-    explainer_of,
+    explains,
+    explanation_of,
 )
 from openvima.input_files import as_path
+from openvima.policies.base import POLICIES_THAT_EXPLAIN
 from openvima.policies.loading import load_policy
 from openvima.scene import Episode
-from openvima.scene.explanation import Explanation
 from openvima.sim.primitive_state import FRAMES_PER_SECOND
 from openvima.video.encoder import Animation, png
 from openvima.video.prompt_strip import MUTED, PAPER, draw_prompt_strip, font
@@ -60,25 +61,14 @@ def record_episode(
     Raises:
         PolicyError: The policy explains nothing.
     """
-    explainer = _explainer(policy) if explain else None
+    if explain and not explains(policy):
+        raise PolicyError(f"the policy has no explain(). {POLICIES_THAT_EXPLAIN}")
+    explainer = partial(explanation_of, policy) if explain else None
     begin_episode(env, start)
     with EpisodeRecorder(env, path, title=title, with_prompt=with_prompt, explain=explainer) as recorder:
         (outcome,) = play([env], [start], policy, after_step=recorder.record_step, may_fail=may_fail)
         recorder.record_outcome(outcome.success if env.episode.problem.goals else None, outcome.steps)
     return outcome
-
-
-def _explainer(policy: RolloutPolicy) -> Callable[[], Explanation]:
-    """Return the function that explains the last action in the only episode of a policy."""
-    explain_all = explainer_of(policy)
-
-    def explain() -> Explanation:
-        (explanation,) = explain_all()
-        if explanation is None:
-            raise PolicyError("explain() of the policy returned None for an episode that goes on.")
-        return explanation
-
-    return explain
 
 
 def save_episode_image(

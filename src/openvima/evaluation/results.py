@@ -4,16 +4,15 @@ import hashlib
 import json
 import platform
 import re
-import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.env.registration import ENVIRONMENT_VERSION
-from openvima.errors import MAX_CHARACTERS, DatasetError, InputFileError, brief_repr, cut, echo
+from openvima.errors import MAX_CHARACTERS, DatasetError, brief_repr, cut, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
 from openvima.html import notebook_html
 from openvima.imports import versions_of
@@ -174,15 +173,15 @@ class Results:
 
     def policy_names(self) -> list[str]:
         """Names of the policies, in the order of the rows."""
-        return _in_order(row.policy for row in self.rows)
+        return list(dict.fromkeys(row.policy for row in self.rows))
 
     def levels(self) -> list[str]:
         """Levels that occur, in the order of the rows."""
-        return _in_order(row.level for row in self.rows)
+        return list(dict.fromkeys(row.level for row in self.rows))
 
     def tasks(self, level: str | None = None) -> list[str]:
         """Tasks that occur, at one level or at all."""
-        return _in_order(row.task for row in self.rows if level in (None, row.level))
+        return list(dict.fromkeys(row.task for row in self.rows if level in (None, row.level)))
 
     def row(self, policy: str, task: str, level: str, ablation: str = "") -> Row | None:
         """The row of that policy, task and level, under an ablation or plain, if there is one."""
@@ -288,36 +287,31 @@ class ResultsFile:
         Raises:
             DatasetError: The file is missing, damaged, too large or of another schema.
         """
-        folder = path.parent if path.suffix == ".json" else path
         path = path / FILE_NAME if path.is_dir() else path
         if not path.is_file():
-            out = shlex.quote(str(folder))
-            raise DatasetError(f"there is no {path}; `openvima evaluate --out {out}` writes one.")
+            raise DatasetError(f"there is no {path}; `openvima evaluate --out FOLDER` writes one.")
         try:
             text = read_text(path, max_bytes=_MAX_BYTES)
             content = json.loads(text)
-            if content.get("schema") != SCHEMA:
-                raise DatasetError(
-                    f"{path} has schema {echo(repr(content.get('schema')))}; this version reads schema "
-                    f"{SCHEMA}. Evaluate again, or read it with the version of openvima that wrote it."
-                )
-            rows = tuple(_row_from_record(record) for record in content["rows"])
-            described = (content["config"], content["versions"], content["policies"])
-            return ResultsFile(Results(rows, *described, content.get("actions_sha256", "")), text, content)
-        except InputFileError as error:
-            raise DatasetError(str(error)) from None
-        except DatasetError:
-            raise
+            schema = content["schema"]
+            if schema == SCHEMA:
+                rows = tuple(_row_from_record(record) for record in content["rows"])
+                described = (content["config"], content["versions"], content["policies"])
+                results = Results(rows, *described, content.get("actions_sha256", ""))
+                return ResultsFile(results, text, content)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise DatasetError(
                 f"{path} is damaged ({echo(repr(error))}); evaluate again with --force."
             ) from error
+        raise DatasetError(
+            f"{path} has schema {echo(repr(schema))}; this version reads schema {SCHEMA}. Evaluate again, or "
+            "read it with the version of openvima that wrote it."
+        )
 
     @property
     def sha256(self) -> str:
         """The digest that it states; empty without one."""
-        stated = self.content.get("sha256", "")
-        return stated if isinstance(stated, str) else ""
+        return str(self.content.get("sha256", ""))
 
 
 def _json_text(content: Mapping[str, object]) -> str:
@@ -332,10 +326,6 @@ def failure_kind(reason: str) -> str:
         'object left the workspace'
     """
     return re.sub(r"\bobject \d+( \([^)]*\))?", "object", reason).strip().rstrip(".") or "unknown"
-
-
-def _in_order(names: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(names))
 
 
 def _row_record(row: Row) -> dict[str, object]:

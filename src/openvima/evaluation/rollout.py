@@ -49,29 +49,25 @@ class EpisodeSlot:
     def step(self, decision: Decision) -> None:
         """Take one step, unless there is no usable action; then the episode has failed."""
         if isinstance(decision, OracleError):
-            return self._end(str(decision), NO_ORACLE_ACTION)
+            return self.end(str(decision), NO_ORACLE_ACTION)
         if isinstance(decision, AnswerError):
-            return self._end(str(decision), decision.kind)
+            return self.end(str(decision), decision.kind)
         assert decision is not None  # rollout policies have checked it
         try:
             _, terminated, truncated, info = self.env.advance(decision)
         except ActionError as error:
-            return self._end(str(error), BAD_ACTION)
+            return self.end(str(error), BAD_ACTION)
         self.steps += 1
         self.grasped |= {info["grasped"]} - {0}
         if info["success"]:
             self.observation, self.outcome = None, self._outcome(True)
         elif terminated:
-            self._end(info["reason"], failure_kind(info["reason"]))
+            self.end(info["reason"], failure_kind(info["reason"]))
         elif truncated:
-            self._end(*self._why_not_done(info["end_effector"] == "suction"))
+            self.end(*self._why_not_done(info["end_effector"] == "suction"))
         else:
             self.observation = self.env.observe()
         return None
-
-    def fail(self, error: OpenVimaError) -> None:
-        """End the episode by an error of the policy."""
-        self._end(str(error), POLICY_ERROR)
 
     def _why_not_done(self, picks: bool) -> tuple[str, str]:
         """Say what was lacking at the end of the steps, with numbers and without."""
@@ -87,7 +83,8 @@ class EpisodeSlot:
         needed = problem.num_required or len(problem.goals)
         return f"{OUT_OF_STEPS}: {num_met} of {needed} goals were met", OUT_OF_STEPS
 
-    def _end(self, reason: str, kind: str) -> None:
+    def end(self, reason: str, kind: str) -> None:
+        """End the episode as a failure."""
         self.observation = None
         self.outcome = self._outcome(False, reason, kind)
 
@@ -149,12 +146,12 @@ def play(
         return _outcomes(slots)
     running = [index for index, slot in enumerate(slots) if slot.outcome is None]
     if len(running) == 1:
-        slots[running[0]].fail(error)
+        slots[running[0]].end(str(error), POLICY_ERROR)
     else:
         for index in running:
             slots[index] = EpisodeSlot(envs[index], starts[index])
             if (own := _play_together([slots[index]], policy, after_step)) is not None:
-                slots[index].fail(own)
+                slots[index].end(str(own), POLICY_ERROR)
     outcomes = _outcomes(slots)
     is_of_batch = not isinstance(error, PolicyRaisedError) and all(o.kind != POLICY_ERROR for o in outcomes)
     never_acts = all(outcome.kind == POLICY_ERROR and not outcome.steps for outcome in outcomes)

@@ -24,7 +24,7 @@ from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.chat import Said, said_in, shot_turns
 from openvima.evaluation.config import Batch
 from openvima.evaluation.sources import PolicySource
-from openvima.policies.base import POLICIES_THAT_EXPLAIN, require_torch, torch_threads
+from openvima.policies.base import require_torch, torch_threads
 from openvima.policies.loading import checked_policy, reads_environments
 from openvima.policies.naming import ORACLE, RANDOM, PolicyRef
 from openvima.scene import Action
@@ -36,15 +36,13 @@ from openvima.user_code import described
 
 _MAX_SEEDS = 16  # that an error lists
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
-Explainer = Callable[[], Sequence[Explanation | None]]  # see `openvima.policies.Policy`
 Decision = Mapping[str, Any] | Action | np.ndarray | ToolCommand | OracleError | AnswerError | None
 
 
 class RolloutPolicy(Protocol):
     """Decides actions for a batch of environments.
 
-    It may have `modalities` and `near_ties` as a policy has them, and `explainer()`, which returns what
-    explains the last actions or raises a `PolicyError`.
+    It may have `modalities`, `near_ties` and `explain` as a policy has them.
     """
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
@@ -76,15 +74,24 @@ class OracleRolloutPolicy:
         return [None if observation is None else _oracle(env) for env, observation in pairs]
 
 
-def explainer_of(policy: RolloutPolicy) -> Explainer:
-    """Return what explains the last actions of a rollout policy.
+def explains(policy: RolloutPolicy) -> bool:
+    """Whether a rollout policy explains its actions."""
+    return getattr(policy, "explain", None) is not None
+
+
+def explanation_of(policy: Any) -> Explanation:
+    """Return what a rollout policy that explains considered for its last action in its only episode.
 
     Raises:
-        PolicyError: Nothing does.
+        PolicyError: It returned something else.
     """
-    if not hasattr(policy, "explainer"):
-        raise PolicyError(f"{type(policy).__name__} has no explain(). {POLICIES_THAT_EXPLAIN}")
-    return policy.explainer()  # type: ignore[attr-defined]
+    found = policy.explain()
+    if not (isinstance(found, list | tuple) and len(found) == 1 and isinstance(found[0], Explanation)):
+        raise PolicyError(
+            f"explain() returned {echo(repr(found))}; give a list of an Explanation for each episode that "
+            "goes on, see docs/explain.md."
+        )
+    return found[0]
 
 
 def _read(action: object) -> None:
@@ -186,28 +193,10 @@ class PromptedRolloutPolicy:
                 f"{self._name} raised {described(error)}, in {_episodes(envs)}."
             ) from error
 
-    def explainer(self) -> Explainer:
-        """Return the method with which the policy explains its last actions.
-
-        Raises:
-            PolicyError: It has none.
-        """
-        explain = getattr(self._policy, "explain", None)
-        if explain is None:
-            kind = type(self._policy).__name__
-            raise PolicyError(f"a policy of kind {kind} has no explain(). {POLICIES_THAT_EXPLAIN}")
-
-        def checked() -> list[Explanation | None]:
-            found = explain()
-            is_list = isinstance(found, list | tuple)
-            if not is_list or not all(isinstance(each, Explanation | None) for each in found):
-                raise PolicyError(
-                    f"explain() of {self._name} returned {echo(repr(found))}; give a list of an Explanation "
-                    "or None for each episode, see docs/explain.md."
-                )
-            return list(found)
-
-        return checked
+    @property
+    def explain(self) -> Callable[[], Any] | None:
+        """The method with which the policy explains its last actions, if it has one."""
+        return getattr(self._policy, "explain", None)
 
     @property
     def near_ties(self) -> Sequence[bool]:
@@ -242,14 +231,13 @@ class VlmRolloutPolicy(PromptedRolloutPolicy):
         return decisions
 
 
-def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = False) -> RolloutPolicy:
+def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
     """Load the policy of a batch of episodes.
 
     Args:
         batch: The episodes.
         fingerprint: Text that stands for the policy's weights; a policy that was loaded before is used again
             only if it is the same.
-        own: Load a policy that nobody else has a reference to, for several that play at once.
 
     Raises:
         UnknownPolicyError: There is no such policy or run folder.
@@ -259,15 +247,14 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "", *, own: bool = Fals
     """
     if batch.source == ORACLE:
         return OracleRolloutPolicy()
-    options: dict[str, Any] = {
-        "device": batch.device,
-        "precision": batch.precision,
-        "boxes": batch.boxes,
-        "trust_code": batch.trust_code,
-        "vlm": batch.vlm,
-    }
-    policy = (
-        build_policy(batch.source, **options) if own else _load_policy(batch.source, fingerprint, **options)
+    policy = _load_policy(
+        batch.source,
+        fingerprint,
+        device=batch.device,
+        precision=batch.precision,
+        boxes=batch.boxes,
+        trust_code=batch.trust_code,
+        vlm=batch.vlm,
     )
     return _rollout_policy(policy, batch.ablation, batch.policy)
 
@@ -296,12 +283,20 @@ def one_thread(batch: Batch) -> Iterator[None]:
 
 
 def load_own_rollout_policy(
-    source: str, *, boxes: str = "", trust_code: bool = False, **options: Any
+    source: str,
+    *,
+    ablation: str = "",
+    name: str = "",
+    boxes: str = "",
+    trust_code: bool = False,
+    **options: Any,
 ) -> RolloutPolicy:
     """Load a policy that nobody else has a reference to, with episodes of its own.
 
     Args:
         source: As for `openvima evaluate --policy`.
+        ablation: Input ablation; empty for none.
+        name: Name of the policy, for errors; by default the source.
         boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
         trust_code: Run the code that a run folder names.
         **options: `device`, `precision` and `vlm`, as in `Batch`.
@@ -312,7 +307,8 @@ def load_own_rollout_policy(
     PolicySource(source, source, trust_code).check()
     if source == ORACLE:
         return OracleRolloutPolicy()
-    return _rollout_policy(build_policy(source, boxes=boxes, trust_code=trust_code, **options), "", source)
+    policy = build_policy(source, boxes=boxes, trust_code=trust_code, **options)
+    return _rollout_policy(policy, ablation, name or source)
 
 
 @lru_cache(maxsize=1)

@@ -16,7 +16,7 @@ from openvima.atomic_io import FINISH_S, Part, atomic_write_file, folder_lock, p
 from openvima.catalog.packs import load_assets
 from openvima.detector.plugins import plugged_boxes
 from openvima.env.config import EnvConfig
-from openvima.errors import ConfigError, PolicyError, differences, echo, one_word_warning
+from openvima.errors import ConfigError, differences, echo, one_word_warning
 from openvima.evaluation.ablations import NOISY_BOXES
 from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
 from openvima.evaluation.chat import Said, summarise, write_answers
@@ -185,7 +185,7 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         played = _play_all(prepared, report)
-        rows = rows_of(prepared.batches, {batch: rollouts.outcomes for batch, rollouts in played.items()})
+        rows = rows_of({batch: played[batch].outcomes for batch in prepared.batches})
         episodes = (  # in the order of the rows
             episode
             for batch in prepared.batches
@@ -204,11 +204,10 @@ def finished_part(config: EvaluationConfig) -> Results | None:
     """Return the results of the tasks and levels whose episodes are all finished; None without any."""
     prepared = prepare(config)
     kept = {job.batch: _kept(job, config.out) for job in _jobs(prepared)}
-    cells = [(batch.policy, batch.ablation, batch.task, batch.level) for batch in kept]
-    open_cells = {cell for cell, played in zip(cells, kept.values(), strict=True) if played is None}
-    whole = [batch for batch, cell in zip(kept, cells, strict=True) if cell not in open_cells]
-    outcomes = {batch: played.outcomes for batch, played in kept.items() if played is not None}
-    rows = rows_of(whole, outcomes)
+    unfinished = {batch.cell for batch, played in kept.items() if played is None}
+    rows = rows_of(
+        {b: played.outcomes for b, played in kept.items() if played is not None and b.cell not in unfinished}
+    )
     return Results(rows, prepared.record(), prepared.versions, prepared.policies) if rows else None
 
 
@@ -220,7 +219,7 @@ def _answered(
     episodes: dict[str, list[tuple[EpisodeOutcome, Said]]] = {}
     for batch in prepared.batches:
         rollouts = played[batch]
-        where = {"policy": batch.policy, "task": batch.task, "level": batch.level, "ablation": batch.ablation}
+        where = {name: getattr(batch, name) for name in ("policy", "task", "level", "ablation")}
         for outcome, said in zip(rollouts.outcomes, rollouts.said, strict=False):  # of others nothing is said
             episodes.setdefault(batch.policy, []).append((outcome, said))
             steps += [where | {"seed": outcome.seed, "step": n} | step for n, step in enumerate(said)]
@@ -264,8 +263,7 @@ def _play_all(prepared: PreparedEvaluation, report: Report | None) -> dict[Batch
         finished[job.batch] = played
         done += job.batch.episodes
         if report is not None:
-            words = (job.batch.policy, job.batch.ablation, job.batch.task, job.batch.level)
-            report(done, total, " ".join(filter(None, words)))
+            report(done, total, " ".join(filter(None, job.batch.cell)))
     return finished
 
 
@@ -350,16 +348,9 @@ def _kept(job: Job, folder: Path) -> Rollouts | None:
     try:
         record = json.loads(job.part(folder).read_text(encoding="utf-8"))
         outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
-        actions = tuple(record["actions"])
-        said = tuple(record["said"])
-        whole = [len(steps) for steps in actions] == [outcome.steps for outcome in outcomes]
+        return Rollouts(outcomes, tuple(record["actions"]), tuple(record["said"]))
     except (OSError, ValueError, TypeError, LookupError):
         return None
-    return (
-        Rollouts(outcomes, actions, said)
-        if whole and [o.seed for o in outcomes] == [*job.batch.seeds]
-        else None
-    )
 
 
 def _write_log(
@@ -421,10 +412,6 @@ def score(
         >>> score({"random": RandomPolicy()}, tasks=("rotate",), levels=("L1",), episodes=2).rows[0].episodes
         2
     """
-    if not isinstance(policies, Mapping):
-        raise PolicyError(
-            f"policies is a {type(policies).__name__}; give policies by name, as {{'mine': …}}."
-        )
     config = EvaluationConfig(
         tuple(policies),
         tasks=names_of(tasks),
@@ -443,11 +430,10 @@ def score(
             f"policy {', '.join(own)} extracts objects by code of its own, which the ablation {NOISY_BOXES} "
             "does not reach; leave it out."
         )
-    batches = plan(config)
-    outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}
+    outcomes: dict[Batch, list[EpisodeOutcome]] = {}
     begun: set[str] = set()
     with one_word_warning():
-        for batch in batches:
+        for batch in plan(config):
             envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
             given = policies.get(batch.policy)
             rollout_policy = (
@@ -456,7 +442,7 @@ def score(
                 else PromptedRolloutPolicy(given, batch.ablation, name=batch.policy)
             )
             may_fail = batch.policy in begun  # a policy that fails from the start is an error, no result
-            outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy, may_fail=may_fail))
+            outcomes[batch] = play(envs, batch.seeds, rollout_policy, may_fail=may_fail)
             begun.add(batch.policy)
     kinds = {
         source.name: {"kind": "object", **object_record(policies[source.name])}
@@ -464,4 +450,4 @@ def score(
         else source.record()
         for source in config.sources
     }
-    return Results(rows_of(batches, outcomes), config.record(), versions(with_torch=True), kinds)
+    return Results(rows_of(outcomes), config.record(), versions(with_torch=True), kinds)

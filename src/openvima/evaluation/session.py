@@ -28,7 +28,8 @@ from openvima.evaluation.rollout_policies import (
     Decision,
     PromptedRolloutPolicy,
     RolloutPolicy,
-    explainer_of,
+    explains,
+    explanation_of,
     load_own_rollout_policy,
 )
 from openvima.evaluation.sources import ORACLE
@@ -261,20 +262,12 @@ class EpisodeSession:
             given = self._decision
             arrays: Any = given  # of an action: a policy of the other control is refused
             action = given if isinstance(given, Action) else Action.from_arrays(arrays)
-            return Proposal(action, self._explanation() if explain else None)
+            explains_it = explain and explains(self._policy)
+            return Proposal(action, explanation_of(self._policy) if explains_it else None)
         except OpenVimaError as error:
             return Proposal(action, error=error)
         except Exception as error:  # of the policy's own `explain`
             return Proposal(action, error=PolicyError(f"the policy raised {described(error)}."))
-
-    def _explanation(self) -> Explanation | None:
-        assert self._policy is not None  # it has decided
-        try:
-            explain = explainer_of(self._policy)
-        except PolicyError:  # it explains nothing
-            return None
-        (explanation,) = explain()
-        return explanation
 
 
 def first_difference(first: Sequence[SessionStep], second: Sequence[SessionStep]) -> int | None:

@@ -132,21 +132,20 @@ class PolicySource:
         if self.kind == "code":
             policy = policy_of_code(self.source)
             return {"kind": "code", **_code_record(self.source), **object_record(policy)}
-        if code := self.learner:
-            weights = weights_hash(self.source)
-            return {"kind": "run", "sha256": weights, "code": _code_record(code.source), **self._seen()}
         if self.kind == "run":
             if self.source in BUNDLED:
                 return {"kind": "run", "bundled": self.source, "sha256": weights_hash(self.source)}
-            left_out = {"excluded_tasks": tasks} if (tasks := tasks_left_out(self.source)) else {}
-            what = {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
-            return what | ({"hub": resolved} if (resolved := hub_commit(self.source)) else {})
+            code = self.learner
+            about = {
+                "code": code and _code_record(code.source),
+                "excluded_tasks": tasks_left_out(self.source),
+                "held_out_data": held_out_data(self.source),
+                "hub": hub_commit(self.source),
+            }
+            known = {name: value for name, value in about.items() if value}
+            return {"kind": "run", "sha256": weights_hash(self.source), **known}
         is_preset = self.kind == UNTRAINED and self.source != UNTRAINED
         return {"kind": self.kind} | ({"preset": self.ref.preset} if is_preset else {})
-
-    def _seen(self) -> dict[str, list[str]]:
-        found = held_out_data(self.source)
-        return {"held_out_data": found} if found else {}
 
 
 def policy_sources(
@@ -171,10 +170,9 @@ def policy_sources(
         if not equals:
             name, source = _default_name(given), given
         sources.append(PolicySource(name, source, trust_code, vlm))
-    if unfinished := [source.name for source in sources if not source.source]:
-        raise ConfigError(f"policy {unfinished[0]!r} has no folder; name it as {unfinished[0]}=PATH.")
     names = [source.name for source in sources]
-    if any(re.fullmatch(r"\w[\w.+-]*", name) is None for name in names) or len(set(names)) < len(names):
+    wrong = any(not s.source or re.fullmatch(r"\w[\w.+-]*", s.name) is None for s in sources)
+    if wrong or len(set(names)) < len(names):
         raise ConfigError(
             "policies need distinct names of letters, digits, dots and hyphens, got "
             f"{echo(', '.join(names))}; name them as NAME=PATH."

@@ -11,9 +11,11 @@ means of the seeds are independent and their variance holds both sources: var(me
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist, fmean, stdev
+from typing import NamedTuple
 
 Interval = tuple[float, float]
 Counts = Sequence[tuple[int, int]]  # (successes, episodes) of each task
@@ -140,8 +142,7 @@ _NEWTON_STEPS = 60  # it needs about 8; more only where an end is nearly -1 or 1
 _CONVERGED = 1e-12
 
 
-@dataclass(frozen=True, slots=True)
-class PairCounts:
+class PairCounts(NamedTuple):
     """Outcomes of two policies, a and b, on the same episodes.
 
     Args:
@@ -149,7 +150,6 @@ class PairCounts:
         only_a: Episodes that a solved and b did not.
         only_b: Episodes that b solved and a did not.
         neither: Episodes that neither solved.
-
     """
 
     both: int
@@ -160,20 +160,18 @@ class PairCounts:
     @classmethod
     def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> "PairCounts":
         """Count the outcomes of a and b, success or not, of each episode."""
-        pairs = list(outcomes)
-        return cls(
-            *(pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False)))
-        )
+        pairs = Counter(outcomes)
+        return cls(pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])
+
+    @classmethod
+    def sum(cls, counts: "Iterable[PairCounts]") -> "PairCounts":
+        """Add the counts of several tasks or seeds."""
+        return cls(*map(sum, zip(*counts, strict=True)))
 
     @property
     def episodes(self) -> int:
         """Number of episodes."""
-        return self.both + self.only_a + self.only_b + self.neither
-
-    @property
-    def swapped(self) -> "PairCounts":
-        """The same outcomes with a and b exchanged."""
-        return PairCounts(self.both, self.only_b, self.only_a, self.neither)
+        return sum(self)
 
     @property
     def difference(self) -> float:
@@ -202,7 +200,7 @@ def mean_difference(counts: Sequence[PairCounts]) -> tuple[float, Interval]:
     Source: T. Tango, "Equivalence test and confidence interval for the difference in proportions for the
         paired-sample design", 1998; for several tasks the same principle with one constraint over all.
     """
-    swapped = [count.swapped for count in counts]
+    swapped = [PairCounts(both, only_b, only_a, neither) for both, only_a, only_b, neither in counts]
     return _mean_of_differences(counts), (_lowest_difference(counts), -_lowest_difference(swapped))
 
 
@@ -349,10 +347,7 @@ def difference_over_seeds(pairs: Sequence[Sequence[PairCounts]]) -> tuple[float,
         The mean of a minus b, and its interval: that of `mean_difference` over all episodes, widened to
         Student's interval of the differences of the seeds.
     """
-    pooled = [
-        PairCounts(*(sum(getattr(p, name) for p in task) for name in PairCounts.__slots__))
-        for task in zip(*pairs, strict=True)
-    ]
+    pooled = [PairCounts.sum(task) for task in zip(*pairs, strict=True)]
     difference, interval = mean_difference(pooled)
     return difference, _widen(interval, list(map(_mean_of_differences, pairs)), least=-1.0)
 

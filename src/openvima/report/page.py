@@ -9,7 +9,7 @@ from typing import Any
 from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.config import DEFAULT_BATCH
-from openvima.evaluation.results import DECLARED, EpisodeOutcome, Results, Row
+from openvima.evaluation.results import DECLARED, Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
 from openvima.input_files import as_path, names_of
@@ -34,6 +34,7 @@ _OPTIONS = (  # settings that results name as commands do
     "device",
     "precision",
 )
+MOST_EPISODES = 4000  # that are listed
 _USUAL = {"assets": "procedural", "batch": DEFAULT_BATCH, "compat": False}
 _PLACES = {"run": "RUN", "remote": "ws://HOST:PORT"}
 _VLM_OPTIONS = {"view": "view"} | {
@@ -80,7 +81,8 @@ def write_report(
     out = as_path(out)
     records = [as_path(run) for run in names_of(runs)]
     clips = list({clip.file_name: clip for clip in clips}.values())
-    listed, num_episodes = listed_episodes(results)
+    episodes = [(row, outcome) for row in results.rows if not row.ablation for outcome in row.outcomes]
+    episodes.sort(key=lambda episode: episode[1].success)  # failures first
     page = render_page(
         "report",
         text=text,
@@ -94,8 +96,8 @@ def write_report(
         notes=notes,
         clips=clips,
         videos={(clip.policy, clip.task, clip.level, clip.seed) for clip in clips},
-        episodes=listed,
-        num_episodes=num_episodes,
+        episodes=episodes[:MOST_EPISODES],
+        num_episodes=len(episodes),
         comparisons=comparisons,
         confirmations={shlex.quote(folder): done for folder, done in confirmations.items()},
         all_confirmed=bool(confirmations) and all(confirmations.values()),
@@ -160,19 +162,3 @@ def _policy_word(name: str, what: Mapping[str, Any]) -> str:
     named = f"{UNTRAINED}:{preset}" if preset else what.get("bundled") or what.get("source")
     source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
     return name if name == source else f"{name}={source}"
-
-
-MOST_EPISODES = 4000  # that are listed; of more, failures alone
-
-
-def listed_episodes(results: Results) -> tuple[list[tuple[Row, EpisodeOutcome]], int]:
-    """List the episodes without input ablations, failures first.
-
-    Returns:
-        At most `MOST_EPISODES` episodes, each with its row; and how many there are.
-    """
-    episodes = [(row, outcome) for row in results.rows if not row.ablation for outcome in row.outcomes]
-    ranked = sorted(episodes, key=lambda episode: episode[1].success)
-    if len(ranked) > MOST_EPISODES:
-        ranked = [episode for episode in ranked if not episode[1].success][:MOST_EPISODES]
-    return ranked, len(episodes)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
@@ -27,6 +27,11 @@ BY_TASK = (
     "them (A by way of B); those of MIDAS are the authors’ ablations (A), those with ~ rounded to whole "
     "points (C). Those of LLaRA are counted (D). Other models have no published rates by task."
 )
+PUBLISHED_SETTINGS: Mapping[str, object] = {
+    "prompts": MULTIMODAL,
+    "task_options": "",
+    "control": PRIMITIVES,
+}
 _MARKS = {"A": "*", "B": "†", "C": "", "D": "‡"}
 
 
@@ -48,7 +53,7 @@ class PublishedModel:
     size: str
     levels: Mapping[str, float]
     data_fraction: float = 1.0
-    rough: tuple[str, ...] = field(default=())
+    rough: tuple[str, ...] = ()
     grade: str = "C"
     aside: bool = False
 
@@ -89,14 +94,12 @@ def leading_models() -> list[PublishedModel]:
 
 def published_tasks(level: str, model: tuple[str, str] = BESIDE) -> Mapping[str, float]:
     """Success rates by task (%) of a model at a level: of VIMA 200M for all tasks, of others for a few."""
-    return next(
-        (r["tasks"] for r in _by_task() if (r["model"], r["size"], r["level"]) == (*model, level)), {}
-    )
+    return _by_task().get((*model, level), {}).get("tasks", {})
 
 
 def models_by_task() -> list[tuple[str, str]]:
     """Name and size of the models with published rates by task."""
-    return list(dict.fromkeys((record["model"], record["size"]) for record in _by_task()))
+    return list(dict.fromkeys((model, size) for model, size, _ in _by_task()))
 
 
 def has_published_tasks(results: Results) -> bool:
@@ -107,11 +110,7 @@ def has_published_tasks(results: Results) -> bool:
 def task_rate(model: tuple[str, str], level: str, task: str) -> str:
     """Write the published rate of a model on a task; "–" where there is none."""
     rate = published_tasks(level, model).get(task)
-    rough = any(
-        task in r.get("rough", ())
-        for r in _by_task()
-        if (r["model"], r["size"], r["level"]) == (*model, level)
-    )
+    rough = task in _by_task().get((*model, level), {}).get("rough", ())
     return "–" if rate is None else f"{'~' if rough else ''}{rate:.1f}"
 
 
@@ -132,17 +131,16 @@ def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | Non
 
 def is_comparable(results: Results) -> bool:
     """Whether prompts, task options and control are as published; success with others is another quantity."""
-    return not unpublished_settings(results)
+    return not unusual_settings(results)
 
 
-def unpublished_settings(results: Results) -> str:
-    """Name prompts, task options and control in sentences, unless they are as published."""
-    prompts, options = results.config.get("prompts", MULTIMODAL), results.config.get("task_options", "")
-    control = results.config.get("control", PRIMITIVES)
-    return (
-        (f" Prompts: {prompts}." if prompts != MULTIMODAL else "")
-        + (f" Task options: {options}." if options else "")
-        + (f" Control: {control}." if control != PRIMITIVES else "")
+def unusual_settings(results: Results, usual: Mapping[str, object] = PUBLISHED_SETTINGS) -> str:
+    """Name settings in sentences that are not the usual ones, by default those that were published."""
+    found = {name: results.config.get(name, value) for name, value in usual.items()}
+    return "".join(
+        f" {name.replace('_', ' ').capitalize()}: {value}."
+        for name, value in found.items()
+        if value != usual[name]
     )
 
 
@@ -162,8 +160,10 @@ def published_rows(results: Results, models: Sequence[PublishedModel]) -> list[t
     return rows
 
 
-def _by_task() -> list[dict]:
-    return _content()["tasks"]
+@cache
+def _by_task() -> dict[tuple[str, str, str], dict]:
+    """Records by model, size and level."""
+    return {(each["model"], each["size"], each["level"]): each for each in _content()["tasks"]}
 
 
 @cache

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
-from openvima.errors import UnknownTaskError
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import Results
 from openvima.evaluation.statistics import mean_of_rates
@@ -18,11 +17,11 @@ from openvima.report.published import (
     published_rate,
     published_rows,
     task_rate,
-    unpublished_settings,
+    unusual_settings,
 )
 from openvima.report.table import Estimate, Line, Table
-from openvima.report.text import ablation_name, counted
-from openvima.tasks.registry import task_spec
+from openvima.report.text import ablation_name, episodes_each
+from openvima.tasks.registry import list_tasks, task_spec
 
 
 def failure_causes(results: Results, policy: str) -> dict[str, Counter[str]]:
@@ -74,17 +73,10 @@ def family_table(results: Results, *, published: bool = True) -> Table:
 def _tasks(results: Results, level: str) -> dict[str, list[str]]:
     """Evaluated tasks of each family at a level."""
     found: dict[str, list[str]] = {family: [] for family in FAMILIES}
-    for task in results.tasks(level):
-        for family in _families(task):
+    for task in filter(set(list_tasks()).__contains__, results.tasks(level)):
+        for family in task_spec(task).families:
             found.setdefault(family, []).append(task)
     return {family: tasks for family, tasks in found.items() if tasks}
-
-
-def _families(task: str) -> tuple[str, ...]:
-    try:
-        return task_spec(task).families
-    except UnknownTaskError:
-        return ()
 
 
 def _mean(
@@ -129,8 +121,7 @@ def paper_tables(
     chosen = [
         _mean_table(results, published=published),
         family_table(results, published=published),
-        *[_task_table(results, policy) for policy in results.policy_names()],
-        *([result_table(results, published=True)] if has_published_tasks(results) and published else []),
+        result_table(results, published=published and has_published_tasks(results)),
         *ablation_tables(results),
         *map(_difference_table, comparisons),
     ]
@@ -147,9 +138,10 @@ def _mean_table(results: Results, *, published: bool) -> Table:
         for policy in results.policy_names()
     ]
     sizes = ", ".join(f"{len(results.tasks(level))} at {level}" for level in levels)
+    each = episodes_each(row for row in results.rows if not row.ablation)
     caption = (
-        f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
-        f"{_made_of(results)}"
+        f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. {each} a "
+        f"task.{unusual_settings(results)}"
     )
     elsewhere = published_rows(results, leading_models()) if published else []
     if elsewhere:
@@ -217,23 +209,9 @@ def ablation_tables(results: Results) -> list[Table]:
     return tables
 
 
-def _task_table(results: Results, policy: str) -> Table:
-    rows = [row for row in results.rows if (row.policy, row.ablation) == (policy, "")]
-    levels = [level for level in results.levels() if any(row.level == level for row in rows)]
-    tasks = list(dict.fromkeys(row.task for row in rows))
-    cells = {(row.task, row.level): Estimate(row.rate, row.interval) for row in rows}
-    lines = [Line(task, tuple(cells.get((task, level), "–") for level in levels)) for task in tasks]
-    played = {level: [task for task in tasks if (task, level) in cells] for level in levels}
-    means = (_mean(results, policy, level, tasks=own) for level, own in played.items())
-    lines.append(Line("mean", tuple(means), starts_group=True))
-    caption = f"Success rates of {policy} (%), with 95 % intervals. {_made_of(results, policy)}"
-    return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
-
-
 def _difference_table(comparison: Comparison) -> Table:
-    first = comparison.levels[0]
     lines = [
-        _difference_line(difference, starts_group=difference is first)
+        _difference_line(difference, starts_group=difference is comparison.levels[0])
         for difference in (*comparison.tasks, *comparison.means)
     ]
     a, b = (name.replace(ABLATION_SEPARATOR, ", ") for name in (comparison.a, comparison.b))
@@ -252,16 +230,8 @@ def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
     cells = (
         difference.level or "all",
         Estimate(difference.difference, difference.interval, signed=True, mark=mark),
-        f"{difference.only_a} : {difference.only_b}",
+        f"{difference.total.only_a} : {difference.total.only_b}",
         f"{difference.p_value:.2g}",
         f"{difference.p_holm:.2g}",
     )
     return Line(difference.task or f"mean of {len(difference.pairs)}", cells, starts_group)
-
-
-def _made_of(results: Results, policy: str | None = None) -> str:
-    """Say how many episodes a number is made of."""
-    rows = [row for row in results.rows if not row.ablation and policy in (None, row.policy)]
-    episodes = sorted({row.episodes for row in rows})
-    number = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
-    return f"{number} a task.{unpublished_settings(results)}"

@@ -5,9 +5,9 @@ from typing import Any
 
 from openvima.evaluation.ablations import INPUT_ABLATIONS, names_in
 from openvima.evaluation.comparison import Comparison, Difference
-from openvima.evaluation.results import Results
+from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import TRAINED_KINDS
-from openvima.report.published import unpublished_settings
+from openvima.report.published import PUBLISHED_SETTINGS, unusual_settings
 
 LEVEL_NAMES = {
     "train": "As in training",
@@ -41,6 +41,7 @@ _ROLES = {
     "remote": "Policy behind a server: observes the prompt and two camera images.",
 }
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
+_USUAL_ASSETS = {"assets": "procedural", "compat": False}
 _NUM_COLOURS = 6  # in the style sheet, for all other policies
 
 
@@ -126,42 +127,24 @@ def percent(fraction: float, decimals: int = 0) -> str:
     return f"{100 * fraction:.{decimals}f} %"
 
 
-def exact(fraction: float) -> str:
-    """Format a rate as a percentage without decimals if it has none, else with one."""
-    return percent(fraction, 0 if round(1000 * fraction) % 10 == 0 else 1)
-
-
-def points(difference: float, decimals: int = 1) -> str:
+def points(difference: float) -> str:
     """Write a difference of rates in percentage points, with its sign.
 
     Example:
-        >>> points(0.043), points(-0.5), points(-0.004, 0)
-        ('+4.3', '−50.0', '−0.4')
+        >>> points(0.043), points(-0.5)
+        ('+4.3', '−50.0')
     """
-    decimals = max(decimals, int(abs(difference) < 0.0095))  # no rounding to "−0"
-    return f"{100 * difference:+.{decimals}f}".replace("-", "−")
+    return f"{100 * difference:+.1f}".replace("-", "−")
 
 
-def points_span(interval: tuple[float, float], decimals: int = 1) -> str:
+def points_span(interval: tuple[float, float]) -> str:
     """Write the interval of a difference.
 
     Example:
         >>> points_span((-0.02, 0.3))
         '−2.0 … +30.0'
     """
-    return " … ".join(points(end, decimals) for end in interval)
-
-
-def probability(p_value: float) -> str:
-    """Write a p-value with as many digits as matter.
-
-    Example:
-        >>> probability(0.0402), probability(0.3), probability(1e-7)
-        ('0.040', '0.30', '< 0.001')
-    """
-    if p_value < 0.001:
-        return "< 0.001"
-    return f"{p_value:.3f}" if p_value < 0.1 else f"{p_value:.2f}"
+    return " … ".join(map(points, interval))
 
 
 def span(interval: tuple[float, float]) -> str:
@@ -191,21 +174,19 @@ def headline(results: Results) -> str:
 
 def measured(results: Results) -> str:
     """Counts of policies, tasks, levels and episodes as a sentence."""
-    episodes = sorted({row.episodes for row in results.rows})
-    each = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
     return (
         f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
-        f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, {each} each; "
+        f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, "
+        f"{episodes_each(results.rows)} each; "
         f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
-        "never uses." + unpublished_settings(results) + _fidelity(results)
+        "never uses." + unusual_settings(results, {**PUBLISHED_SETTINGS, **_USUAL_ASSETS})
     )
 
 
-def _fidelity(results: Results) -> str:
-    """Name the assets and the compatibility mode unless they are the usual ones."""
-    assets = results.config.get("assets", "procedural")
-    compat = " The quirks of VIMA-Bench are reproduced (compat)." if results.config.get("compat") else ""
-    return (f" Assets: {assets}." if assets != "procedural" else "") + compat
+def episodes_each(rows: Iterable[Row]) -> str:
+    """Say how many episodes a row has: "200 episodes", or "20 to 200 episodes"."""
+    episodes = sorted({row.episodes for row in rows})
+    return f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
 
 
 def finding(comparison: Comparison, difference: Difference | None = None) -> str:

@@ -133,20 +133,15 @@ def requested_episodes(config: EvaluationConfig, videos: VideoSelection) -> list
     played = cells(config)
     requested = []
     for text in videos.record_video:
-        found = _EPISODE.fullmatch(text)
-        if found is None:
-            raise ConfigError(
-                f"record_video is {text!r}; give TASK/SEED or TASK/LEVEL/SEED, such as rotate/L1/3."
-            )
-        task, wanted, seed = found[1], found[2], int(found[3])
+        task, wanted, seed = found.groups() if (found := _EPISODE.fullmatch(text)) else ("", "", -1)
         level = next((level for name, level in played if name == task and wanted in (None, level)), None)
         last = config.seed + config.episodes - 1
-        if level is None or not config.seed <= seed <= last:
+        if level is None or not config.seed <= int(seed) <= last:
             raise ConfigError(
-                f"record_video is {text!r}, which is not evaluated; tasks and levels are those of this "
-                f"evaluation, and seeds {config.seed} to {last}."
+                f"record_video is {text!r}; give TASK/SEED or TASK/LEVEL/SEED, such as rotate/L1/3, of this "
+                f"evaluation, with seeds {config.seed} to {last}."
             )
-        requested.append((task, level, seed))
+        requested.append((task, level, int(seed)))
     return requested
 
 

@@ -198,16 +198,20 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
     panels: dict[str, dict[tuple[str, bool], list[RatePoint]]] = {}
     for level in [""] if study.x_axis == "level" else dict.fromkeys(point.level for point in points):
         curves = panels.setdefault(level or "All levels", {})
-        for point in points:
-            if level in ("", point.level):
-                score, x = point.score, _number(point.x, values, named)
+        for point in (*points, *study.published):
+            if level not in ("", point.level):
+                continue
+            x = float(values.index(point.x) if named else point.x)
+            if isinstance(point, Point):
+                score = point.score
                 seeds = tuple(mean for mean, _ in score.seeds) if len(score.seeds) > 1 else ()
-                found = RatePoint(x, score.mean, score.interval, seeds=seeds)
-                curves.setdefault((point.series or "this study", False), []).append(found)
-        for point in study.published:
-            if level in ("", point.level):
-                found = RatePoint(_number(point.x, values, named), point.rate)
-                curves.setdefault((point.series, True), []).append(found)
+                curve, found = (
+                    (point.series or "this study", False),
+                    RatePoint(x, score.mean, score.interval, seeds),
+                )
+            else:
+                curve, found = (point.series, True), RatePoint(x, point.rate)
+            curves.setdefault(curve, []).append(found)
         for of_name in curves.values():
             of_name.sort(key=lambda point: point.x)
     return RateFigure(
@@ -218,10 +222,6 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
         logarithmic=study.logarithmic,
         named=named,
     )
-
-
-def _number(value: float | str, values: Sequence[float | str], named: bool) -> float:
-    return float(values.index(value) if named else value)
 
 
 def _rows(points: Sequence[Point]) -> dict[tuple[str, str], dict[str, Point]]:

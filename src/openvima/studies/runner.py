@@ -72,41 +72,34 @@ def run_study(
     out = as_path(out).absolute()
     how: dict[str, Any] = {"workers": workers, "engine": engine, "address": address}
     plan = plan_study(study, inputs, out, seeds=seeds, device=device, **how)
-    check_plan(plan, inputs)
+    check_plan(plan)
     with folder_lock(out):
         record = record_of(study, inputs, device)
         _claim(out, record)
         _Runner(plan, how, report or (lambda *_: None)).run()
-        return _write(study, inputs, plan, out, record, command)
+        points, costs = study_points(study, plan), study_costs(plan)
+        versions = Results.read(plan.evaluations[0].config.out).versions
+        content = {
+            "schema": SCHEMA,
+            "settings": record,
+            "points": [asdict(point) for point in points],
+            "published": [asdict(point) for point in study.published],
+            "costs": costs,
+            "versions": versions,
+        }
+        atomic_write_file(out / RESULTS_FILE, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+        page = study_page(study, inputs, points, costs=costs, versions=versions, command=command)
+        return atomic_write_file(out / PAGE_FILE, page)
 
 
-def _write(
-    study: Study, inputs: StudyInputs, plan: Plan, out: Path, record: dict[str, Any], command: str
-) -> Path:
-    """Write `study.json` and the page."""
-    points, costs = study_points(study, plan), study_costs(plan)
-    versions = Results.read(plan.evaluations[0].config.out).versions
-    content = {
-        "schema": SCHEMA,
-        "settings": record,
-        "points": [asdict(point) for point in points],
-        "published": [asdict(point) for point in study.published],
-        "costs": costs,
-        "versions": versions,
-    }
-    atomic_write_file(out / RESULTS_FILE, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-    page = study_page(study, inputs, points, costs=costs, versions=versions, command=command)
-    return atomic_write_file(out / PAGE_FILE, page)
-
-
-def check_plan(plan: Plan, inputs: StudyInputs) -> None:
+def check_plan(plan: Plan) -> None:
     """Check everything that can be checked before any work.
 
     Raises:
         OpenVimaError: As for `run_study`.
     """
     require_extra()
-    load_assets(inputs.assets)
+    load_assets(plan.inputs.assets)
     for demonstrations, out in plan.data.items():
         _generate_config(demonstrations, out).resolved_tasks()
     if plan.trainings:
@@ -138,9 +131,8 @@ def _claim(out: Path, record: dict[str, Any]) -> None:
         raise ConfigError(f"{file} cannot be read ({error}); give another --out.") from None
     here = flatten(record)
     if differing := differences(there, here):
-        shown, num_more = differing[:_MAX_DIFFERENCES], len(differing) - _MAX_DIFFERENCES
-        more = f"; and {num_more} more" if num_more > 0 else ""
-        raise ConfigError(f"{out} holds another study: {'; '.join(shown)}{more}. Give another --out.")
+        shown = "; ".join(differing[:_MAX_DIFFERENCES])
+        raise ConfigError(f"{out} holds another study: {shown}. Give another --out.")
 
 
 class _Runner:
@@ -184,32 +176,27 @@ class _Runner:
                 self._finish(_described(training))
             else:
                 missing.append(training)
-        if self.how["engine"] == "processes" and self.how["workers"] in (None, 1):
-            for training in missing:  # with its progress
-                _train(
-                    training,
-                    lambda d, t, note, of=training: self._say(f"{_described(of)}: {d} of {t}, {note}"),
-                )
-                self._finish(_described(training))
-            return
         engine, workers, address = (self.how[name] for name in ("engine", "workers", "address"))
-        for training, _ in imap_with_engine(engine, train_one, missing, workers, address=address):
+        trained = imap_with_engine(
+            engine,
+            train_one,
+            missing,
+            workers,
+            address=address,
+            report=lambda steps: self._say(f"training, {steps:,} steps"),
+        )
+        for training, _ in trained:
             self._finish(_described(training))
 
 
 def train_one(training: Training, count: Callable[[int], None]) -> None:
-    """Run a training in a worker process, possibly on another machine."""
-    _train(training, lambda done, total, note: count(done))
-
-
-def _train(training: Training, report: Report) -> None:
-    """Train, and note the costs, which also says that it is done."""
+    """Train, perhaps in a worker process, and note the costs, which also says that it is done."""
     from openvima.policies.checkpoint import load_network
     from openvima.training import train
     from openvima.training.run_folder import read_costs
 
     config = training.config
-    train(config, report)
+    train(config, lambda done, total, note: count(done))
     network, _ = load_network(config.out)
     costs = {
         "parameters": sum(p.numel() for p in network.parameters()),

@@ -314,11 +314,6 @@ class Study:
                 f"study {self.name!r} has runs {labels}; give at least one, all of other labels."
             )
         for run in self.runs:
-            if not 0 < run.data_fraction <= 1:
-                raise ConfigError(
-                    f"data_fraction of run {run.label!r} is {run.data_fraction}; it must be above 0, and at "
-                    "most 1."
-                )
             if run.policy is None and run.data is None and self.data is None:
                 raise ConfigError(
                     f"run {run.label!r} trains, but has no demonstrations; give the study `data`."

@@ -12,7 +12,7 @@ from openvima.data.manifest import MANIFEST_NAME
 from openvima.data.reader import DemonstrationQuery, find_demonstrations
 from openvima.env.tabletop import VideoFrame
 from openvima.errors import DatasetError, PolicyError
-from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode, success_rates
+from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode
 from openvima.evaluation.results import FILE_NAME, Results
 from openvima.input_files import as_path
 from openvima.render import channels_last
@@ -113,7 +113,10 @@ class BrowsePanel:
         for group in self._rows:
             group.remove()
         assert self._results is not None  # as opened
-        rates = success_rates(self._results[1], self._policy.value, self._chosen_ablation)
+        rates: dict[str, dict[str, float]] = {}  # by task and level
+        for row in self._results[1].rows:
+            if (row.policy, row.ablation) == (self._policy.value, self._chosen_ablation):
+                rates.setdefault(row.task, {})[row.level] = row.rate
         self._rows = []
         with self._matrix:
             for task, by_level in rates.items():
