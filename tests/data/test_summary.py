@@ -64,7 +64,7 @@ def test_the_terminal_shows_the_whole(
     assert main(["data", "info", str(whole), "--details"]) == 0
     shown = capsys.readouterr().out
     assert f"{whole}: 6 episodes" in shown
-    assert "written by openvima generate, assets procedural, compat no" in shown
+    assert "written by openvima generate, assets procedural, compat False" in shown
     assert re.search(r"rotate +3 +\d+ +\d+\.\d +\d+ +\d+\.\d% +\d+\n", shown)
     assert re.search(r"spatula  █+ 3 \(50\.0%\)", shown)
 

@@ -1,5 +1,6 @@
 """Bundled checkpoints by name. Most tests replace the checkpoint with a small network."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -67,8 +68,9 @@ def test_quickstart_scores_it_beside_the_policy_that_it_trains(
 ) -> None:
     monkeypatch.setattr(quickstart, "TASKS", ("rotate",))
     monkeypatch.setattr(quickstart, "LEVELS", ("L1",))
-    monkeypatch.setattr(quickstart, "_generate", lambda *_: Path("demonstrations"))
-    monkeypatch.setattr(quickstart, "_train", lambda *_: bundled)
+    monkeypatch.setattr("openvima.data.generate", lambda *_: Path("demonstrations"))
+    trained = lambda *_, **__: shutil.copytree(bundled, "quick/trained")  # noqa: E731
+    monkeypatch.setattr("openvima.cli.train.train_in_processes", trained)
     monkeypatch.setattr(videos, "recording_jobs", lambda *_: [])  # other tests record
     assert quickstart.main(out=Path("quick"), episodes=1, workers=1) == 0
     shown = capsys.readouterr().out

@@ -1,9 +1,10 @@
 """`openvima demo`: record a video of the oracle or of a policy on one task or on an episode from a file."""
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from openvima.cli.options import Task
+from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment, Task
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 if TYPE_CHECKING:
@@ -18,11 +19,6 @@ def main(
     seed: int = 0,
     level: str | None = None,
     policy: str = "oracle",
-    assets: str = "procedural",
-    compat: bool = False,
-    prompts: str = "multimodal",
-    task_options: str = "",
-    control: Literal["primitives", "end_effector"] = "primitives",
     device: str = "cpu",
     boxes: str | None = None,
     trust_code: bool = False,
@@ -30,6 +26,7 @@ def main(
     base_url: str | None = None,
     view: ChatView = "top",
     vlm: VlmOptions = DEFAULT_OPTIONS,
+    environment: Environment = DEFAULT_ENVIRONMENT,
 ) -> int:
     """Record one episode: the prompt above, the table and the arm below.
 
@@ -37,7 +34,8 @@ def main(
 
     Args:
         task: Name of the task; `openvima tasks` lists them. Leave it out with --episode.
-        episode: YAML or JSON file of an episode, sampled or composed (see docs/compose.md).
+        episode: YAML or JSON file of an episode, sampled or composed (see docs/compose.md); of the settings
+            of the environment only assets and compat then matter.
         out: MP4 file to write.
         seed: Number of the episode.
         level: train, L1 to L8; by default the task's first.
@@ -45,16 +43,6 @@ def main(
             folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
             a published file, OWNER/NAME[@REVISION] on the Hub, a policy server (ws://HOST:PORT), or a
             vision-language model (vlm:MODEL), whose words are drawn beside the video.
-        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
-            or FILE.py:FUNCTION, which registers assets of your own.
-        compat: Follow the original benchmark also where it is odd.
-        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
-            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
-        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
-            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
-            all that have the option.
-        control: primitives; or end_effector, an action each 0.1 s (see docs/end_effector.md), for the oracle
-            and for policies of that control.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
@@ -66,6 +54,7 @@ def main(
             http://127.0.0.1:8000/v1; by default that of OPENAI_BASE_URL, else OpenAI's own.
         view: Camera that it sees, and in whose picture it points; top+front shows both.
         vlm: How it is asked.
+        environment: Tasks, prompts and control.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -75,17 +64,9 @@ def main(
 
     if (task is None) == (episode is None):
         raise ConfigError("demo takes either a TASK or --episode FILE; `openvima tasks` lists the tasks.")
-    given = seed, level, prompts, task_options, control
-    if episode is not None and given != (0, None, "multimodal", "", "primitives"):
-        raise ConfigError(
-            "an episode file is played by primitives and says all of --seed, --level, --prompts and "
-            "--task-options; leave these and --control out."
-        )
     level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
-    if boxes is not None and policy in ("oracle", "random"):
-        raise ConfigError(f"--boxes is {boxes!r}, but {policy} uses no boxes; name a trained policy.")
     from openvima.catalog import load_assets
     from openvima.env import EnvConfig, load_episode
     from openvima.evaluation.recording import record_episode
@@ -99,11 +80,12 @@ def main(
 
     source = PolicySource(policy, policy, trust_code)
     source.check()  # before a scene is built
-    env_config = EnvConfig(assets, compat, prompts, task_options, control)
+    env_config = EnvConfig(**asdict(environment))
     load_assets(env_config.assets)  # may register objects of the task that is sampled next
     start: int | Episode = seed
     if episode is not None:
-        start = load_episode(episode, assets=assets)
+        start = load_episode(episode, assets=env_config.assets)
+        env_config = EnvConfig(env_config.assets, env_config.compat)
         env = env_config.make(HOST_TASK, "train", domain="user", realtime=True)
         what, title = str(episode), episode.stem
         if policy == ORACLE:

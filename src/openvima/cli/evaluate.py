@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from openvima.cli.options import Json
+from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment, Json
 from openvima.cli.terminal import (
     parse_list,
     parse_shard_range,
@@ -23,30 +23,6 @@ from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 if TYPE_CHECKING:
     from openvima.evaluation import EvaluationConfig, Results
     from openvima.report import VideoSelection
-
-
-@dataclass(frozen=True, slots=True)
-class EnvironmentOptions:
-    """Tasks, prompts and control.
-
-    Args:
-        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
-            or FILE.py:FUNCTION, which registers assets of your own.
-        compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
-        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
-            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
-        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
-            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
-            all that have the option.
-        control: primitives; or end_effector, where an action moves the tool for 0.1 s, for policies of that
-            control and the oracle. Scores of the two are never joined.
-    """
-
-    assets: str = "procedural"
-    compat: bool = False
-    prompts: str = "multimodal"
-    task_options: str = ""
-    control: Literal["primitives", "end_effector"] = "primitives"
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +134,7 @@ def main(
     out: Path = Path("evaluation"),
     force: bool = False,
     as_json: Json = False,
-    environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = EnvironmentOptions(),
+    environment: Environment = DEFAULT_ENVIRONMENT,
     ablation: tyro.conf.OmitArgPrefixes[AblationOptions] = AblationOptions(),
     recording: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions(),
     network: tyro.conf.OmitArgPrefixes[NetworkOptions] = NetworkOptions(),
@@ -203,7 +179,7 @@ def main(
         Exit status.
     """
     from openvima.env import EnvConfig
-    from openvima.errors import ConfigError, LimitReachedError
+    from openvima.errors import LimitReachedError
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.ablations import IN_CONTEXT
     from openvima.evaluation.config import plan
@@ -213,7 +189,6 @@ def main(
     from openvima.report import VideoSelection
     from openvima.serving.chat import VlmConfig
 
-    ablations = parse_list(ablation.ablations) + (IN_CONTEXT,) * ablation.in_context
     config = EvaluationConfig(
         policies=parse_list(policy),
         tasks=parse_list(tasks),
@@ -224,7 +199,7 @@ def main(
         out=out,
         env_config=EnvConfig(**asdict(environment)),
         force=force,
-        ablations=_with_boxes(ablations, ablation.boxes),
+        ablations=parse_list(ablation.ablations) + (IN_CONTEXT,) * ablation.in_context,
         boxes=ablation.boxes,
         engine=jobs.engine,
         address=jobs.address,
@@ -242,8 +217,6 @@ def main(
         config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
     print_left_out(config.tasks, environment.prompts, config.levels)
     selection = VideoSelection(recording.videos, parse_list(recording.record_video))
-    if recording.record_video and not recording.report:
-        raise ConfigError("--record-video needs the report; drop --no-report.")
     if jobs.list_shards:
         for number, shard in enumerate(plan(config)):
             names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)
@@ -326,11 +299,3 @@ def print_results(results: "Results") -> None:
     print_table(rich_table(result_table(results)), num_heads=2)
     for table in ablation_tables(results):
         print_table(rich_table(table))
-
-
-def _with_boxes(ablations: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:
-    """Add the ablation that uses the boxes, if any are given."""
-    from openvima.evaluation.ablations import DETECTED_BOXES
-
-    asked = boxes is None or any(name == "all" or DETECTED_BOXES in name.split("+") for name in ablations)
-    return ablations if asked else (*ablations, DETECTED_BOXES)

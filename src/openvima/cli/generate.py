@@ -2,9 +2,11 @@
 
 import shlex
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
+from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment
 from openvima.cli.terminal import parse_list, parse_shard_range, print_left_out, progress_bar
 
 
@@ -23,12 +25,8 @@ def main(
     address: str | None = None,
     compression: Literal["lz4", "zstd"] = "lz4",
     images: bool = True,
-    assets: str = "procedural",
-    compat: bool = False,
-    prompts: str = "multimodal",
-    task_options: str = "",
-    control: Literal["primitives", "end_effector"] = "primitives",
     force: bool = False,
+    environment: Environment = DEFAULT_ENVIRONMENT,
 ) -> int:
     """Write demonstrations with the oracle, or those that a folder still lacks.
 
@@ -53,17 +51,8 @@ def main(
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
         compression: Codec of the files: lz4, or zstd, which is smaller and slower.
         images: Store images; without, they are drawn anew on reading.
-        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
-            or FILE.py:FUNCTION, which registers assets of your own.
-        compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
-        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
-            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
-        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
-            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
-            all that have the option.
-        control: primitives; or end_effector, where the tool moves by ten commands a second: joint paths then
-            have a waypoint for each, and `openvima data export-lerobot` writes a frame for each.
         force: Delete the data set that is in the folder.
+        environment: Tasks, prompts and control.
 
     Returns:
         Exit status.
@@ -79,7 +68,7 @@ def main(
         level=level,
         start_seed=seed,
         shard_size=shard_size,
-        env_config=EnvConfig(assets, compat, prompts, task_options, control),
+        env_config=EnvConfig(**asdict(environment)),
         compression=compression,
         images=images,
         workers=workers,
@@ -88,7 +77,7 @@ def main(
         shard_range=parse_shard_range(shard_range),
         force=force,
     )
-    print_left_out(config.tasks, prompts, [level])
+    print_left_out(config.tasks, environment.prompts, [level])
     if list_shards:
         for number, block in enumerate(plan(config)):
             print(f"{number}\t{block.path.name}\t{block.episodes}")

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from openvima.cli.terminal import progress_bar
-from openvima.errors import ConfigError
 from openvima.multiprocess import num_cpus
 from openvima.policies.naming import SMALL, bundled_folder
 
@@ -37,57 +36,20 @@ def main(
     Returns:
         Exit status.
     """
+    from openvima.cli.evaluate import print_results
+    from openvima.cli.train import parse, train_in_processes
+    from openvima.data import GenerateConfig, generate
+    from openvima.evaluation import EvaluationConfig, Results
     from openvima.policies.base import require_torch
+    from openvima.report import evaluate_and_report
     from openvima.report.videos import require_extra
 
-    _check(demonstrations=demonstrations, episodes=episodes, workers=workers)
-    require_torch("training")
-    require_extra()
-    bundled_folder(SMALL)  # fails before any work if missing
-    workers = workers or min(8, num_cpus())
-    out.mkdir(parents=True, exist_ok=True)
-    data = _generate(out / "demonstrations", demonstrations, seed, workers)
-    run = _train(data, out / "trained", seed)
-    _evaluate(run, out, episodes, seed, workers)
-    print(f"Report: {out / 'report.html'}")
-    return 0
-
-
-def _check(**counts: int | None) -> None:
-    """Refuse before any work what would only be found out when its turn comes.
-
-    Raises:
-        ConfigError: A number is below 1.
-    """
-    for name, count in counts.items():
-        if count is not None and count < 1:
-            raise ConfigError(f"{name} is {count}; it must be at least 1.")
-
-
-def _generate(folder: Path, demonstrations: int, seed: int, workers: int) -> Path:
-    from openvima.data import GenerateConfig, generate
-
-    config = GenerateConfig(
-        tasks=TASKS, episodes=demonstrations, out=folder, workers=workers, start_seed=seed
+    workers = min(8, num_cpus()) if workers is None else workers
+    run = out / "trained"
+    demonstrated = GenerateConfig(
+        tasks=TASKS, episodes=demonstrations, out=out / "demonstrations", workers=workers, start_seed=seed
     )
-    with progress_bar("1/3 demonstrations") as report:
-        return generate(config, report)
-
-
-def _train(data: Path, run: Path, seed: int) -> Path:
-    from openvima.cli.train import parse, train_in_processes
-
-    words = ("--data", f"{data}", "--out", f"{run}", "--seed", f"{seed}")
-    words = (*words, "--runtime.processes", f"{min(2, num_cpus())}")
-    return train_in_processes(parse(words), words, label="2/3 training")
-
-
-def _evaluate(run: Path, out: Path, episodes: int, seed: int, workers: int) -> None:
-    from openvima.cli.evaluate import print_results
-    from openvima.evaluation import EvaluationConfig, Results
-    from openvima.report import evaluate_and_report
-
-    config = EvaluationConfig(
+    evaluated = EvaluationConfig(
         policies=(f"trained={run}", *BASELINES),
         tasks=TASKS,
         levels=LEVELS,
@@ -96,6 +58,17 @@ def _evaluate(run: Path, out: Path, episodes: int, seed: int, workers: int) -> N
         workers=workers,
         out=out,
     )
+    require_torch("training")
+    require_extra()
+    bundled_folder(SMALL)  # fails before any work if missing
+    out.mkdir(parents=True, exist_ok=True)
+    with progress_bar("1/3 demonstrations") as report:
+        data = generate(demonstrated, report)
+    words = ("--data", f"{data}", "--out", f"{run}", "--seed", f"{seed}")
+    words = (*words, "--runtime.processes", f"{min(2, num_cpus())}")
+    train_in_processes(parse(words), words, label="2/3 training")
     with progress_bar("3/3 evaluation") as report:
-        path = evaluate_and_report(config, progress=report)
+        path = evaluate_and_report(evaluated, progress=report)
     print_results(Results.read(path))
+    print(f"Report: {out / 'report.html'}")
+    return 0

@@ -89,11 +89,7 @@ def _summary(summary: "Summary", name: str) -> "Iterator[str | Table]":
 def _settings(config: dict[str, Any]) -> str:
     """Format scalar settings in one line."""
     plain = {name: value for name, value in config.items() if isinstance(value, str | int | float | bool)}
-    return "".join(f", {name.replace('_', ' ')} {_shown(value)}" for name, value in sorted(plain.items()))
-
-
-def _shown(value: object) -> str:
-    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
+    return "".join(f", {name.replace('_', ' ')} {value}" for name, value in sorted(plain.items()))
 
 
 def _task_table(summary: "Summary") -> "Table":
