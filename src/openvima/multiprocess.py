@@ -314,13 +314,12 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
 def _check_answers(address: str) -> None:
     """Probe a HOST:PORT: Ray itself waits for minutes, then ends the process without an exception."""
     host, _, port = address.rpartition(":")
-    if not host or not port.isdigit():
-        raise ConfigError(f"address is {address!r}; it must be HOST:PORT.")
     try:
         socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, ValueError) as error:
         raise ConfigError(
-            f"no Ray cluster answers at {address} ({error}); `ray status` on its head shows the address."
+            f"no Ray cluster answers at {address} ({error}); `ray status` on its head shows the address, "
+            "HOST:PORT."
         ) from None
 
 

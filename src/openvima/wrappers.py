@@ -115,16 +115,11 @@ class FlatObservation(gymnasium.ObservationWrapper):
         env: An environment of the package, wrapped or not, that observes `rgb` and `segm`.
         max_objects: Rows for objects on the table; no task has more than 18 by default.
         max_prompt_objects: Rows for objects in the prompt's images; likewise.
-
-    Raises:
-        ConfigError: The environment does not observe `rgb` and `segm`.
     """
 
     def __init__(self, env: gymnasium.Env, *, max_objects: int = 18, max_prompt_objects: int = 18) -> None:
         super().__init__(env)
         self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
-        if not {"rgb", "segm"} <= set(self._base.modalities):
-            raise ConfigError(f"modalities are {self._base.modalities}; FlatObservation needs rgb and segm.")
         self.max_objects, self.max_prompt_objects = max_objects, max_prompt_objects
         size = (max_objects + max_prompt_objects) * OBJECT_SIZE + NUM_BUCKETS + 1
         size += TOOL_SIZE * (self._base.control == END_EFFECTOR)

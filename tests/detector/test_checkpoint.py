@@ -106,7 +106,7 @@ def test_sizes_survive_a_file_and_wrong_ones_are_told():
     with pytest.raises(ConfigError, match="unknown fields colour"):
         DetectorConfig.from_dict({**detector_config("small").to_dict(), "colour": 1})
     backbone = BackboneConfig("basic", (1, 1), (8,), 8, 3, 16)
-    with pytest.raises(ConfigError, match=r"depths has 2 stages.*anchor_sizes has 2 numbers"):
+    with pytest.raises(ConfigError, match=r"depths has 2 stages.*anchor_sizes 2 numbers"):
         DetectorConfig(backbone, (1.0, 2.0))
 
 

@@ -244,7 +244,7 @@ def test_boxes_are_drawn_around_masks_and_specks_left_out() -> None:
     [
         (lambda: Detections(np.zeros((2, 4))), "float64.*from_edges"),
         (lambda: Detections(np.zeros((2, 5), int)), r"\(2, 5\).*\(N, 4\)"),
-        (lambda: Detections([[1, 2, 3, 4]]), "boxes are a list.*numpy array"),
+        (lambda: Detections([[1, 2, 3, 4]]), "boxes are list.*an array of integers"),
         (lambda: Detections(boxes((5, 5, 4, 9))), r"box 0 is \[5, 5, 4, 9\]"),
         (lambda: Detections(boxes(), masks=np.zeros((0, 8, 8))), "masks are float64"),
         (lambda: Detections(boxes(), scores=np.zeros(3)), r"scores are float64 \(3,\)"),

@@ -37,11 +37,6 @@ class BackboneConfig:
     frozen_batch_norm: bool = False
     stride_in_1x1: bool = False
 
-    @property
-    def num_levels(self) -> int:
-        """Number of pyramid levels."""
-        return len(self.widths) + self.extra_level
-
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
@@ -98,19 +93,15 @@ class DetectorConfig:
     max_detections: int = 100
 
     def __post_init__(self) -> None:
-        backbone, problems = self.backbone, []
-        if len(backbone.depths) != len(backbone.widths) or not backbone.depths:
-            problems.append(
-                f"depths has {len(backbone.depths)} stages and widths {len(backbone.widths)}; give both one "
-                "number per stage."
+        backbone = self.backbone
+        stages = len(backbone.depths)
+        numbers = {len(backbone.widths), len(self.anchor_sizes) - backbone.extra_level}
+        if numbers != {stages} or not stages:
+            raise ConfigError(
+                f"depths has {stages} stages, widths {len(backbone.widths)} and anchor_sizes "
+                f"{len(self.anchor_sizes)} numbers; give one per stage, and one more of anchor_sizes for "
+                "the extra level."
             )
-        if len(self.anchor_sizes) != backbone.num_levels:
-            problems.append(
-                f"anchor_sizes has {len(self.anchor_sizes)} numbers; the pyramid has {backbone.num_levels} "
-                "levels."
-            )
-        if problems:
-            raise ConfigError(" ".join(problems))
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested dictionaries of plain values."""

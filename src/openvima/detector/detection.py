@@ -33,6 +33,17 @@ DEPTH_WEIGHT = 0.5  # the front camera is tilted by 45 degrees, so height appear
 COLOUR_WEIGHT_M = 0.3  # metres for histograms of colours without overlap
 NUM_BINS = 4  # of each colour channel
 JOINT_PAIRS = 4  # pairs of images in a batch: 20 % faster than each alone, and larger batches are no faster
+_FORMS = (  # field of `Detections`, kinds of its dtype, axes, and both in words
+    (
+        "boxes",
+        "iu",
+        2,
+        "an array of integers (N, 4): first column, first row, last column, last row. Detections.from_edges "
+        "takes real numbers",
+    ),
+    ("masks", "b", 3, "an array of bool (N, H, W), as many as boxes"),
+    ("scores", "iuf", 1, "an array of numbers (N,), as many as boxes"),
+)
 MATCHING_VERSION = 2  # grows whenever the same detections give other objects
 
 
@@ -56,20 +67,21 @@ class Detections:
     scores: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        boxes, masks, scores = self.boxes, self.masks, self.scores
-        for name, array in (("boxes", boxes), ("masks", masks), ("scores", scores)):
-            if not isinstance(array, np.ndarray) and not (array is None and name != "boxes"):
-                raise ShapeError(f"{name} are a {type(array).__name__}; they must be a numpy array.")
-        if boxes.dtype.kind not in "iu" or boxes.ndim != 2 or boxes.shape[1] != 4:
-            raise ShapeError(
-                f"boxes are {boxes.dtype} {boxes.shape}; they must be integers of shape (N, 4): first "
-                "column, first row, last column, last row. Detections.from_edges takes real numbers."
+        boxes, scores = self.boxes, self.scores
+        for name, kinds, ndim, form in _FORMS:
+            array = getattr(self, name)
+            if array is None and name != "boxes":
+                continue
+            fits = (
+                isinstance(array, np.ndarray)
+                and array.dtype.kind in kinds
+                and array.ndim == ndim
+                and len(array) == len(boxes)
+                and (name != "boxes" or array.shape[1] == 4)
             )
-        count = len(boxes)
-        if masks is not None and (masks.dtype != np.bool_ or masks.ndim != 3 or len(masks) != count):
-            raise ShapeError(f"masks are {masks.dtype} {masks.shape}; they must be bool ({count}, H, W).")
-        if scores is not None and (scores.dtype.kind not in "iuf" or scores.shape != (count,)):
-            raise ShapeError(f"scores are {scores.dtype} {scores.shape}; they must be numbers ({count},).")
+            if not fits:
+                given = f"{getattr(array, 'dtype', type(array).__name__)} {getattr(array, 'shape', '')}"
+                raise ShapeError(f"{name} are {given}; they must be {form}.")
         if scores is not None and not np.isfinite(scores).all():
             raise ShapeError(f"scores are {scores.tolist()}; they must be finite.")
         wrong = np.flatnonzero((boxes[:, 2:] < boxes[:, :2]).any(axis=1))
