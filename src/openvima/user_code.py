@@ -42,9 +42,11 @@ def load_function(source: str, *, what: str) -> Callable[..., Any]:
     if not is_code(source):
         raise ConfigError(f"{what} is {source!r}; name a function as {FORM}.")
     module = load_file(Path(where), what=what) if _is_file(where) else _load_module(where, what)
-    function = getattr(module, name, None)
-    if not callable(function):
+    if not hasattr(module, name):
         raise ConfigError(f"{what} is {source!r}, but {where} has no function {name!r}.")
+    function = getattr(module, name)
+    if not callable(function):
+        raise ConfigError(f"{what} is {source!r}, which is a {type(function).__name__}; name a function.")
     return function
 
 
@@ -168,6 +170,11 @@ def _is_file(where: str) -> bool:
 def _load_module(name: str, what: str) -> ModuleType:
     try:
         return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+            raise ConfigError(f"{what} names {name!r}, which raised {described(error)}.") from error
+        hint = f"name it as {name}.py:FUNCTION" if Path(f"{name}.py").is_file() else "set PYTHONPATH"
+        raise ConfigError(f"{what} names {name!r}, and there is no such module; {hint}.") from None
     except (Exception, SystemExit) as error:
         raise ConfigError(f"{what} names {name!r}, which raised {described(error)}.") from error
 

@@ -248,9 +248,9 @@ def test_stages_have_charts_of_their_own_and_many_curves_are_thinned(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     matching, cloning = read_charts(path)
-    losses = {"loss": [(5.0, 2.0)], "loss/contrastive": [(5.0, 1.5)]}
-    assert (matching.title, matching.curves) == ("1-pretraining: loss", losses)
-    assert list(cloning.curves) == [*(f"validation_{kind}" for kind in kinds), "accuracy"]
+    losses = {"training data": [(5.0, 2.0)], "contrastive, training data": [(5.0, 1.5)]}
+    assert (matching.title, matching.curves) == ("Pretraining: loss", losses)
+    assert list(cloning.curves) == ["held out", "pick, held out", "yaw, held out"]
 
 
 def test_curves_of_several_runs_are_told_apart_by_their_titles(metrics, tmp_path):
@@ -259,7 +259,7 @@ def test_curves_of_several_runs_are_told_apart_by_their_titles(metrics, tmp_path
         run.mkdir(parents=True)
         (run / "metrics.jsonl").write_bytes(metrics.read_bytes())
     titles = [chart.title for chart in read_run_charts(runs)]
-    assert titles == [f"{run} · training: {kind}" for run in ("one", "two") for kind in ("loss", "accuracy")]
+    assert titles == [f"{run} · Training: {kind}" for run in ("one", "two") for kind in ("loss", "accuracy")]
     assert read_run_charts([runs[0]]) == read_charts(metrics)
 
 

@@ -1,6 +1,6 @@
 """`openvima demo`: record a video of the oracle or of a policy on one task or on an episode from a file."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,8 +34,7 @@ def main(
 
     Args:
         task: Name of the task; `openvima tasks` lists them. Leave it out with --episode.
-        episode: YAML or JSON file of an episode, sampled or composed (see docs/compose.md); of the settings
-            of the environment only assets and compat then matter.
+        episode: YAML or JSON file of an episode, sampled or composed (see docs/compose.md).
         out: MP4 file to write.
         seed: Number of the episode.
         level: train, L1 to L8; by default the task's first.
@@ -64,6 +63,12 @@ def main(
 
     if (task is None) == (episode is None):
         raise ConfigError("demo takes either a TASK or --episode FILE; `openvima tasks` lists the tasks.")
+    of_file = replace(DEFAULT_ENVIRONMENT, assets=environment.assets, compat=environment.compat)
+    if episode is not None and (seed, level, environment) != (0, None, of_file):
+        raise ConfigError(
+            "an episode file is played by primitives and says all of --seed, --level, --prompts and "
+            "--task-options; leave these and --control out."
+        )
     level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
@@ -85,7 +90,6 @@ def main(
     start: int | Episode = seed
     if episode is not None:
         start = load_episode(episode, assets=env_config.assets)
-        env_config = EnvConfig(env_config.assets, env_config.compat)
         env = env_config.make(HOST_TASK, "train", domain="user", realtime=True)
         what, title = str(episode), episode.stem
         if policy == ORACLE:

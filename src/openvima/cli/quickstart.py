@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from openvima.cli.terminal import progress_bar
+from openvima.errors import ConfigError
 from openvima.multiprocess import num_cpus
 from openvima.policies.naming import SMALL, bundled_folder
 
@@ -44,6 +45,8 @@ def main(
     from openvima.report import evaluate_and_report
     from openvima.report.videos import require_extra
 
+    if demonstrations < 1:
+        raise ConfigError(f"demonstrations is {demonstrations}; it must be at least 1.")
     workers = min(8, num_cpus()) if workers is None else workers
     run = out / "trained"
     demonstrated = GenerateConfig(

@@ -66,12 +66,11 @@ def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
 def run_labels(folders: Sequence[Path]) -> list[str]:
     """Short distinct names for folders: the last part of the path, or as much of it as tells them apart."""
     parts = [folder.resolve().parts for folder in folders]
-    names: list[str] = []
     for length in range(1, max(map(len, parts), default=1) + 1):
         names = ["/".join(part[-length:]) for part in parts]
         if len(set(names)) == len(names):
-            break
-    return names
+            return names
+    return [f"{part[-1]} {number}" for number, part in enumerate(parts, start=1)]
 
 
 def read_charts(metrics: Path) -> list[Chart]:
@@ -104,9 +103,26 @@ def read_charts(metrics: Path) -> list[Chart]:
     charts = []
     for stage, values in stages.items():
         for kind, percent in _KINDS:
-            # Where all would be too many, the held-out ones.
-            names = sorted(values, key=lambda name: (not name.startswith(_HELD_OUT), name))
-            curves: dict[str, Curve] = {name: values[name] for name in names if kind in name}
-            if curves:
-                charts.append(Chart(f"{stage}: {kind}", dict([*curves.items()][:_MOST_CURVES]), percent))
+            chosen = _chosen(sorted(name for name in values if kind in name))
+            if chosen:
+                curves: dict[str, Curve] = {_label(name, kind): values[name] for name in chosen}
+                charts.append(Chart(f"{_stage_title(stage)}: {kind}", curves, percent))
     return charts
+
+
+def _chosen(names: list[str]) -> list[str]:
+    """All metrics of a kind, or the held-out ones alone where all would be too many."""
+    held_out = [name for name in names if name.startswith(_HELD_OUT)]
+    return held_out[:_MOST_CURVES] if held_out and len(names) > _MOST_CURVES else names[:_MOST_CURVES]
+
+
+def _stage_title(name: str) -> str:
+    """Name of a stage without its number, such as "Cloning" for "2-cloning"."""
+    return name.lstrip("0123456789-").capitalize() or name
+
+
+def _label(name: str, kind: str) -> str:
+    """Name of a curve, such as "pick, held out" for "validation_pick_accuracy"."""
+    what = name.removeprefix(_HELD_OUT).replace(kind, "").strip("_/").replace("_", " ")
+    seen = "held out" if name.startswith(_HELD_OUT) else "training data"
+    return f"{what}, {seen}" if what else seen

@@ -147,6 +147,18 @@ def points_span(interval: tuple[float, float]) -> str:
     return " … ".join(map(points, interval))
 
 
+def probability(p_value: float) -> str:
+    """Write a p-value with as many digits as matter.
+
+    Example:
+        >>> probability(0.0402), probability(0.3), probability(1e-7)
+        ('0.040', '0.30', '< 0.001')
+    """
+    if p_value < 0.001:
+        return "< 0.001"
+    return f"{p_value:.3f}" if p_value < 0.1 else f"{p_value:.2f}"
+
+
 def span(interval: tuple[float, float]) -> str:
     """Format an interval in whole percent, without the sign."""
     return f"{round(100 * interval[0])}–{round(100 * interval[1])}"
