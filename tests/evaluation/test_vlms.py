@@ -201,10 +201,10 @@ def test_settings_that_a_server_refuses_are_left_out(tmp_path: Path) -> None:
     [
         (
             refused(400, "this model does not support images"),
-            r"HTTP 400: .*support images.*can the model see",
+            r"HTTP 400: .*support images.*sees and takes as many images",
         ),
         (refused(413, "too large"), "HTTP 413"),
-        (refused(404, "no such model"), "'some/model-7b' a model of it"),
+        (refused(404, "no such model"), "whether 'some/model-7b' sees"),
     ],
 )
 def test_refusals_are_errors_of_one_line(reply: Any, message: str, tmp_path: Path) -> None:

@@ -187,7 +187,7 @@ def _training(folder: Path) -> str:
     recorded = _recorded(folder)
     if not recorded:
         return "Not recorded: the checkpoint does not lie in its run folder.\n"
-    data = _mapping(recorded.get("demonstrations"))
+    data = recorded.get("demonstrations") or {}
     settings = {name: _setting(recorded["training"], name) for name in _SETTINGS}
     left_out = _setting(recorded["training"], "loader.exclude_tasks")
     values = {
@@ -204,23 +204,17 @@ def _recorded(folder: Path) -> Mapping[str, Any]:
     run = folder.absolute().parent
     for place in (run.parent if run.name == CHECKPOINTS_FOLDER else folder, folder / _BUNDLED_RUN):
         try:
-            recorded = read_yaml(place / CONFIG_FILE)
-            if isinstance(recorded["training"], dict):
+            if "training" in (recorded := read_yaml(place / CONFIG_FILE)):
                 return recorded
-        except (OSError, OpenVimaError, LookupError, TypeError):
+        except (OSError, OpenVimaError):
             continue
     return {}
 
 
-def _mapping(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
-def _setting(values: Mapping[str, Any], dotted: str) -> Any:
-    found: Any = values
+def _setting(values: Any, dotted: str) -> Any:
     for name in dotted.split("."):
-        found = _mapping(found).get(name)
-    return found
+        values = (values or {}).get(name)
+    return values
 
 
 def _scores(scores: Results | None, name: HubName, *, confirmed: bool) -> str:

@@ -261,13 +261,11 @@ class ChatClient:
     def _refusal(self, error: Any) -> ServerError:
         """Compose the error for a request that the server refused."""
         status = error.status_code
-        if status in (401, 403):
-            hint = f"the key is that of the environment variable {KEY_VARIABLE}"
-        elif status == 404:
-            hint = f"is {echo(self.model)!r} a model of it, and --base-url complete, such as http://HOST:PORT/v1?"
-        elif status in (400, 413, 422):
-            enlarge = self.config.options.enlarge
-            hint = f"can the model see, and take as many images, the view {enlarge} times enlarged?"
+        if status < 500 and status != 429:  # too many requests
+            hint = (
+                f"check the key in the environment variable {KEY_VARIABLE}, --base-url, such as "
+                f"http://HOST:PORT/v1, and whether {echo(self.model)!r} sees and takes as many images"
+            )
         else:
             hint = "the same command goes on where this ended"
         said = self._shown(error)

@@ -65,7 +65,7 @@ class RemotePolicy(Policy):
         self.metadata = self._connect()
         with self._closed_by_errors():
             asked = self.metadata.get("modalities", DEFAULT_MODALITIES)
-            self.modalities = check_modalities(asked, "the policy")
+            self.modalities = check_modalities(asked)
             control = self.metadata.get("control", PRIMITIVES)
             self.control = check_form(control, CONTROLS, "control of the policy")
 

@@ -8,6 +8,7 @@ counts only after it was compared with the bytes that are there.
 
 import ipaddress
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -139,16 +140,14 @@ def check_address(url: str) -> None:
     """Check that a text can be the address of a server.
 
     Raises:
-        ConfigError: It has another scheme, no host, a port that is none, or a fragment.
+        ConfigError: It has another scheme, no host, or a port that is none.
     """
     try:
         parts = urlsplit(url)
-        usable = (
-            url.startswith(SERVER_SCHEMES) and bool(parts.hostname) and parts.port != 0 and not parts.fragment
-        )
+        is_one = url.startswith(SERVER_SCHEMES) and parts.hostname and parts.port != 0
     except ValueError:  # the port is no number
-        usable = False
-    if not usable or not url.isprintable():
+        is_one = False
+    if not is_one:
         shown = echo(repr(url))
         raise ConfigError(f"the address of a policy server is {shown}; it must be ws://HOST:PORT or wss://….")
 
@@ -244,10 +243,7 @@ def encode_prompt(prompt: RenderedPrompt) -> dict[str, Any]:
             "kind": image.kind,
             "rgb": dict(image.rgb),
             "segm": dict(image.segm),
-            "objects": [
-                {"object_id": each.object_id, "object": each.object, "texture": each.texture}
-                for each in image.objects
-            ],
+            "objects": [asdict(each) for each in image.objects],
         }
         for image in prompt.images.values()
     ]
@@ -326,12 +322,11 @@ def decode_action(message: Any, where: str = "action", *, control: str = PRIMITI
     )
 
 
-def check_modalities(names: object, whose: str) -> tuple[str, ...]:
+def check_modalities(names: object) -> tuple[str, ...]:
     """Return the modalities that a policy asks for.
 
     Args:
         names: What it names.
-        whose: How to name the policy in the error.
 
     Raises:
         MessageError: It is no list of modalities that are sent, or "rgb" is not among them.
@@ -339,7 +334,7 @@ def check_modalities(names: object, whose: str) -> tuple[str, ...]:
     listed = list(names) if isinstance(names, list | tuple) else []
     if "rgb" not in listed or any(name not in MODALITIES for name in listed):
         raise MessageError(
-            f"{whose} has modalities {echo(repr(names))}; servers get rgb and, if asked, segm and joints."
+            f"the policy has modalities {echo(repr(names))}; servers get rgb and, if asked, segm and joints."
         )
     return tuple(name for name in MODALITIES if name in listed)
 

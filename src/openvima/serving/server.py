@@ -304,7 +304,7 @@ class _PolicyServer:
         self._new_policy: Callable[[], Policy] = getattr(policy, "new_session", lambda: policy)
         self._max_connections = config.max_connections if hasattr(policy, "new_session") else 1
         self._num_connections = 0
-        modalities = check_modalities(getattr(policy, "modalities", DEFAULT_MODALITIES), "the policy")
+        modalities = check_modalities(getattr(policy, "modalities", DEFAULT_MODALITIES))
         control = check_form(getattr(policy, "control", PRIMITIVES), CONTROLS, "control of the policy")
         versions = {"openvima": __version__}
         about = {"protocol": PROTOCOL, "versions": versions, **about}
