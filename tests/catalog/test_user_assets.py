@@ -12,7 +12,7 @@ import pytest
 from openvima.catalog import Pool, load_assets, packs, registration
 from openvima.catalog.packs import recorded_assets
 from openvima.cli.main import main
-from openvima.data import Dataset, GenerateConfig, generate, rerender, verification
+from openvima.data import Dataset, GenerateConfig, generate, records, rerender
 from openvima.data.verification import VerifyConfig, verify
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import AssetError, UnknownNameError
@@ -40,7 +40,7 @@ def forget() -> None:
     """Undo what the functions did, as another process would find it."""
     packs._packs.clear()
     os.environ.pop(packs._LOADED_VARIABLE, None)
-    for cached in (rerender._rasteriser, verification._make_env):
+    for cached in (rerender._rasteriser, records.make_env):
         cached.cache_clear()
     for table in (registration.REGISTERED_OBJECTS, registration.REGISTERED_TEXTURES):
         for name in [name for name in table if name.startswith("test ")]:
@@ -105,7 +105,7 @@ def test_demonstrations_of_own_assets_are_read_drawn_anew_and_replayed(
     with pytest.raises(AssetError, match="code that is not run"):
         Dataset(folder)[0].rgb["front"]
     found = verify(folder, VerifyConfig())
-    assert any("code that is not run" in note for note in found.notes)
+    assert any("code that is not run" in problem.cause for problem in found.problems)
     assert "test bar" not in registration.REGISTERED_OBJECTS
     assert verify(folder, VerifyConfig(assets=BAR)).is_clean
 

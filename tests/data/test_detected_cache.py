@@ -91,7 +91,7 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
     assert rows_of(caches[1][0].objects).tolist() != rows_of(caches[2][0].objects).tolist()
     again = pickle.loads(pickle.dumps(caches[2]))
     assert rows_of(again[3].objects).tolist() == rows_of(caches[2][3].objects).tolist()
-    with pytest.raises(DatasetError, match=r"lacks 6 shards.*--boxes DETECTOR"):
+    with pytest.raises(DatasetError, match="lacks 6 shards"):
         ObjectCache(dataset, variant="clumsy-3")
 
 

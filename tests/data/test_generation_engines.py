@@ -105,7 +105,6 @@ def test_ranges_of_shards_in_any_order_make_the_same_data_set(whole: Path, tmp_p
         ({"shard_range": (2, 2)}, "shard_range is 2:2; it must be a:b"),
         ({"shard_range": (-1, 2)}, "shard_range is -1:2"),
         ({"engine": "slurm"}, "engine is 'slurm'; allowed are processes and ray"),
-        ({"compression": "gzip"}, "compression is 'gzip'; allowed are lz4 and zstd"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(changes: dict, message: str, tmp_path: Path) -> None:

@@ -134,7 +134,7 @@ def test_an_extension_stopped_by_hand_leaves_whole_files_and_is_continued(
     with pytest.raises(KeyboardInterrupt):
         generate(config(tmp_path), stop)
     assert contents(tmp_path).keys() - {"index.parquet"} == {"rotate-train-00000.arrow"}
-    with pytest.raises(DatasetError, match="not finished"):
+    with pytest.raises(DatasetError, match="holds no finished data set"):
         Dataset(tmp_path)
     generate(config(tmp_path))
     assert contents(tmp_path) == contents(whole)

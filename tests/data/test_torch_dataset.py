@@ -12,8 +12,7 @@ torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader, Subset  # noqa: E402
 
 from openvima.data import Dataset  # noqa: E402
-from openvima.data.torch_dataset import DemonstrationDataset, collate, tensors_of  # noqa: E402
-from openvima.errors import ShapeError  # noqa: E402
+from openvima.data.torch_dataset import DemonstrationDataset, tensors_of  # noqa: E402
 
 
 @pytest.fixture(name="demos")
@@ -50,8 +49,6 @@ def test_items_are_demonstrations_by_number(demos: Dataset) -> None:
         items[10]
     copied = pickle.loads(pickle.dumps(DemonstrationDataset(demos)))
     assert torch.equal(copied[0]["rgb_top"], DemonstrationDataset(demos)[0]["rgb_top"])
-    with pytest.raises(ShapeError, match="at least one"):
-        collate([])
 
 
 def test_a_demonstration_without_steps_has_tensors_without_rows(demos: Dataset) -> None:

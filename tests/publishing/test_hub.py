@@ -89,7 +89,7 @@ def test_a_revision_stays_what_it_was_when_the_branch_moves_on(hub: LocalHub, de
     first = push_demonstrations(demos, "owner/demos")
     hub.repository("owner/demos", "datasets").commit({MANIFEST_NAME: b"{}"})
     assert len(Dataset(f"hf://{first}")) == 2
-    with pytest.raises(DatasetError, match=r"dataset\.json of owner/demos@[0-9a-f]{40}: it is damaged"):
+    with pytest.raises(DatasetError, match=r"owner--demos/[0-9a-f]{40}/dataset\.json: it is damaged"):
         Dataset("hf://owner/demos")
 
 

@@ -158,7 +158,7 @@ def test_nothing_of_an_evaluation_level_is_recorded(page: Any, studio: Any, reco
     episode = sample_episode("visual_manipulation", level="L2", seed=3)
     session.submit(lambda: session.open(episode, None)).result()
     page.tab("You")
-    page.wait_for("is of level L2, which stays unseen")
+    page.wait_for("stays unseen; demonstrations are recorded at level train")
 
 
 def test_a_scene_of_two_objects_is_composed_and_solved(page: Any, studio: Any, tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ from openvima.data.chat import (
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
 from openvima.data.subsets import check_out
-from openvima.errors import ConfigError
 from openvima.input_files import as_path
 from openvima.multiprocess import Report
 from openvima.perception.objects import ObjectExtractor
@@ -66,12 +65,9 @@ def export_chat(
         The folder.
 
     Raises:
-        ConfigError: There cannot be so many questions.
         DatasetError: There are no such demonstrations, or the folder has content.
         DatasetError: A shard is damaged.
     """
-    if questions < 0:
-        raise ConfigError(f"questions is {questions}; it must be at least 0.")
     dataset, out = Dataset(data, tasks=tasks), as_path(out)
     check_out(out, [dataset.path], force=False)
     with folder_lock(out), atomic_folder(out) as folder:

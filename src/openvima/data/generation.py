@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 from openvima.atomic_io import FINISH_S, folder_lock, parts_in_range
@@ -23,11 +22,9 @@ from openvima.data.planning import (
     GenerateConfig,
     plan,
 )
-from openvima.data.reader import read_manifest
-from openvima.data.records import Demonstration, rollout_oracle
+from openvima.data.records import Demonstration, make_env, rollout_oracle
 from openvima.data.shard import Shard, ShardWriter, remedy
 from openvima.env import TabletopEnv
-from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.multiprocess import Report, imap_with_engine
 
@@ -39,18 +36,6 @@ def is_done(block: Block) -> bool:
     written.
     """
     return block.path.is_file() and len(Shard(block.path)) == block.episodes
-
-
-def _check_origin(folder: Path) -> None:
-    """Refuse what other commands made: shards of a sample say the same of themselves, with other episodes."""
-    if not (folder / MANIFEST_NAME).is_file():
-        return
-    manifest = read_manifest(folder)
-    if manifest["command"] != COMMAND:
-        raise DatasetError(
-            f"{folder} belongs to another data set: `{manifest['command']}` made it. "
-            "Give another --out, or --force to delete it."
-        )
 
 
 def write_block(block: Block, count: Callable[[int], None]) -> None:
@@ -65,7 +50,7 @@ def write_block(block: Block, count: Callable[[int], None]) -> None:
         DatasetError: A record that is to be copied is damaged.
     """
     num_kept, next_seed, skipped, reason = 0, block.seeds.start, [], ""
-    env = _env(block.info.task, block.info.level, block.env_config)
+    env = make_env(block.info.task, block.info.level, DOMAIN, block.env_config)
     with ShardWriter(block.path, block.info) as kept:
         if block.path.is_file():
             num_kept, next_seed = _copy_records(block.path, kept)
@@ -116,11 +101,6 @@ def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
     return Skipped(seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
 
 
-@lru_cache(maxsize=4)
-def _env(task: str, level: str, env_config: EnvConfig) -> TabletopEnv:
-    return env_config.make(task, level, domain=DOMAIN)
-
-
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     """Write demonstrations by the oracle, or those that a data folder still lacks.
 
@@ -152,13 +132,12 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
         with folder_lock(config.out, config.shard_range):
             if config.force:
                 clear(config.out)
-            _check_origin(config.out)
-            check_shards(config.out, {block.path.name: (block.info, block.episodes) for block in blocks})
+            wanted = {block.path.name: (block.info, block.episodes) for block in blocks}
+            check_shards(config.out, COMMAND, wanted)
+            if config.shard_range is None:
+                remove_leftovers(config.out)
             _write_missing(config, own, report)
-            if config.shard_range is None and not is_finished(config.out):
-                finish(config, blocks)
-        if config.shard_range is not None:
-            _finish_with_others(config, blocks)
+        _finish(config, blocks)
     except BrokenPipeError:  # of `report`
         raise
     except OSError as error:
@@ -172,7 +151,6 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
     Raises:
         DatasetError: A shard is not where it should be.
     """
-    _remove_leftovers(config, own)
     missing = [block for block in own if not is_done(block)]
     missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
     total, left = (sum(block.episodes for block in part) for part in (own, missing))
@@ -185,13 +163,10 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
     if not missing:
         return
     (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
-    try:
-        for _ in imap_with_engine(
-            config.engine, write_block, missing, config.workers, address=config.address, report=count
-        ):
-            pass  # a block's result is its file
-    finally:
-        _remove_leftovers(config, own)
+    for _ in imap_with_engine(
+        config.engine, write_block, missing, config.workers, address=config.address, report=count
+    ):
+        pass  # a block's result is its file
     lost = [block.path for block in own if not block.path.is_file()]
     if lost:
         raise DatasetError(
@@ -200,28 +175,11 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
         )
 
 
-def _remove_leftovers(config: GenerateConfig, own: Sequence[Block]) -> None:
-    remove_leftovers(config.out, None if config.shard_range is None else [block.path for block in own])
-
-
-def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None:
-    """Write index and manifest if the shards of all ranges are there."""
+def _finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+    """Write index and manifest if all shards are there, those of other ranges, too."""
     if is_finished(config.out) or not all(is_done(block) for block in blocks):
         return
     with folder_lock(config.out, timeout_s=FINISH_S):  # others may have come to the same conclusion
         if not is_finished(config.out):
-            finish(config, blocks)
-
-
-def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
-    """Write index and manifest of a folder whose shards are all there.
-
-    Args:
-        config: What was generated.
-        blocks: Its division into shards.
-
-    Raises:
-        DatasetError: A shard is damaged.
-    """
-    paths, versions = [block.path for block in blocks], blocks[0].info.versions
-    finish_folder(config.out, paths, command=COMMAND, config=config.record(), versions=versions)
+            paths, versions = [block.path for block in blocks], blocks[0].info.versions
+            finish_folder(config.out, paths, command=COMMAND, config=config.record(), versions=versions)

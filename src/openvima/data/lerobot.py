@@ -10,7 +10,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -20,17 +19,17 @@ import pyarrow.parquet as pq
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, folder_lock
 from openvima.data.lerobot_frames import (
-    DenseTrajectory,
     FrameLayout,
+    Trajectory,
     dense_settings,
     dense_trajectory,
     frame_layout,
+    step_trajectory,
 )
 from openvima.data.reader import Dataset
-from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE
 from openvima.data.subsets import check_out
-from openvima.errors import ConfigError, DatasetError
+from openvima.errors import ConfigError
 from openvima.input_files import settle
 from openvima.multiprocess import Report
 from openvima.render import channels_last
@@ -165,19 +164,27 @@ ROBOT_TYPE = "ur5"
 
 
 class LerobotWriter:
-    """Writes a data set into an empty folder; a context manager.
+    """Writes a data set into an empty folder, which is one after `finish`.
 
-    The folder is a data set when the block has ended well. Numbers of up to `EPISODES_PER_FILE` episodes are
-    in memory, and the pictures of one.
+    Numbers of up to `EPISODES_PER_FILE` episodes are in memory, and the pictures of one.
 
     Args:
         folder: The folder.
+        closing: Closes the videos, also should something fail.
         frames: What a frame holds.
         fps: Frames a second.
         pixels: Pixel format of the videos.
     """
 
-    def __init__(self, folder: Path, frames: FrameLayout, *, fps: int, pixels: PixelFormat) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        closing: contextlib.ExitStack,
+        frames: FrameLayout,
+        *,
+        fps: int,
+        pixels: PixelFormat,
+    ) -> None:
         self._folder, self._frames, self._fps, self._pixels = folder, frames, fps, pixels
         self._schema = _schema(frames)
         self._tasks: dict[str, int] = {}
@@ -187,10 +194,10 @@ class LerobotWriter:
         self._tables: list[pa.Table] = []  # frames of each episode of the present files
         self._rows: list[dict[str, Any]] = []  # and its entry in the list of episodes
         self._pixel_counts = {key: np.zeros((3, 256), np.int64) for key in frames.video_keys}
-        self._closing = contextlib.ExitStack()
+        self._closing = closing
         self._videos: dict[str, VideoWriter] = {}
 
-    def write(self, demo: Demonstration | DenseTrajectory) -> None:
+    def write(self, demo: Trajectory) -> None:
         """Append an episode.
 
         Args:
@@ -199,7 +206,7 @@ class LerobotWriter:
         number = self._num_episodes // EPISODES_PER_FILE
         if not self._rows:
             self._begin_files(number)
-        values = {**self._frames.values(demo), **self._counters(demo)}  # type: ignore[arg-type]  # of the layout
+        values = {**self._frames.values(demo), **self._counters(demo)}
         self._tables.append(_table(values, self._schema))
         statistics = {**self._write_pictures(demo), **{k: value_statistics(v) for k, v in values.items()}}
         start, end = self._num_frames, self._num_frames + demo.num_steps
@@ -224,20 +231,13 @@ class LerobotWriter:
         if len(self._rows) == EPISODES_PER_FILE:
             self._finish_files(number)
 
-    def __enter__(self) -> "LerobotWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is not None:
-            self._closing.__exit__(kind, error, trace)
-            return
+    def finish(self) -> None:
+        """Write what is left, and the metadata."""
         if self._rows:
             self._finish_files(self._num_episodes // EPISODES_PER_FILE)
         self._write_metadata()
 
-    def _counters(self, demo: Demonstration | DenseTrajectory) -> dict[str, np.ndarray]:
+    def _counters(self, demo: Trajectory) -> dict[str, np.ndarray]:
         steps = np.arange(demo.num_steps)
         task_index = self._tasks.setdefault(demo.prompt.text, len(self._tasks))
         return {
@@ -248,9 +248,10 @@ class LerobotWriter:
             "task_index": np.full_like(steps, task_index),
         }
 
-    def _write_pictures(self, demo: Demonstration | DenseTrajectory) -> dict[str, Statistics]:
+    def _write_pictures(self, demo: Trajectory) -> dict[str, Statistics]:
         statistics = {}
-        for key, pictures in self._frames.pictures(demo).items():  # type: ignore[arg-type]  # as above
+        views = {view: images[: demo.num_steps] for view, images in demo.rgb.items()}
+        for key, pictures in self._frames.pictures(views, demo.prompt).items():
             for index, picture in enumerate(pictures):
                 repeat = demo.num_steps // len(pictures)
                 self._videos[key].write(channels_last(picture), repeat=repeat, is_key=index == 0)
@@ -396,22 +397,20 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     """
     import_av()  # before the work begins
     dataset = Dataset(config.data, tasks=config.tasks)
-    if not len(dataset):
-        raise DatasetError(f"{config.data} has no episodes to export.")
     check_out(config.out, [config.data], force=config.force, is_own=lambda out: (out / INFO_PATH).is_file())
     settings = dense_settings(dataset)
     fps = CONTROL_HZ if settings else 1  # a whole number of float32 seconds, by which LeRobot finds frames
-    with folder_lock(config.out), atomic_folder(config.out) as folder:
-        with LerobotWriter(
-            folder,
-            find_layout(dataset, END_EFFECTOR if settings else PRIMITIVES),
-            fps=fps,
-            pixels=config.pixels,
-        ) as writer:
-            for number, demo in enumerate(dataset, 1):
-                writer.write(dense_trajectory(demo, settings[demo.task, demo.level]) if settings else demo)
-                if report:
-                    report(number, len(dataset), demo.task)
+    layout = find_layout(dataset, END_EFFECTOR if settings else PRIMITIVES)
+    with folder_lock(config.out), atomic_folder(config.out) as folder, contextlib.ExitStack() as closing:
+        writer = LerobotWriter(folder, closing, layout, fps=fps, pixels=config.pixels)
+        for number, demo in enumerate(dataset, 1):
+            if settings:
+                writer.write(dense_trajectory(demo, settings[demo.task, demo.level]))
+            else:
+                writer.write(step_trajectory(demo, has_joints=layout.has_joints))
+            if report:
+                report(number, len(dataset), demo.task)
+        writer.finish()
         _write_source(folder, dataset, config, fps)
     return config.out
 
@@ -422,28 +421,14 @@ def find_layout(dataset: Dataset, control: str) -> FrameLayout:
     Args:
         dataset: The demonstrations.
         control: "primitives" or "end_effector".
-
-    Raises:
-        DatasetError: An episode has no steps, so no frames either.
     """
     num_images, has_joints = 0, True
     for name in dataset.shard_names():
         table = dataset.shard(name).table(["prompt_images", "joint_paths", "steps"])
-        if not table["steps"].to_numpy().all():
-            raise DatasetError(f"{dataset.path / name} holds an episode without steps; LeRobot takes none.")
-        num_images = max(num_images, *_lengths(table["prompt_images"].combine_chunks()))
-        has_joints = has_joints and _has_joints(table)
+        images, paths, steps = (column.combine_chunks() for column in table.columns)
+        num_images = max(num_images, *images.value_lengths().to_pylist())
+        has_joints = has_joints and paths.value_lengths().equals(steps)
     return frame_layout(control, num_images, has_joints)
-
-
-def _has_joints(table: pa.Table) -> bool:
-    """Whether there are waypoints of the arm for each step."""
-    waypoints = _lengths(table["joint_paths"].combine_chunks().flatten())
-    return np.count_nonzero(waypoints) == table["steps"].to_numpy().sum()
-
-
-def _lengths(lists: pa.ListArray) -> np.ndarray:
-    return lists.value_lengths().to_numpy()
 
 
 def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig, fps: int) -> None:

@@ -9,14 +9,18 @@ import numpy as np
 
 from openvima.catalog.packs import recorded_assets
 from openvima.data.reader import Dataset
-from openvima.data.records import Demonstration
+from openvima.data.records import Demonstration, action_arrays
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.env.config import EnvConfig
 from openvima.errors import ActionError, DatasetError
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS, WORKSPACE_HIGH, WORKSPACE_LOW, RenderedPrompt
-from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR
+from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES
+
+if TYPE_CHECKING:  # comes with the simulator
+    from openvima.env import TabletopEnv
 
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+TOOL_NAMES = ("tool_x", "tool_y", "tool_z", "tool_yaw", "tool_holds")
 ACTION_NAMES = tuple(f"{key}.{axis}" for key, length in ACTION_SHAPES.items() for axis in "xyzw"[:length])
 MAX_PROMPT_IMAGES = 8  # of the benchmark's prompts: novel_adj
 IMAGE_PREFIX = "observation.images."
@@ -34,27 +38,55 @@ _HEIGHT, _WIDTH = IMAGE_SHAPE
 Feature = dict[str, Any]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """An episode as the frames show it, T steps or commands.
+
+    Args:
+        prompt: Text and images.
+        rgb: View name to images before each action, shape (T or more, 3, 128, 256), uint8.
+        states: Numbers of `observation.state` before each action, shape (T, D), float32.
+        actions: Shape (T, 12 or 5), float32.
+        success: Whether the episode was solved.
+    """
+
+    prompt: RenderedPrompt
+    rgb: Mapping[str, np.ndarray]
+    states: np.ndarray
+    actions: np.ndarray
+    success: bool
+
+    @property
+    def num_steps(self) -> int:
+        """Number of actions, T."""
+        return len(self.actions)
+
+
 @dataclass(frozen=True, slots=True)
 class FrameLayout:
     """What all frames of an export have in common.
 
     Args:
         num_prompt_images: The largest number of images in a prompt.
-        has_joints: Whether the arm's joints are known throughout; without them the state is the tool alone.
+        has_joints: Whether the arm's joints are known throughout; with control "primitives" the state is the
+            tool alone without them.
+        control: "primitives" or "end_effector".
     """
 
     num_prompt_images: int
     has_joints: bool
+    control: str = PRIMITIVES
 
     @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the numbers of `observation.state`."""
-        return (*(JOINT_NAMES if self.has_joints else ()), "end_effector")
+        tool = TOOL_NAMES if self.control == END_EFFECTOR else ()
+        return (*(JOINT_NAMES if self.has_joints else ()), *tool, "end_effector")
 
     @property
     def action_names(self) -> tuple[str, ...]:
         """Names of the numbers of `action`."""
-        return ACTION_NAMES
+        return COMMAND_NAMES if self.control == END_EFFECTOR else ACTION_NAMES
 
     @property
     def video_keys(self) -> tuple[str, ...]:
@@ -97,56 +129,28 @@ class FrameLayout:
         }
         return {**dict.fromkeys(self.video_keys, video), **self.value_features()}
 
-    def values(self, demo: Demonstration) -> dict[str, np.ndarray]:
-        """Return what the frames of one episode hold besides images and counters.
+    def values(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
+        """Return what the frames of one episode hold besides images and counters, arrays of T rows."""
+        is_last = np.arange(trajectory.num_steps) == trajectory.num_steps - 1
+        return {
+            "observation.state": trajectory.states,
+            "action": trajectory.actions,
+            "next.reward": (is_last & trajectory.success).astype(np.float32),
+            "next.done": is_last,
+            "next.success": is_last & trajectory.success,
+        }
+
+    def pictures(self, views: Mapping[str, np.ndarray], prompt: RenderedPrompt) -> dict[str, np.ndarray]:
+        """Return the pictures of T frames.
 
         Args:
-            demo: The episode, T steps.
-
-        Returns:
-            Arrays of T rows.
-        """
-        actions = np.array([_action_row(demo, step) for step in range(demo.num_steps)], np.float32)
-        return _values(self._states(demo), actions, success=demo.outcome.success)
-
-    def pictures(self, demo: Demonstration) -> dict[str, np.ndarray]:
-        """Return the pictures of one episode.
-
-        Args:
-            demo: The episode, T steps.
+            views: View name to images, shape (T, 3, 128, 256), uint8.
+            prompt: That of the episode.
 
         Returns:
             Video key to uint8, shape (T or 1, 3, 128, 256); one picture stands for all T frames. Black where
             the prompt has fewer images than others.
         """
-        return self._pictures({view: demo.rgb[view][: demo.num_steps] for view in VIEWS}, demo.prompt)
-
-    def frame(self, observation: Mapping[str, Any], prompt: RenderedPrompt) -> dict[str, Any]:
-        """Return an observation in the form in which LeRobot's environments return it.
-
-        Args:
-            observation: Of the environment: `rgb`, `ee` and, with joints, `joints`.
-            prompt: The episode's.
-
-        Returns:
-            `pixels`, image name to uint8, shape (128, 256, 3); and `agent_pos`, float32: the numbers of
-            `observation.state`. LeRobot names the images `observation.images.{name}`.
-        """
-        pictures = self._pictures({view: observation["rgb"][view][None] for view in VIEWS}, prompt)
-        joints = observation["joints"] if self.has_joints else ()
-        return {
-            "pixels": {
-                key.removeprefix(IMAGE_PREFIX): np.moveaxis(picture[0], 0, -1)
-                for key, picture in pictures.items()
-            },
-            "agent_pos": np.array([*joints, observation["ee"]], np.float32),
-        }
-
-    def action(self, row: np.ndarray) -> Any:
-        """Return the action that a row of `action` stands for; see `action_from_row`."""
-        return action_from_row(row)
-
-    def _pictures(self, views: Mapping[str, np.ndarray], prompt: RenderedPrompt) -> dict[str, np.ndarray]:
         shown = {f"{IMAGE_PREFIX}{view}": pictures for view, pictures in views.items()}
         for number, image in enumerate(prompt.images.values()):
             for view in VIEWS:
@@ -154,42 +158,58 @@ class FrameLayout:
         black = np.zeros((1, 3, _HEIGHT, _WIDTH), np.uint8)
         return {key: shown.get(key, black) for key in self.video_keys}
 
-    def _states(self, demo: Demonstration) -> np.ndarray:
-        tool = float(END_EFFECTORS.index(demo.end_effector))
-        if not self.has_joints:
-            return np.full((demo.num_steps, 1), tool, np.float32)
-        return np.array([(*path[0], tool) for path in demo.joint_paths], np.float32)
+    def frame(self, observation: Mapping[str, Any], prompt: RenderedPrompt) -> dict[str, Any]:
+        """Return an observation in the form in which LeRobot's environments return it.
+
+        Args:
+            observation: Of the environment: `rgb`, `ee`, with joints `joints`, and with control
+                "end_effector" `tool`.
+            prompt: The episode's.
+
+        Returns:
+            `pixels`, image name to uint8, shape (128, 256, 3); and `agent_pos`, float32: the numbers of
+            `observation.state`. LeRobot names the images `observation.images.{name}`.
+        """
+        pictures = self.pictures({view: observation["rgb"][view][None] for view in VIEWS}, prompt)
+        joints = observation["joints"] if self.has_joints else ()
+        tool = observation["tool"] if self.control == END_EFFECTOR else ()
+        return {
+            "pixels": {
+                key.removeprefix(IMAGE_PREFIX): np.moveaxis(picture[0], 0, -1)
+                for key, picture in pictures.items()
+            },
+            "agent_pos": np.array([*joints, *tool, observation["ee"]], np.float32),
+        }
+
+    def action(self, row: np.ndarray) -> Any:
+        """Return the action or command that a row of `action` stands for, as the environment takes it.
+
+        A regression leaves the bounds by little: positions of primitives are clipped to the workspace, and
+        rotations scaled to unit length. What is not finite stays so, and the environment refuses it.
+
+        Args:
+            row: Numbers with the names `action_names`, floating-point.
+
+        Raises:
+            ActionError: The row has another shape or dtype.
+        """
+        names = self.action_names
+        if row.shape != (len(names),) or not np.issubdtype(row.dtype, np.floating):
+            raise ActionError(
+                f"the action has shape {row.shape}, dtype {row.dtype}; it must be "
+                f"{len(names)} floating-point numbers: {', '.join(names)}."
+            )
+        row = row.astype(np.float32)
+        if self.control == END_EFFECTOR:
+            return row
+        ends = np.cumsum(list(ACTION_SHAPES.values()))[:-1]
+        parts = zip(ACTION_SHAPES, np.split(row, ends), strict=True)
+        return {key: _within_bounds(values) for key, values in parts}
 
 
-def action_from_row(row: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the action that a row of `action` stands for, as the environment takes it.
-
-    A regression leaves the bounds by little: positions are clipped to the workspace, and rotations scaled to
-    unit length. What is not finite stays so, and the environment refuses it.
-
-    Args:
-        row: Shape (12,), float32; see `ACTION_NAMES`.
-
-    Raises:
-        ActionError: The row has another shape or dtype.
-    """
-    check_row(row, ACTION_NAMES)
-    ends = np.cumsum(list(ACTION_SHAPES.values()))[:-1]
-    parts = zip(ACTION_SHAPES, np.split(row.astype(np.float32), ends), strict=True)
-    return {key: _within_bounds(values) for key, values in parts}
-
-
-def check_row(row: np.ndarray, names: tuple[str, ...]) -> None:
-    """Check that a row has a floating-point number for each name.
-
-    Raises:
-        ActionError: It has another shape or dtype.
-    """
-    if row.shape != (len(names),) or not np.issubdtype(row.dtype, np.floating):
-        raise ActionError(
-            f"the action has shape {row.shape}, dtype {row.dtype}; it must be {len(names)} floating-point "
-            f"numbers: {', '.join(names)}."
-        )
+def frame_layout(control: str, num_prompt_images: int, has_joints: bool) -> FrameLayout:
+    """Return the layout of a control's frames; those of "end_effector" always have joints."""
+    return FrameLayout(num_prompt_images, has_joints or control == END_EFFECTOR, control)
 
 
 def _within_bounds(values: np.ndarray) -> np.ndarray:
@@ -200,93 +220,21 @@ def _within_bounds(values: np.ndarray) -> np.ndarray:
     return np.clip(values / max(float(np.linalg.norm(values)), 1e-6), -1, 1).astype(np.float32)
 
 
-def _values(states: np.ndarray, actions: np.ndarray, *, success: bool) -> dict[str, np.ndarray]:
-    is_last = np.arange(len(actions)) == len(actions) - 1
-    return {
-        "observation.state": states,
-        "action": actions,
-        "next.reward": (is_last & success).astype(np.float32),
-        "next.done": is_last,
-        "next.success": is_last & success,
-    }
-
-
 def _feature(dtype: str, names: tuple[str, ...] = ()) -> Feature:
     return {"dtype": dtype, "shape": [len(names) or 1], "names": list(names) or None}
 
 
-def _action_row(demo: Demonstration, step: int) -> list[float]:
-    return [number for key in ACTION_SHAPES for number in getattr(demo.actions[step], key)]
-
-
-if TYPE_CHECKING:  # comes with the simulator
-    from openvima.env import TabletopEnv
-
-TOOL_NAMES = ("tool_x", "tool_y", "tool_z", "tool_yaw", "tool_holds")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DenseTrajectory:
-    """A demonstration of low-level control, T commands.
-
-    Args:
-        task: Name of the task.
-        prompt: Text and images.
-        rgb: View name to images before each command, shape (T, 3, 128, 256), uint8.
-        states: Joints, `TOOL_NAMES` and end effector before each command, shape (T, 12), float32.
-        commands: Shape (T, 5), float32.
-        success: Whether the episode was solved.
-    """
-
-    task: str
-    prompt: RenderedPrompt
-    rgb: Mapping[str, np.ndarray]
-    states: np.ndarray
-    commands: np.ndarray
-    success: bool
-
-    @property
-    def num_steps(self) -> int:
-        """Number of commands, T."""
-        return len(self.commands)
-
-
-class DenseLayout(FrameLayout):
-    """What all frames of an export of low-level control have in common."""
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the numbers of `observation.state`."""
-        return (*JOINT_NAMES, *TOOL_NAMES, "end_effector")
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the numbers of `action`."""
-        return COMMAND_NAMES
-
-    def values(self, demo: DenseTrajectory) -> dict[str, np.ndarray]:  # type: ignore[override]  # of its own kind
-        """Return what the frames of one trajectory hold besides images and counters, arrays of T rows."""
-        return _values(demo.states, demo.commands, success=demo.success)
-
-    def frame(self, observation: Mapping[str, Any], prompt: RenderedPrompt) -> dict[str, Any]:
-        """Return an observation of the environment in the form in which LeRobot's environments return it."""
-        values = (*observation["joints"], *observation["tool"], observation["ee"])
-        return {**FrameLayout.frame(self, observation, prompt), "agent_pos": np.array(values, np.float32)}
-
-    def action(self, row: np.ndarray) -> np.ndarray:
-        """Return the command that a row of `action` stands for, as the environment takes it.
-
-        Raises:
-            ActionError: The row has another shape or dtype.
-        """
-        check_row(row, COMMAND_NAMES)
-        return row.astype(np.float32)
-
-
-def frame_layout(control: str, num_prompt_images: int, has_joints: bool) -> FrameLayout:
-    """Return the layout of a control's frames; those of "end_effector" always have joints."""
-    kind = DenseLayout if control == END_EFFECTOR else FrameLayout
-    return kind(num_prompt_images, has_joints)
+def step_trajectory(demo: Demonstration, *, has_joints: bool) -> Trajectory:
+    """Return a demonstration with a frame for each step; without joints its states are the tool alone."""
+    tool = END_EFFECTORS.index(demo.end_effector)
+    joints = [path[0] for path in demo.joint_paths] if has_joints else [()] * demo.num_steps
+    return Trajectory(
+        demo.prompt,
+        demo.rgb,
+        np.array([(*each, tool) for each in joints], np.float32),
+        np.concatenate([*action_arrays(demo).values()], axis=1),
+        demo.outcome.success,
+    )
 
 
 def dense_settings(dataset: Dataset) -> dict[tuple[str, str], EnvConfig]:
@@ -304,8 +252,8 @@ def dense_settings(dataset: Dataset) -> dict[tuple[str, str], EnvConfig]:
     return {(i.task, i.level): replace(i.env_config, assets=recorded_assets(i.assets)) for i in infos}
 
 
-def dense_trajectory(demo: Demonstration, env_config: EnvConfig) -> DenseTrajectory:
-    """Replay a demonstration of low-level control.
+def dense_trajectory(demo: Demonstration, env_config: EnvConfig) -> Trajectory:
+    """Replay a demonstration of low-level control, with a frame for each command.
 
     Args:
         demo: The demonstration.
@@ -329,8 +277,7 @@ def dense_trajectory(demo: Demonstration, env_config: EnvConfig) -> DenseTraject
                 f"{demo.task}, seed {demo.seed}: the path of step {step} differs; other versions wrote it."
             )
     tool = END_EFFECTORS.index(demo.end_effector)
-    return DenseTrajectory(
-        demo.task,
+    return Trajectory(
         demo.prompt,
         {view: np.stack([each["rgb"][view] for each in seen]) for view in demo.rgb},
         np.array([(*each["joints"], *each["tool"], tool) for each in seen], np.float32),

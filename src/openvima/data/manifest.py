@@ -4,8 +4,9 @@ import hashlib
 import itertools
 import json
 import re
+import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
@@ -15,10 +16,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from openvima.atomic_io import NO_SPACE, atomic_write_file
+from openvima.atomic_io import atomic_write_file
 from openvima.data.encoding import ShardInfo
 from openvima.data.schema import SCHEMA_VERSION
-from openvima.data.shard import Shard, Span, measure
+from openvima.data.shard import Shard, Span, measure, remedy
 from openvima.errors import DatasetError, StorageError
 
 INDEX_NAME = "index.parquet"
@@ -28,29 +29,25 @@ _NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
 CACHE_FOLDER = "object_cache"  # derived from the shards, safe to delete
 LICENCE = "MIT"
 
-INDEX_SCHEMA = pa.schema(
-    [
-        pa.field("task", pa.string(), nullable=False),
-        pa.field("level", pa.string(), nullable=False),
-        pa.field("domain", pa.string(), nullable=False),
-        pa.field("seed", pa.int64(), nullable=False),
-        pa.field("steps", pa.int32(), nullable=False),
-        pa.field("end_effector", pa.string(), nullable=False),
-        pa.field("shard", pa.string(), nullable=False),
-        pa.field("row", pa.int32(), nullable=False),
-        pa.field("content_hash", pa.string(), nullable=False),
-        pa.field("offset", pa.int64(), nullable=False),  # of the record's first byte in its shard
-        pa.field("num_bytes", pa.int32(), nullable=False),
-        pa.field("crc32", pa.uint32(), nullable=False),  # of these bytes
-    ]
-)
-# What a manifest must hold, besides its checksum.
-_KEYS = ("command", "config", "versions", "licence", "content_hash", "counts", "tasks", "index", "shards")
+_INDEX_COLUMNS = {
+    "task": pa.string(),
+    "level": pa.string(),
+    "domain": pa.string(),
+    "seed": pa.int64(),
+    "steps": pa.int32(),
+    "end_effector": pa.string(),
+    "shard": pa.string(),
+    "row": pa.int32(),
+    "content_hash": pa.string(),
+    "offset": pa.int64(),  # of the record's first byte in its shard
+    "num_bytes": pa.int32(),
+    "crc32": pa.uint32(),  # of these bytes
+}
+INDEX_SCHEMA = pa.schema([pa.field(name, type_, nullable=False) for name, type_ in _INDEX_COLUMNS.items()])
 _SHARD_NAME = re.compile(r"\w[\w.+-]{0,200}\.arrow")
 
-_NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
 # What the index and the counts need of each shard.
-_COLUMNS = [name for name in INDEX_SCHEMA.names if name not in _NOT_IN_SHARDS] + ["redraws", "skipped"]
+_COLUMNS = ("task", "level", "domain", "seed", "steps", "end_effector", "content_hash", "redraws", "skipped")
 
 
 def finish_folder(
@@ -179,8 +176,6 @@ def parse_manifest(content: bytes) -> dict[str, Any]:
         raise DatasetError(f"it has schema {written_as}; this package reads {SCHEMA_VERSION}")
     if checksum != manifest_checksum(manifest):
         raise DatasetError("it is damaged or was edited (its checksum is wrong)")
-    if lacking := [key for key in _KEYS if key not in manifest]:
-        raise DatasetError(f"it lacks {', '.join(lacking)}")
     for name in manifest["shards"]:
         if not _SHARD_NAME.fullmatch(name):  # the object cache has files of these names
             raise DatasetError(f"it names the shard {name!r:.80}, which is no plain file name like a.arrow")
@@ -191,18 +186,48 @@ def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:
     """Read an index and compare it with its checksum in the manifest.
 
     Raises:
-        DatasetError: It is damaged or has other columns; the message is the bare cause.
+        DatasetError: It is damaged; the message is the bare cause.
     """
     if hashlib.sha256(content).hexdigest() != manifest["index"].get("sha256"):
         raise DatasetError("it is damaged (its checksum is wrong)")
+    # Arrow's I/O threads, which `read_table` starts, can abort the interpreter as it exits.
+    return pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Read the manifest of a data folder.
+
+    Raises:
+        DatasetError: There is none, or it is damaged or of another version.
+    """
+    return _read(folder, MANIFEST_NAME, parse_manifest)
+
+
+def read_index(folder: Path, manifest: Mapping[str, Any]) -> pa.Table:
+    """Read the index of a data folder, as its manifest describes it.
+
+    Raises:
+        DatasetError: There is none, or it is damaged.
+    """
+    return _read(folder, INDEX_NAME, lambda content: parse_index(content, manifest))
+
+
+def _read(folder: Path, name: str, parse: Callable[[bytes], Any]) -> Any:
     try:
-        # Arrow's I/O threads, which `read_table` starts, can abort the interpreter as it exits.
-        index = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)
-    except (pa.ArrowException, OSError) as error:
-        raise DatasetError(f"it is no Parquet file ({error})") from None
-    if not index.schema.equals(INDEX_SCHEMA):
-        raise DatasetError(f"it has other columns than schema version {SCHEMA_VERSION} asks for")
-    return index
+        return parse((folder / name).read_bytes())
+    except (FileNotFoundError, NotADirectoryError):
+        raise DatasetError(explain_missing(folder, name)) from None
+    except DatasetError as error:
+        raise DatasetError(f"{folder / name}: {error}. {remedy(folder)}") from None
+
+
+def explain_missing(folder: Path, name: str = MANIFEST_NAME) -> str:
+    """Say what is wrong with a path where a file of a data set is missing, and what helps."""
+    if not folder.is_dir():
+        return f"there is no folder {folder}; `openvima generate --out {shlex.quote(str(folder))}` makes one."
+    inner = sorted(folder.glob(f"*/{MANIFEST_NAME}"))  # as in the folder that `openvima data split` writes
+    hint = f", but {inner[0].parent} does" if inner else ""
+    return f"{folder} holds no finished data set ({name} is missing){hint}."
 
 
 def fingerprint(path: Path) -> dict[str, Any]:
@@ -222,17 +247,24 @@ def is_finished(folder: Path) -> bool:
     return (folder / MANIFEST_NAME).is_file() and (folder / INDEX_NAME).is_file()
 
 
-def check_shards(folder: Path, wanted: Mapping[str, tuple[ShardInfo, int]]) -> None:
+def check_shards(folder: Path, command: str, wanted: Mapping[str, tuple[ShardInfo, int]]) -> None:
     """Refuse a folder whose shards do not belong to the data set that is asked for.
 
     Args:
         folder: The folder.
+        command: What makes it; shards of a sample say the same of themselves, with other episodes.
         wanted: File name of each shard that is asked for, to what its rows have in common and their number.
 
     Raises:
-        DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
+        DatasetError: Another command made it, it holds shards of other settings or versions, or more episodes
+            than are asked for.
         DatasetError: A shard is damaged.
     """
+    if (folder / MANIFEST_NAME).is_file() and (made_by := read_manifest(folder)["command"]) != command:
+        raise DatasetError(
+            f"{folder} belongs to another data set: `{made_by}` made it. "
+            "Give another --out, or --force to delete it."
+        )
     (any_info, _), *_ = wanted.values()
     for path in sorted(folder.glob("*.arrow")):
         shard = Shard(path)
@@ -253,18 +285,10 @@ def clear(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def remove_leftovers(folder: Path, shards: Iterable[Path] | None = None) -> None:
-    """Delete what killed writers, perhaps on other machines, left in a folder that is locked.
-
-    Args:
-        folder: The data folder.
-        shards: The locked shards; None means the whole folder.
-    """
-    names = None if shards is None else {path.name for path in shards}
-    for file in folder.glob(".*.tmp"):  # .NAME.PROCESS.tmp
-        name = file.name[1:].rsplit(".", 2)[0]
-        if name in names if names is not None else name in _NAMES or name.endswith(".arrow"):
-            file.unlink(missing_ok=True)
+def remove_leftovers(folder: Path) -> None:
+    """Delete what killed writers, perhaps on other machines, left of shards in a folder that is locked."""
+    for file in folder.glob(".*.arrow.*.tmp"):
+        file.unlink(missing_ok=True)
 
 
 def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> StorageError:
@@ -276,8 +300,7 @@ def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> Stora
         error: What the system said.
     """
     num_there = sum(path.is_file() for path in shards)
-    remedy = "Make room" if error.errno in NO_SPACE else "Make sure that it can be written to"
     return StorageError(
         f"cannot write to {folder}: {error.strerror or error}. {num_there} of {len(shards)} shards are "
-        f"whole and were kept. {remedy}; the same command then goes on from there."
+        "whole and were kept; the same command goes on from there."
     )

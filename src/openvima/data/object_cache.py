@@ -4,9 +4,8 @@ A derived folder, written when first needed and safe to delete. It has an Arrow 
 row per demonstration, uncompressed and memory-mapped: a demonstration that is read is a set of views into it.
 """
 
-import shlex
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import prod
@@ -18,13 +17,13 @@ import numpy as np
 import pyarrow as pa
 from xxhash import xxh3_64
 
-from openvima.atomic_io import NO_SPACE, atomic_write, folder_lock
+from openvima.atomic_io import atomic_write, folder_lock
 from openvima.data.manifest import CACHE_FOLDER, joint_hash, split_index
 from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empty_episode, preprocess
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
 from openvima.data.shard import DAMAGE_ERRORS, Envelope, Shard, list_spans, map_file
-from openvima.errors import DatasetError, unknown_name
+from openvima.errors import DatasetError, one_line, unknown_name
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, imap_unordered
 from openvima.perception.objects import ObjectExtractor
@@ -39,7 +38,6 @@ from openvima.perception.preprocessing import (
 from openvima.scene import COMPOSED
 
 CACHE_VERSION = 7  # grows whenever the same demonstration gives another row
-_RERENDERED = "rerendered-v"  # in front of version and number of a random appearance
 # Columns of lists, one record for each object, step or image: Arrow type of a number and shape of each field,
 # which has the name that it has in `PreprocessedEpisode`.
 _Fields = dict[str, tuple[pa.DataType, tuple[int, ...]]]
@@ -110,7 +108,7 @@ class Variant:
             part = f"-{self.boxes.fraction:g}" if self.boxes.fraction < 1 else ""
             names.append(f"{self.boxes.name}{part}")
         if self.appearance is not None:
-            names.append(f"{_RERENDERED}{RERENDERING_VERSION}-{self.appearance}")
+            names.append(f"rerendered-v{RERENDERING_VERSION}-{self.appearance}")
         return "-".join(names)
 
 
@@ -128,7 +126,10 @@ class CacheFile:
         self.path = path
         try:
             reader = pa.ipc.open_file(pa.py_buffer(map_file(path)))
-            about = _read_about(reader.schema)
+            metadata = reader.schema.metadata or {}
+            about: dict[str, Any] = {key.decode(): value.decode() for key, value in metadata.items()}
+            if not reader.schema.equals(_schema(about["kind"])):
+                raise ValueError("it has other columns")
             rows = reader.get_batch(0)
             rows.validate(full=True)  # no list reaches beyond its records
             self._lists = {
@@ -137,9 +138,7 @@ class CacheFile:
             self._scalars = {name: rows.column(name).to_pylist() for name in _SCALARS}
             self._checksums = rows.column(_CHECKSUM).to_pylist()
         except DAMAGE_ERRORS as error:
-            raise DatasetError(
-                _describe_damage(path, str(error).splitlines()[0] if str(error) else "empty")
-            ) from None
+            raise DatasetError(_describe_damage(path, one_line(error))) from None
         self.kind: InputKind = about["kind"]
         self.source, self.variant = about["source"], about["variant"]
 
@@ -238,16 +237,6 @@ def _schema(kind: InputKind, about: dict[str, str] | None = None) -> pa.Schema:
     return pa.schema({**lists, **_SCALARS, _CHECKSUM: pa.uint64()}, about)
 
 
-def _read_about(schema: pa.Schema) -> dict[str, Any]:
-    """Read version, kind, source and variant of a file, and check its columns."""
-    about = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
-    if about.get("version") != str(CACHE_VERSION):
-        raise ValueError(f"it is of version {about.get('version')!r:.20}, not {CACHE_VERSION}")
-    if about.get("kind") not in KINDS or not schema.equals(_schema(about["kind"])):
-        raise ValueError("it has other columns")
-    return about
-
-
 def _pack(fields: Mapping[str, Sequence[np.ndarray]]) -> pa.Array:
     """Put arrays of each row, which differ in length from row to row, into a column of lists of records."""
     columns = []
@@ -325,12 +314,9 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         self.folder = _cache_folder(dataset, kind, folder, variant)
         files = _open_files(self.folder, _index_by_shard(dataset), kind, variant)
         if missing := [name for name, file in files.items() if file is None]:
-            option = "--boxes DETECTOR" if variant else f"--kind {kind}"
-            if variant.startswith(_RERENDERED):
-                option = f"--kind {kind} --rerendered {variant.rpartition('-')[2]}"
             raise DatasetError(
-                f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; "
-                f"`openvima data preprocess {shlex.quote(str(dataset.path))} {option}` writes them."
+                f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; `openvima data preprocess` "
+                "writes them."
             )
         self._files = {name: file for name, file in files.items() if file is not None}
 
@@ -340,9 +326,6 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     def __getitem__(self, index: int) -> PreprocessedEpisode:  # type: ignore[override]  # nobody slices
         name, row = self.dataset.locate(index)
         return self._files[name][row]
-
-    def __iter__(self) -> Iterator[PreprocessedEpisode]:
-        return (self[index] for index in range(len(self)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ObjectCache, (self.dataset, self.kind, self._root, self.variant)
@@ -434,8 +417,6 @@ def check_object_cache(
         target.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=target).close()
     except OSError as error:
-        if error.errno in NO_SPACE:
-            raise
         raise DatasetError(
             f"cannot write the object cache to {target}: {error.strerror}. Name another folder: "
             "--object-cache of `openvima train`, --out of `openvima data preprocess`."

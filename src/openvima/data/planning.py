@@ -15,7 +15,6 @@ from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import package_versions
-from openvima.data.schema import CODECS
 from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
 from openvima.errors import ConfigError, brief_repr, unknown_name
 from openvima.input_files import settle
@@ -99,19 +98,17 @@ class GenerateConfig:
         ]
         if not self.tasks:
             problems.append("tasks is empty; name some, or 'all'.")
-        if problems := [*problems, *self._contradictions()]:
-            raise ConfigError(" ".join(problems))
-
-    def _contradictions(self) -> Iterator[str]:
-        if self.compression not in CODECS:
-            yield f"compression is {self.compression!r}; allowed are {' and '.join(CODECS)}."
-        yield from engine_problems(self.engine, self.address)
+        problems += engine_problems(self.engine, self.address)
         if self.shard_range is not None:
             start, stop = self.shard_range
             if not 0 <= start < stop:
-                yield f"shard_range is {start}:{stop}; it must be a:b with 0 ≤ a < b."
+                problems.append(f"shard_range is {start}:{stop}; it must be a:b with 0 ≤ a < b.")
             if self.force:
-                yield "force and shard_range exclude each other: each part would delete those before it."
+                problems.append(
+                    "force and shard_range exclude each other: each part would delete those before it."
+                )
+        if problems:
+            raise ConfigError(" ".join(problems))
 
     def resolved_tasks(self) -> tuple[str, ...]:
         """Return the names of the tasks, sorted.

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from openvima.data.records import Demonstration
+from openvima.data.records import Demonstration, action_arrays
 from openvima.data.schema import VIEWS
 from openvima.perception.boxes import match_ids_to_slots
 from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, make_hidden_objects, observe
@@ -20,10 +20,9 @@ from openvima.perception.preprocessing import (
     offset_index,
     preprocess_prompt,
 )
-from openvima.scene import ACTION_SHAPES, END_EFFECTORS, Action
+from openvima.scene import ACTION_SHAPES, END_EFFECTORS
 from openvima.tasks.prompts import image_descriptions
 
-ACTION_PARTS = tuple(ACTION_SHAPES)
 _SMALL_BOX = 16  # pixels, of a false positive where a view shows nothing to take the size from
 
 
@@ -141,7 +140,7 @@ def preprocess(
         place_ids=place_ids,
         false_positives=false_positives,
         final=ObjectTable.from_views(final, stack),
-        actions=np.array([_action_row(action) for action in demo.actions], np.float32).reshape(-1, 12),
+        actions=np.concatenate([*action_arrays(demo).values()], axis=1),
         images=stack.images()[1:],
         descriptions=image_descriptions(demo.prompt),
     )
@@ -197,7 +196,3 @@ def _cut_false_positives(
             row, column = rng.integers(image.shape[1] - height), rng.integers(image.shape[2] - width)
             crop, false_positives.boxes[t, v] = crop_box(image, (column, column + width, row, row + height))
             false_positives.crop_index[t, v] = stack.add(crop)
-
-
-def _action_row(action: Action) -> np.ndarray:
-    return np.concatenate([np.asarray(getattr(action, part)) for part in ACTION_PARTS])

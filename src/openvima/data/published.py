@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from itertools import groupby
 from pathlib import Path
@@ -114,8 +114,8 @@ class PublishedData(Sequence[Demonstration]):
     def __init__(self, path: str | Path, *, tasks: str | Sequence[str] | None = None) -> None:
         self.path = as_path(path)
         self.tasks = None if tasks is None else names_of(tasks)
-        self._source = open_source(self.path)
-        places, self.broken_folders = _sort_places(self._source)
+        self.source = open_source(self.path)
+        places, self.broken_folders = _sort_places(self.source)
         if self.tasks is not None:
             places = _select_tasks(places, self.tasks, self.path)
         self.places = tuple(places)
@@ -132,10 +132,6 @@ class PublishedData(Sequence[Demonstration]):
     def keys(self) -> tuple[EpisodeKey, ...]:
         """Task and id of all episodes, sorted."""
         return tuple(place.key for place in self.places)
-
-    def digest(self) -> str:
-        """Return 32 hexadecimal digits that stand for the archive, or for the episodes' names in folders."""
-        return self._source.digest()
 
     def __len__(self) -> int:
         return len(self.places)
@@ -168,7 +164,7 @@ class PublishedData(Sequence[Demonstration]):
             on_broken: Called with each one that is not.
         """
         for place in self.places:
-            found = read_place(self._source, place)
+            found = read_place(self.source, place)
             if isinstance(found, Demonstration):
                 yield found
             elif on_broken is not None:
@@ -178,7 +174,7 @@ class PublishedData(Sequence[Demonstration]):
         return partial(PublishedData, tasks=self.tasks), (self.path,)
 
     def _read(self, place: EpisodePlace) -> Demonstration:
-        found = read_place(self._source, place)
+        found = read_place(self.source, place)
         if isinstance(found, Broken):
             raise DatasetError(f"{self.path}: {found.member}: {found.reason}")
         return found
@@ -317,39 +313,32 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
     tasks = None if config.tasks == ("all",) else config.tasks
     data = PublishedData(config.source, tasks=tasks)
     blocks = plan(config, data)
+    wanted = {block.path.name: (block.info, len(block.places)) for block in blocks}
     with folder_lock(config.out):
-        _import(config, data, blocks, report)
-    return config.out
-
-
-def _import(
-    config: ImportConfig, data: PublishedData, blocks: Sequence[Block], report: Report | None
-) -> None:
-    if config.force:
-        clear(config.out)
-    check_shards(config.out, {block.path.name: (block.info, len(block.places)) for block in blocks})
-    broken = {block.path: _find_broken(block) for block in blocks}
-    missing = [block for block in blocks if broken[block.path] is None]
-    try:
-        if missing:
-            (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
-        total, left = (sum(len(block.places) for block in part) for part in (blocks, missing))
-        watch = report and (lambda done: report(total - left + done, total, ""))
-        for block, found in imap_unordered(write_block, missing, config.workers, report=watch):
-            broken[block.path] = found
-    except OSError as error:
-        if error.errno not in NO_SPACE:
-            raise
-        raise storage_error(config.out, [block.path for block in blocks], error) from error
-    finally:
+        if config.force:
+            clear(config.out)
+        check_shards(config.out, COMMAND, wanted)
         remove_leftovers(config.out)
-    if not is_finished(config.out):
-        _finish(config, data, blocks, [entry for block in blocks for entry in broken[block.path] or ()])
+        missing = [block for block in blocks if _find_broken(block) is None]
+        try:
+            if missing:
+                (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
+            total, left = (sum(len(block.places) for block in part) for part in (blocks, missing))
+            watch = report and (lambda done: report(total - left + done, total, ""))
+            for _ in imap_unordered(write_block, missing, config.workers, report=watch):
+                pass  # a block's result is its file
+        except OSError as error:
+            if error.errno not in NO_SPACE:
+                raise
+            raise storage_error(config.out, [block.path for block in blocks], error) from error
+        if not is_finished(config.out):
+            _finish(config, data, blocks)
+    return config.out
 
 
 def plan(config: ImportConfig, data: PublishedData) -> list[Block]:
     """Divide the episodes into blocks; the division depends on source and settings alone."""
-    versions = {**package_versions(), "vima": data.digest()}
+    versions = {**package_versions(), "vima": data.source.digest()}
     blocks = []
     for task, group in groupby(data.places, key=lambda place: place.key.task):
         places = tuple(group)[: config.episodes]
@@ -371,50 +360,35 @@ def plan(config: ImportConfig, data: PublishedData) -> list[Block]:
     return blocks
 
 
-def write_block(block: Block, count: Callable[[int], None]) -> list[Broken]:
-    """Write one shard.
+def write_block(block: Block, count: Callable[[int], None]) -> None:
+    """Write one shard of the episodes that are not broken.
 
     Args:
         block: What to write.
         count: Called with the number of episodes read so far.
-
-    Returns:
-        The episodes that it lacks because they are broken.
     """
-    broken, source = [], open_source(block.source)
+    source = open_source(block.source)
     with ShardWriter(block.path, block.info) as writer:
         for number, place in enumerate(block.places, start=1):
             found = read_place(source, place)
-            if isinstance(found, Broken):
-                broken.append(found)
-            else:
+            if isinstance(found, Demonstration):
                 writer.write(found)
             count(number)
-    return broken
 
 
 def _find_broken(block: Block) -> list[Broken] | None:
-    """The episodes that a finished shard lacks because they are broken; None if it is not finished.
-
-    Raises:
-        DatasetError: The shard has episodes that were not asked for.
-    """
+    """The episodes that a finished shard lacks because they are broken; None if it is not finished."""
     if not block.path.is_file():
         return None
     present = set(Shard(block.path).table(["reason"]).column(0).to_pylist())
-    others = present - {place.folder for place in block.places}
-    if others:
-        raise DatasetError(
-            f"{block.path} holds episodes that were not asked for, such as {min(others)}. "
-            "Give its settings, another folder, or --force to delete it."
-        )
     source = open_source(block.source)
     found = [read_place(source, place) for place in block.places if place.folder not in present]
     broken = [entry for entry in found if isinstance(entry, Broken)]
     return broken if len(broken) == len(found) else None
 
 
-def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], broken: list[Broken]) -> None:
+def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block]) -> None:
+    broken = [entry for block in blocks for entry in _find_broken(block) or ()]
     info = blocks[0].info  # but for task and number, the same of all
     settings = {
         "tasks": sorted({block.info.task for block in blocks}),
@@ -434,7 +408,7 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
     }
     (config.out / BROKEN_NAME).unlink(missing_ok=True)
     if broken or data.broken_folders:
-        entries = [{"member": b.member, "reason": b.reason} for b in (*data.broken_folders, *broken)]
+        entries = [asdict(entry) for entry in (*data.broken_folders, *broken)]
         text = json.dumps(entries, indent=1, ensure_ascii=False)
         atomic_write_file(config.out / BROKEN_NAME, text + "\n")
     finish_folder(

@@ -18,18 +18,12 @@ PICKLES = ("obs.pkl", "action.pkl", "trajectory.pkl")
 FRAME_FOLDERS = ("rgb_front", "rgb_top")
 # An episode of 30 steps with eight prompt images has 4 MB; larger claims are damage or malice.
 MAX_EPISODE_BYTES = 64 * 2**20
-_FRAME = re.compile(rf"({'|'.join(FRAME_FOLDERS)})/([0-9]{{1,6}})\.jpg")
+_FRAME = re.compile(rf"({'|'.join(FRAME_FOLDERS)})/[0-9]{{1,6}}\.jpg")
 
 
 def is_episode_file(name: str) -> bool:
     """Whether an episode needs a file; the name is relative to its folder."""
-    return name in PICKLES or frame_number(name) is not None
-
-
-def frame_number(name: str) -> int | None:
-    """Return the step of an image; None for other files."""
-    match = _FRAME.fullmatch(name)
-    return int(match[2]) if match else None
+    return name in PICKLES or _FRAME.fullmatch(name) is not None
 
 
 MAX_DEPTH = 3  # folders above those of the tasks
@@ -40,15 +34,10 @@ class EpisodeFolders:
 
     Args:
         path: A folder above those of the tasks, or that of one task.
-
-    Raises:
-        DatasetError: There is no such folder.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if not path.is_dir():
-            raise DatasetError(f"there is no folder {path}.")
         self._episodes: dict[str, str] | None = None
 
     def episodes(self) -> Mapping[str, str]:
@@ -152,16 +141,15 @@ class _Excerpt(io.RawIOBase):
     Args:
         file: The archive.
         start: Where its directory begins.
-        offset: Where the archive says that it begins.
         entries: Those of the episode.
     """
 
-    def __init__(self, file: BinaryIO, start: int, offset: int, entries: bytes) -> None:
+    def __init__(self, file: BinaryIO, start: int, entries: bytes) -> None:
         size, end = len(entries), start + len(entries)
         self._file, self._start, self._place = file, start, 0
         self._tail = (
             entries
-            + _END_64.pack(b"PK\6\6", _END_64.size - 12, 45, 45, 0, 0, 0, 0, size, offset)
+            + _END_64.pack(b"PK\6\6", _END_64.size - 12, 45, 45, 0, 0, 0, 0, size, start)
             + _POINTER_64.pack(b"PK\6\7", 0, end, 1)
             + _END.pack(b"PK\5\6", 0, 0, 0, 0, 0, 0, 0)
         )
@@ -199,7 +187,7 @@ class ZipArchive:
     def __init__(self, path: Path) -> None:
         self.path = path
         with open(path, "rb") as file:
-            self._start, self._end, self._shift = _find_directory(file, path)
+            self._start, self._end = _find_directory(file, path)
 
     def episodes(self) -> dict[str, Place]:
         """Return the folders of all episodes, such as "vima_v6/rotate/000123", and where their entries are.
@@ -242,7 +230,7 @@ class ZipArchive:
                 file.seek(start)
                 entries += file.read(end - start)
             try:
-                archive = zipfile.ZipFile(_Excerpt(file, self._start, self._start - self._shift, entries))
+                archive = zipfile.ZipFile(_Excerpt(file, self._start, entries))
             except _DAMAGE_ERRORS as error:
                 raise DatasetError(f"the archive's directory is damaged here ({error}).") from None
             members = {_EPISODE.sub(b"", m.filename.encode()).decode(): m for m in archive.infolist()}
@@ -260,17 +248,13 @@ class ZipArchive:
 
     def _runs(self) -> Iterator[tuple[bytes, int, int]]:
         """Folder, start and end of each run of entries that lie in the same episode's folder."""
-        if self._start == self._end:
-            return
         with open(self.path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             folder, run_start, position = None, self._start, self._start
             while position < self._end:
                 try:
                     name, extra, comment = _LENGTHS.unpack_from(content, position + _LENGTHS_AT)
                 except struct.error:
-                    raise DatasetError(
-                        f"{self.path}: its directory is damaged at byte {position:,}."
-                    ) from None
+                    break  # beyond the end of the file
                 name_start = position + _ENTRY_BYTES
                 if folder is None or content[name_start : name_start + len(folder)] != folder:
                     if folder is not None:
@@ -284,8 +268,8 @@ class ZipArchive:
                 yield folder, run_start, position
 
 
-def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
-    """Start and end of the directory, and how far everything lies behind where the archive says."""
+def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int]:
+    """Start and end of the directory."""
     size = file.seek(0, 2)
     tail_start = max(0, size - _END.size - _LONGEST_COMMENT)
     file.seek(tail_start)
@@ -293,17 +277,12 @@ def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
     at = tail.rfind(b"PK\5\6")
     if at < 0 or at + _END.size > len(tail):
         raise DatasetError(f"{path} is no zip archive, or its end is missing (an interrupted download?).")
-    _, disk, first_disk, _, _, num_bytes, offset, _ = _END.unpack_from(tail, at)
+    *_, num_bytes, offset, _ = _END.unpack_from(tail, at)
     end = tail_start + at
-    large = _find_end_64(file, end, path)
-    if large is not None:
-        end, num_bytes, offset = large
-    elif disk or first_disk:
-        raise DatasetError(f"{path} is one of several parts of an archive; join them first.")
-    start = end - num_bytes
-    if start < offset:
+    end, num_bytes, offset = _find_end_64(file, end, path) or (end, num_bytes, offset)
+    if offset != end - num_bytes:
         raise DatasetError(f"{path} lacks bytes before its directory; copy or download it again.")
-    return start, end, start - offset
+    return offset, end
 
 
 def _find_end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] | None:
@@ -312,7 +291,7 @@ def _find_end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] |
     pointer = file.read(_POINTER_64.size)
     if len(pointer) < _POINTER_64.size or not pointer.startswith(b"PK\6\7"):
         return None
-    # It lies right before the pointer to it, also where the archive was put behind something else.
+    # It lies right before the pointer to it.
     at = end - _POINTER_64.size - _END_64.size
     file.seek(max(0, at))
     record = file.read(_END_64.size)

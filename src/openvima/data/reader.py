@@ -1,10 +1,9 @@
 """Reading a folder of demonstrations, or one on the Hugging Face Hub, as a sequence of episodes."""
 
 import hashlib
-import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.catalog import LEVELS, OBJECTS, TEXTURES
-from openvima.data.manifest import (
-    INDEX_NAME,
-    MANIFEST_NAME,
-    parse_index,
-    parse_manifest,
-)
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, read_index, read_manifest
 from openvima.data.records import Demonstration
 from openvima.data.shard import Envelope, Shard, Span, remedy
 from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
@@ -55,7 +49,7 @@ class Dataset:
         self.path = data_folder(path, shards=not index_only)
         self.tasks = None if tasks is None else names_of(tasks)
         self.manifest = read_manifest(self.path)
-        index = _read_index(self.path, self.manifest)
+        index = read_index(self.path, self.manifest)
         if self.tasks is not None:
             index = index.filter(select_tasks(index, self.tasks, str(self.path)))
         self.index = index
@@ -65,8 +59,12 @@ class Dataset:
         self._rows = self.index.column("row").to_numpy()
         self._spans = [self.index.column(name).to_numpy() for name in ("offset", "num_bytes", "crc32")]
         self._shards: dict[str, Shard] = {}
-        if not index_only:
-            _check_shards(self.path, sorted(self._names))
+        missing = [name for name in sorted(self._names) if not (self.path / name).is_file()]
+        if missing and not index_only:
+            raise DatasetError(
+                f"{self.path} lacks {len(missing)} of {len(self._names)} shards, first {missing[0]}. "
+                f"{remedy(self.path)}"
+            )
 
     def __repr__(self) -> str:
         tasks = ", ".join(self.tasks or self.manifest["tasks"])
@@ -139,53 +137,6 @@ class Dataset:
         return shard, row
 
 
-def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:
-    path = folder / INDEX_NAME
-    try:
-        return parse_index(path.read_bytes(), manifest)
-    except FileNotFoundError:
-        raise DatasetError(f"{path} is missing. {remedy(folder)}") from None
-    except DatasetError as error:
-        raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
-
-
-def _check_shards(folder: Path, names: Sequence[str]) -> None:
-    missing = [name for name in names if not (folder / name).is_file()]
-    if missing:
-        raise DatasetError(
-            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {remedy(folder)}"
-        )
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of a data folder.
-
-    Raises:
-        DatasetError: There is none, or it is damaged or of another version.
-    """
-    path = folder / MANIFEST_NAME
-    try:
-        return parse_manifest(path.read_bytes())
-    except (FileNotFoundError, NotADirectoryError):
-        raise DatasetError(explain_missing(folder)) from None
-    except DatasetError as error:
-        raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
-
-
-def explain_missing(folder: Path) -> str:
-    """Say what is wrong with a path where no manifest is, and what helps."""
-    if folder.is_file():
-        return f"{folder} is a file; give the folder that holds the data set, such as {folder.parent}."
-    if not folder.is_dir():
-        out = shlex.quote(str(folder))
-        return f"there is no folder {folder}; `openvima generate --out {out}` makes one."
-    if any(folder.glob("*.arrow")):
-        return f"{folder} is not finished: repeat the command that writes it ({MANIFEST_NAME} is missing)."
-    inner = sorted(str(path.parent) for path in folder.glob(f"*/{MANIFEST_NAME}"))
-    hint = f", but these do: {', '.join(inner[:5])}{', …' if len(inner) > 5 else ''}" if inner else ""
-    return f"{folder} holds no data set ({MANIFEST_NAME} is missing){hint}."
-
-
 def select_tasks(index: pa.Table, tasks: Sequence[str] | None, where: str) -> np.ndarray:
     """Tell which episodes are of some tasks.
 
@@ -235,15 +186,10 @@ def data_folder(path: str | Path, *, shards: bool = True) -> Path:
     commit = fetch(name, (MANIFEST_NAME,), kind="dataset").name
     fixed, folder = replace(name, revision=commit), cache_folder(name, commit)
     fetch(fixed, (MANIFEST_NAME, INDEX_NAME), kind="dataset", into=folder)
-    manifest = folder / MANIFEST_NAME
-    if not manifest.is_file():
+    if not (folder / MANIFEST_NAME).is_file():
         raise DatasetError(f"{name} on the Hugging Face Hub holds no data set ({MANIFEST_NAME} is missing).")
     if shards:
-        try:
-            names = list(parse_manifest(manifest.read_bytes())["shards"])
-        except DatasetError as error:
-            raise DatasetError(f"{MANIFEST_NAME} of {fixed}: {error}.") from None
-        fetch(fixed, names, kind="dataset", into=folder)
+        fetch(fixed, list(read_manifest(folder)["shards"]), kind="dataset", into=folder)
     return folder
 
 
@@ -329,11 +275,9 @@ def find_demonstrations(dataset: Dataset, query: DemonstrationQuery) -> np.ndarr
 
 def _filter_by_appearance(dataset: Dataset, candidates: np.ndarray, query: DemonstrationQuery) -> np.ndarray:
     """Keep the demonstrations with an object that fits."""
-    rows: dict[str, list[tuple[int, int]]] = {}
-    for index, (name, row) in zip(candidates.tolist(), dataset.locations(candidates), strict=True):
-        rows.setdefault(name, []).append((index, row))
-    kept = []
-    for name, members in rows.items():
+
+    @cache
+    def rows_showing(name: str) -> set[int]:
         lists = dataset.shard(name).table(["objects"]).column("objects").combine_chunks()
         objects: pa.StructArray = lists.flatten()
         fits = np.ones(len(objects), bool)
@@ -341,6 +285,7 @@ def _filter_by_appearance(dataset: Dataset, candidates: np.ndarray, query: Demon
             if value := getattr(query, field):
                 fits &= objects.field(field).to_numpy(zero_copy_only=False) == value
         owners = np.repeat(np.arange(len(lists)), lists.value_lengths().to_numpy())
-        showing = set(owners[fits].tolist())
-        kept += [index for index, row in members if row in showing]
-    return np.array(sorted(kept), np.int64)
+        return set(owners[fits].tolist())
+
+    places = dataset.locations(candidates)
+    return candidates[np.array([row in rows_showing(name) for name, row in places], bool)]

@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,7 @@ _NUM_PIXELS = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
 
 if TYPE_CHECKING:  # reading needs no simulation
     from openvima.env import TabletopEnv
+    from openvima.env.config import EnvConfig
 
 _MOST_FRAMES = 6  # in a notebook
 _JSON = json.JSONEncoder(sort_keys=True)
@@ -111,6 +113,12 @@ class Demonstration:
         versions of the packages do not count.
         """
         return make_columns(self).content_hash
+
+
+@lru_cache(maxsize=4)
+def make_env(task: str, level: str, domain: str, env_config: "EnvConfig") -> "TabletopEnv":
+    """Make an environment once in this process, for all shards of a task."""
+    return env_config.make(task, level, domain=domain)
 
 
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
@@ -279,14 +287,20 @@ def _floats(values: Sequence[float]) -> list[float]:
     return [float(value) for value in values]  # as text, 1 and 1.0 would differ
 
 
+def action_arrays(demo: Demonstration) -> dict[str, np.ndarray]:
+    """Return the actions of a demonstration of T steps: name to numbers, shape (T, width), float32."""
+    return {
+        name: np.array([getattr(action, name) for action in demo.actions], "<f4").reshape(-1, width)
+        for name, width in ACTION_SHAPES.items()
+    }
+
+
 def _arrays(demo: Demonstration) -> dict[str, np.ndarray]:
     poses = [[(*p.pose.position, *p.pose.quaternion) for p in scene.placements] for scene in demo.scenes]
     arrays: dict[str, np.ndarray] = {
         "poses": np.array(poses, "<f8").reshape(len(poses), len(demo.objects), 7)
     }
-    for name, width in ACTION_SHAPES.items():
-        values = np.array([getattr(action, name) for action in demo.actions], "<f4")
-        arrays[name] = values.reshape(-1, width)
+    arrays |= action_arrays(demo)
     paths = [np.zeros((0, 6), "<f4"), *demo.joint_paths]
     arrays["joint_paths"] = np.concatenate(paths).astype("<f4", copy=False)
     return arrays

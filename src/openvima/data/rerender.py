@@ -32,13 +32,7 @@ from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.schema import VIEWS
-from openvima.errors import (
-    AssetError,
-    DatasetError,
-    OpenVimaError,
-    UnknownNameError,
-    UnknownTaskError,
-)
+from openvima.errors import ConfigError, DatasetError, SamplingError, UnknownTaskError, differences
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
 from openvima.scene.prompt import PLACEHOLDER, PromptFill
@@ -79,9 +73,7 @@ def rerender(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonst
         rasteriser = _rasteriser(info.assets)
         rgb, segm = render_observations(rasteriser, demo.scenes)
         prompt = rasteriser.prompt(sample_prompt(demo, info, rasteriser.assets))
-    except OpenVimaError as error:  # the task samples no episode for this seed, or is gone
-        if isinstance(error, AssetError | UnknownNameError) and not isinstance(error, UnknownTaskError):
-            raise
+    except (SamplingError, ConfigError, UnknownTaskError) as error:  # the task is another one, or gone
         raise _explain_change(demo, info, f" ({error})") from error
     result = dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=prompt)
     if result.content_hash() != content_hash:
@@ -131,20 +123,11 @@ def _rasteriser(assets: str) -> Rasteriser:
 
 
 def _explain_change(demo: Demonstration, info: ShardInfo, details: str = "") -> DatasetError:
-    installed = package_versions()
-    others = [
-        f"{name} {info.versions.get(name, 'none')} (installed: {installed.get(name, 'none')})"
-        for name in sorted(installed.keys() | info.versions.keys())
-        if info.versions.get(name) != installed.get(name)
-    ]
-    versions = (
-        "all versions as installed; so the task or the asset pack is another one, or the file is damaged"
-    )
-    if others:
-        versions = f"{', '.join(others)}; read it with those, or generate it again"
+    others = "; ".join(differences(info.versions, package_versions()))
+    cause = f"Versions differ: {others}" if others else "The task, the asset pack or the file is another one"
     return DatasetError(
         f"{demo.task} of seed {demo.seed} is stored without images and cannot be rerendered identically"
-        f"{details}. It was written with {versions}."
+        f"{details}. {cause}."
     )
 
 

@@ -12,12 +12,11 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import pyarrow as pa
 
-from openvima.atomic_io import NO_SPACE, atomic_path
+from openvima.atomic_io import atomic_path
 from openvima.data.encoding import ShardInfo, Skipped, decode, decode_columns, encode
 from openvima.data.records import Demonstration, make_columns
 from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION
@@ -86,22 +85,13 @@ def map_file(path: Path) -> memoryview:
 
 
 def measure(path: Path) -> tuple[Envelope, list[Span]]:
-    """Find the parts of a whole shard and their checksums.
-
-    Raises:
-        DatasetError: It is no chain of records.
-    """
+    """Find the parts of a whole shard and their checksums."""
     content, ends = map_file(path), []
-    try:
-        with pa.memory_map(str(path)) as file:
-            file.seek(_MAGIC_BYTES)
-            with contextlib.suppress(EOFError):  # the mark after the last record
-                while pa.ipc.read_message(file):
-                    ends.append(file.tell())
-    except (pa.ArrowInvalid, OSError) as error:
-        raise DatasetError(f"{path}: {str(error).splitlines()[0]}") from None
-    if not ends:
-        raise DatasetError(f"{path}: it ends before its schema")
+    with pa.memory_map(str(path)) as file:
+        file.seek(_MAGIC_BYTES)
+        with contextlib.suppress(EOFError):  # the mark after the last record
+            while pa.ipc.read_message(file):
+                ends.append(file.tell())
     spans = [
         Span(start, end - start, zlib.crc32(content[start:end])) for start, end in itertools.pairwise(ends)
     ]
@@ -277,8 +267,6 @@ class Shard:
         return self._readers[key]
 
     def _row_damage(self, row: int, error: Exception | str) -> DatasetError:
-        if isinstance(error, OSError) and error.errno in NO_SPACE:
-            raise error  # nothing is damaged: Numba keeps what it compiled on a full disk
         return self._damage(f"record {row} of {len(self)}", error)
 
     def _damage(self, what: str, error: Exception | str) -> DatasetError:
@@ -293,7 +281,7 @@ def remedy(folder: Path) -> str:
     return f"`openvima data verify {shlex.quote(str(folder))}` names all damage, and what makes it again."
 
 
-class ShardWriter:
+class ShardWriter(contextlib.ExitStack):
     """Writes one shard; a context manager.
 
     The file gets its name when the block ends without an exception, so a file with that name is whole. After
@@ -305,15 +293,14 @@ class ShardWriter:
     """
 
     def __init__(self, path: Path, info: ShardInfo) -> None:
-        self.path = path
+        super().__init__()
         self._schema = COLUMNS.with_metadata(info.to_metadata())
         self._has_images = info.images
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
-        self._closing = contextlib.ExitStack()
-        file = pa.OSFile(str(self._closing.enter_context(atomic_path(path))), "wb")
-        stream = self._closing.enter_context(pa.BufferedOutputStream(file, _BUFFER_BYTES))
-        self._writer = self._closing.enter_context(pa.ipc.new_file(stream, self._schema, options=options))
+        file = pa.OSFile(str(self.enter_context(atomic_path(path))), "wb")
+        stream = self.enter_context(pa.BufferedOutputStream(file, _BUFFER_BYTES))
+        self._writer = self.enter_context(pa.ipc.new_file(stream, self._schema, options=options))
 
     def write(self, demo: Demonstration, skipped: Sequence[Skipped] = ()) -> None:
         """Append one episode.
@@ -331,11 +318,3 @@ class ShardWriter:
             batch: The row, as `Shard.batch` gives it.
         """
         self._writer.write_batch(batch.replace_schema_metadata(self._schema.metadata))
-
-    def __enter__(self) -> "ShardWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._closing.__exit__(kind, error, traceback)

@@ -29,7 +29,6 @@ from openvima.data.manifest import (
 from openvima.data.planning import LARGEST_SHARD
 from openvima.data.reader import Dataset, hash_names, select_tasks
 from openvima.data.shard import ShardWriter
-from openvima.env.config import EnvConfig
 from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import as_path, names_of, settle
 from openvima.multiprocess import Report, imap_unordered
@@ -39,7 +38,6 @@ Duplicates = Literal["refuse", "skip"]
 
 _SPLIT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _ROUNDING = 1e-6  # tolerance of the sum of fractions
-_NUM_NAMED = 3  # duplicates that a message names
 _NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, CACHE_FOLDER)
 
 
@@ -72,17 +70,13 @@ def check_out(
     place = out.resolve()
     for source in sources:
         there = source.resolve()
-        if place == there or place in there.parents:
-            raise DatasetError(f"{out} holds the source {source}, which must stay. Give another folder.")
-        if there in place.parents:
-            raise DatasetError(f"{out} lies in the source {source}, which must stay as it is. Give another.")
-    if out.exists() and not out.is_dir():
-        raise DatasetError(f"{out} is a file. Give the name of a folder.")
-    if not out.exists() or all(map(is_lock_file, out.iterdir())):
+        if place == there or place in there.parents or there in place.parents:
+            raise DatasetError(f"{out} holds the source {source} or lies in it. Give another folder.")
+    if not out.exists() or (out.is_dir() and all(map(is_lock_file, out.iterdir()))):
         return
     if not force:
         raise DatasetError(f"{out} is not empty. Give another folder, or --force to replace it.")
-    if not is_own(out):
+    if not (out.is_dir() and is_own(out)):
         raise DatasetError(f"{out} holds other things than --force would write, so it is not replaced.")
 
 
@@ -97,17 +91,13 @@ def check_fractions(fractions: Mapping[str, float]) -> None:
     Raises:
         ConfigError: They do not, or a name cannot be that of a folder.
     """
-    problems = []
-    for name, fraction in fractions.items():
-        if not _SPLIT_NAME.fullmatch(name):
-            problems.append(f"split {name!r} needs a name of letters, digits, '_' and '-'.")
-        if not 0 < fraction < 1:
-            problems.append(f"split {name!r} has the fraction {fraction}; it must lie between 0 and 1.")
-    total = sum(fractions.values())
-    if not problems and abs(total - 1) > _ROUNDING:
-        problems.append(f"the fractions add up to {total:g}; they must add up to 1.")
-    if problems:
-        raise ConfigError(" ".join(problems))
+    are_sound = all(_SPLIT_NAME.fullmatch(name) and 0 < share < 1 for name, share in fractions.items())
+    if not are_sound or abs(sum(fractions.values()) - 1) > _ROUNDING:
+        given = ", ".join(f"{name}={fraction:g}" for name, fraction in fractions.items())
+        raise ConfigError(
+            f"splits are {given}; give names of letters, digits, '_' and '-', and fractions between 0 and 1 "
+            "that add up to 1."
+        )
 
 
 def parse_splits(text: str) -> dict[str, float]:
@@ -121,16 +111,13 @@ def parse_splits(text: str) -> dict[str, float]:
     """
     fractions: dict[str, float] = {}
     for entry in text.split(","):
-        name, _, fraction = (word.strip() for word in entry.partition("="))
+        name, _, fraction = entry.partition("=")
         try:
-            number = float(fraction)
+            fractions[name.strip()] = float(fraction)
         except ValueError:
             raise ConfigError(
                 f"splits are {text!r}; give names and fractions such as training=0.923,validation=0.077."
             ) from None
-        if name in fractions:
-            raise ConfigError(f"split {name!r} is named twice.")
-        fractions[name] = number
     check_fractions(fractions)
     return fractions
 
@@ -453,8 +440,6 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
         DatasetError: A source is damaged.
     """
     datasets = sorted(map(Dataset, config.sources), key=lambda dataset: dataset.manifest["checksum"])
-    if not any(map(len, datasets)):
-        raise DatasetError("there is nothing to merge; name data sets that hold episodes.")
     index = pa.concat_tables([dataset.index for dataset in datasets])
     wanted = select_tasks(index, config.tasks, "the sources")
     masks = np.split(wanted, np.cumsum([len(dataset) for dataset in datasets])[:-1])
@@ -481,9 +466,8 @@ def _skip_duplicates(
     Raises:
         DatasetError: Some occur more than once, and they are refused.
     """
-    setup_of_content: dict[tuple[EnvConfig, str], EnvConfig] = {}
-    folders: dict[tuple[Any, ...], Path] = {}  # name and setup to where it was first
-    kept, repeats, total = [], [], 0
+    folders: dict[tuple[Any, ...], Path] = {}  # name and setup, and content, to where it was first
+    kept, repeats = [], []
     for part in parts:
         setup = part.info.env_config
         common = replace(setup, prompts=MULTIMODAL, task_options="")
@@ -492,20 +476,20 @@ def _skip_duplicates(
         episodes = []
         for episode_index, row in zip(part.episodes, rows, strict=True):
             content = common, row.pop("content_hash")
-            key = *row.values(), setup_of_content.setdefault(content, setup)
-            if key not in folders:
-                folders[key] = part.source
-                episodes.append(episode_index)
+            keys = content, (*row.values(), setup)
+            first = [folders[key] for key in keys if key in folders]
+            for key in keys:
+                folders.setdefault(key, part.source)
+            if first:
+                named = "{task} {level} {domain} seed {seed}".format(**row)
+                repeats.append(f"{named} in {first[0]} and {part.source}")
             else:
-                where = " and ".join(dict.fromkeys(map(str, (folders[key], part.source))))
-                repeats.append("{task} {level} {domain} seed {seed}".format(**row) + f" in {where}")
-        total += len(rows)
+                episodes.append(episode_index)
         if episodes:
             kept.append(replace(part, episodes=episodes))
     if repeats and refuse:
-        more = "; …" if len(repeats) > _NUM_NAMED else ""
         raise DatasetError(
-            f"{len(repeats)} of {total} episodes repeat others: {'; '.join(repeats[:_NUM_NAMED])}{more}. "
+            f"{len(repeats)} episodes repeat others, such as {repeats[0]}. "
             "Leave a source out, or keep one of each with --duplicates skip."
         )
     return kept

@@ -10,7 +10,6 @@ import pyarrow as pa
 
 from openvima.data.manifest import CACHE_FOLDER, INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset, data_folder
-from openvima.errors import DatasetError, echo
 from openvima.hub import dataset_name
 from openvima.multiprocess import Report
 
@@ -73,11 +72,8 @@ def summarise_folder(folder: str | Path, *, details: bool = False, report: Repor
     index = dataset.index
     sizes = index.group_by("task").aggregate([("num_bytes", "sum")])
     num_bytes = dict(zip(*(sizes[name].to_pylist() for name in ("task", "num_bytes_sum")), strict=True))
-    tasks = {}
-    for task, entry in dataset.manifest["tasks"].items():
-        if task not in num_bytes:
-            raise DatasetError(f"{dataset.path} lists the task {echo(task)}, of which it holds no episode.")
-        tasks[task] = {**entry, "bytes": num_bytes[task]}
+    entries = dataset.manifest["tasks"].items()
+    tasks = {task: {**entry, "bytes": num_bytes[task]} for task, entry in entries}
     shown = {"level": "level", "steps in an episode": "steps", "end effector": "end_effector"}
     histograms = {title: _in_order(_value_counts(index.column(name))) for title, name in shown.items()}
     if details:

@@ -17,9 +17,7 @@ from torch.utils.data import Dataset, get_worker_info
 from torch.utils.data._utils.collate import default_collate_fn_map  # documented with `default_collate`
 
 from openvima.data.reader import Dataset as Demonstrations
-from openvima.data.records import Demonstration
-from openvima.errors import ShapeError
-from openvima.scene import ACTION_SHAPES
+from openvima.data.records import Demonstration, action_arrays
 from openvima.scene.scene import BACKGROUND_ID
 
 
@@ -75,7 +73,7 @@ def tensors_of(demo: Demonstration) -> DemonstrationTensors:
         `pick_ids`, `place_ids` (T,) int64; `prompt`, the text; `prompt_images`, for each placeholder the
         same four images without the time axis; `task`, `seed` and `end_effector`.
     """
-    item = DemonstrationTensors(
+    return DemonstrationTensors(
         task=demo.task,
         seed=demo.seed,
         end_effector=demo.end_effector,
@@ -84,18 +82,16 @@ def tensors_of(demo: Demonstration) -> DemonstrationTensors:
         **_images(demo.rgb, demo.segm),
         pick_ids=torch.tensor(demo.pick_ids, dtype=torch.int64),
         place_ids=torch.tensor(demo.place_ids, dtype=torch.int64),
+        **{name: torch.from_numpy(rows) for name, rows in action_arrays(demo).items()},
     )
-    for key, width in ACTION_SHAPES.items():
-        rows = np.array([getattr(action, key) for action in demo.actions], np.float32)
-        item[key] = torch.from_numpy(rows.reshape(-1, width))
-    return item
 
 
 def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:
     """Join B demonstrations to a batch; a plain `DataLoader` does so by itself.
 
     Args:
-        items: As `tensors_of` returns them; the longest has T steps, the longest prompt P images.
+        items: As `tensors_of` returns them, at least one; the longest has T steps, the longest prompt P
+            images.
 
     Returns:
         `rgb_front`, `rgb_top` (B, T + 1, 3, 128, 256) and `segm_front`, `segm_top` (B, T + 1, 128, 256)
@@ -105,12 +101,7 @@ def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:
         (B, P, 128, 256) uint8; `prompt_mask` (B, P) bool, which prompt images exist. Lists of B entries:
         `prompt`, `prompt_names` (names of the prompt images), `task`, `seed` and `end_effector`.
         Padding is 0, in segmentations 255 (nothing), in ids −1.
-
-    Raises:
-        ShapeError: There are no items.
     """
-    if not items:
-        raise ShapeError("collate got no demonstrations; give at least one.")
     images = [list(item["prompt_images"].values()) for item in items]
     batch: dict[str, Any] = {
         **{name: [item[name] for item in items] for name in ("prompt", "task", "seed", "end_effector")},

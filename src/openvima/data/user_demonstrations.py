@@ -11,13 +11,7 @@ from pathlib import Path
 from openvima.atomic_io import folder_lock
 from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import (
-    MANIFEST_NAME,
-    finish_folder,
-    remove_leftovers,
-    storage_error,
-)
-from openvima.data.reader import read_manifest
+from openvima.data.manifest import MANIFEST_NAME, finish_folder, read_manifest, storage_error
 from openvima.data.records import Demonstration, Rollout, package_versions
 from openvima.data.shard import Shard, ShardWriter
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
@@ -48,15 +42,10 @@ def check_recordable(episode: Episode, *, env_config: EnvConfig = DEFAULT_ENV_CO
             another episode for its seed.
     """
     named = f"the episode ({episode.task}, {episode.level}, {episode.domain} seed {episode.seed})"
-    if episode.level != LEVEL:
+    if (episode.level, episode.domain) != (LEVEL, DOMAIN):
         raise DatasetError(
-            f"{named} is of level {episode.level}, which stays unseen; demonstrations are recorded at level "
-            f"{LEVEL} and for composed scenes only."
-        )
-    if episode.domain != DOMAIN:
-        raise DatasetError(
-            f"{named} has a seed of domain {episode.domain!r}; demonstrations are recorded for episodes of "
-            f"domain {DOMAIN!r} and for composed scenes only."
+            f"{named} stays unseen; demonstrations are recorded at level {LEVEL}, for seeds of domain "
+            f"{DOMAIN} and composed scenes."
         )
     if not episode.problem.goals:
         raise DatasetError(f"{named} has no goals, so it is never solved; give it some to record it.")
@@ -85,10 +74,7 @@ def demonstrate(
         ActionError: An action is invalid.
     """
     is_composed = episode.task == COMPOSED
-    if is_composed:
-        env = TabletopEnv(HOST_TASK, assets=env_config.assets, compat=env_config.compat)
-    else:
-        env = env_config.make(episode.task, episode.level, domain=episode.domain)
+    env = env_config.make(HOST_TASK if is_composed else episode.task, LEVEL, domain=DOMAIN)
     observation, _ = env.reset(options={"episode": episode})
     rollout, pick_ids, place_ids = Rollout(env, observation), [], []
     for number, action in enumerate(actions, start=1):
@@ -146,7 +132,6 @@ def record_demonstration(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with folder_lock(folder, timeout_s=_LOCK_S):
-            remove_leftovers(folder)
             return _append(folder, demo, env_config)
     except OSError as error:
         raise storage_error(folder, list(folder.glob("*.arrow")), error) from error
@@ -158,11 +143,10 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
     same = [shard for shard in shards if shard.info.task == demo.task]
     settings = {**env_config.record(), "assets": load_assets(env_config.assets).name}
     info = ShardInfo(demo.task, LEVEL, DOMAIN, len(same), 1, 0, versions=package_versions(), **settings)
-    is_complete = (folder / MANIFEST_NAME).is_file()
     for shard in same:
-        seeds = _seeds(shard) if shard.info.env_config == info.env_config else []
-        if demo.seed in seeds:
-            if not is_complete and shard[seeds.index(demo.seed)].content_hash() == demo.content_hash():
+        seeds = shard.table(["seed"]).column("seed").to_pylist()
+        if shard.info.env_config == info.env_config and demo.seed in seeds:
+            if not (folder / MANIFEST_NAME).is_file():
                 return _finish(folder)  # recording it was interrupted
             raise DatasetError(
                 f"{folder} holds a demonstration of this episode already ({demo.task}, seed {demo.seed}); "
@@ -185,20 +169,15 @@ def _open_own_shards(folder: Path) -> list[Shard]:
     """Open the shards of a folder, by task and number.
 
     Raises:
-        DatasetError: It holds other data than recorded demonstrations.
+        DatasetError: It holds other data than demonstrations of users.
         DatasetError: A shard is damaged.
     """
     shards = [Shard(path) for path in sorted(folder.glob("*.arrow"))]
-    made_by = read_manifest(folder)["command"] if (folder / MANIFEST_NAME).is_file() else COMMAND
-    if made_by != COMMAND or any(shard.info.domain != DOMAIN for shard in shards):
+    if any(shard.info.domain != DOMAIN for shard in shards):
         raise DatasetError(
-            f"{folder} holds other data (`{made_by}`); give a folder of recorded demonstrations or a new one."
+            f"{folder} holds other data; give a folder of recorded demonstrations or a new one."
         )
     return shards
-
-
-def _seeds(shard: Shard) -> list[int]:
-    return shard.table(["seed"]).column("seed").to_pylist()
 
 
 def _find_moved(before: Scene, after: Scene) -> int | None:

@@ -15,7 +15,7 @@ import openvima
 from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, GenerateConfig, generate, lerobot
 from openvima.data.lerobot import LerobotConfig, export_lerobot
-from openvima.data.lerobot_frames import DenseLayout, dense_trajectory
+from openvima.data.lerobot_frames import FrameLayout, dense_trajectory
 from openvima.data.records import rollout_oracle
 from openvima.data.verification import find_difference
 from openvima.env import EnvConfig, TabletopEnv
@@ -241,7 +241,7 @@ def test_large_exports_are_spread_over_several_files(
     store: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    data = store([made_up(seed, num_steps=4, num_images=0) for seed in range(5)])
+    data = store([replace(made_up(seed, num_steps=4, num_images=0), joint_paths=()) for seed in range(5)])
     monkeypatch.setattr(lerobot, "EPISODES_PER_FILE", 2)
     export = export_lerobot(LerobotConfig(data, tmp_path / "out"))
     for pattern in ("data", "meta/episodes"):
@@ -329,7 +329,7 @@ def test_the_export_has_a_frame_for_each_command_at_its_true_time(data, tmp_path
         demo.task, level="train", domain="train", control="end_effector", modalities=("rgb", "joints")
     )
     observation, _ = env.reset(seed=demo.seed)
-    layout = DenseLayout(num_prompt_images=len(demo.prompt.images), has_joints=True)
+    layout = FrameLayout(len(demo.prompt.images), True, "end_effector")
     for row in table.select(["observation.state", "action", "next.success"]).to_pylist():
         frame = layout.frame(observation, env.prompt)  # as LeRobot's environments return it
         assert np.array_equal(row["observation.state"], frame["agent_pos"])

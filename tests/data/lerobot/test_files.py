@@ -13,7 +13,7 @@ from openvima.data.lerobot import (
     pixel_statistics,
     value_statistics,
 )
-from openvima.data.lerobot_frames import FrameLayout, action_from_row, frame_layout
+from openvima.data.lerobot_frames import FrameLayout, step_trajectory
 from openvima.errors import ActionError
 from openvima.scene import END_EFFECTORS, Action
 from openvima.scene.action import ToolCommand
@@ -26,7 +26,8 @@ def test_an_observation_is_encoded_as_the_frame_of_the_export(
 ) -> None:
     layout = FrameLayout(3, has_joints)
     for demo in demos:
-        pictures, values = layout.pictures(demo), layout.values(demo)
+        values = layout.values(step_trajectory(demo, has_joints=has_joints))
+        pictures = layout.pictures(demo.rgb, demo.prompt)
         for step in range(demo.num_steps):
             observation = {
                 "rgb": {view: images[step] for view, images in demo.rgb.items()},
@@ -41,33 +42,34 @@ def test_an_observation_is_encoded_as_the_frame_of_the_export(
                 np.testing.assert_array_equal(np.moveaxis(shown, -1, 0), images[min(step, len(images) - 1)])
             row = values["action"][step]
             for key, array in demo.actions[step].to_arrays().items():
-                np.testing.assert_allclose(action_from_row(row)[key], array, atol=1e-6)
+                np.testing.assert_allclose(layout.action(row)[key], array, atol=1e-6)
 
 
 def test_a_row_beyond_the_bounds_is_brought_back_and_one_that_is_none_is_refused() -> None:
     row = np.array([0.9, -0.7, 0, 0, 3, 4, 0.5, 0.1, 0, 0, 0, 0], np.float32)
-    action = Action.from_arrays(action_from_row(row))
+    layout = FrameLayout(0, True)
+    action = Action.from_arrays(layout.action(row))
     assert action.pose0_position == (0.75, -0.5)
     assert action.pose0_rotation == pytest.approx((0, 0, 0.6, 0.8))
     for bad in (np.nan, np.inf):
         row[0] = bad
         with pytest.raises(ActionError, match="must be finite"):
-            Action.from_arrays(action_from_row(row))
+            Action.from_arrays(layout.action(row))
     with pytest.raises(ActionError, match=r"shape \(11,\)"):
-        action_from_row(row[:11])
+        layout.action(row[:11])
     with pytest.raises(ActionError, match="dtype int64; it must be 12 floating-point numbers"):
-        action_from_row(np.zeros(12, np.int64))
+        layout.action(np.zeros(12, np.int64))
 
 
 def test_a_row_of_commands_is_one_for_the_environment() -> None:
-    layout = frame_layout("end_effector", 0, True)
+    layout = FrameLayout(0, True, "end_effector")
     assert layout.action_names == ("dx", "dy", "dz", "dyaw", "tool")
     row = np.array([0.5, 0, 0, 0, 0.7], np.float64)
     assert ToolCommand.from_array(layout.action(row)).dx == pytest.approx(0.05)
     for bad in (row[:4], row.astype(int), np.zeros((1, 5))):
         with pytest.raises(ActionError, match="5 floating-point numbers: dx, dy, dz, dyaw, tool"):
             layout.action(bad)
-    assert frame_layout("primitives", 0, False).state_names == ("end_effector",)
+    assert FrameLayout(0, False).state_names == ("end_effector",)
 
 
 def smallest_not_exceeded_by(values: np.ndarray, share: float) -> float:

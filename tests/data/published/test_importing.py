@@ -52,7 +52,7 @@ def test_an_import_holds_what_the_source_holds_and_tells_what_was_broken(
     assert manifest["command"] == "openvima data import"
     assert manifest["licence"] == "CC BY 4.0"
     assert manifest["counts"]["episodes"] == 6
-    digest = PublishedData(source).digest()
+    digest = PublishedData(source).source.digest()
     origin = {"digest": digest, "episodes": 7, "broken": 1, "unknown_folders": []}
     assert manifest["config"]["source"] == origin
     assert manifest["versions"]["vima"] == digest

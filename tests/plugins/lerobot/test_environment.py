@@ -10,11 +10,16 @@ import gymnasium
 import numpy as np
 import pytest
 
-from openvima.data.lerobot_frames import DenseLayout, FrameLayout
+from openvima.data.lerobot_frames import FrameLayout
 
 FILE = Path(__file__).parents[3] / "plugins/lerobot/lerobot_env_openvima/env.py"
 FIXED = {"prompts": "multimodal", "control": "primitives", "layout": FrameLayout(1, True), "fps": 1}
-LOW_LEVEL = {"prompts": "text", "control": "end_effector", "layout": DenseLayout(0, True), "fps": 10}
+LOW_LEVEL = {
+    "prompts": "text",
+    "control": "end_effector",
+    "layout": FrameLayout(0, True, "end_effector"),
+    "fps": 10,
+}
 
 
 @pytest.fixture(scope="module")
