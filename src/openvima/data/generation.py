@@ -134,9 +134,10 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
                 clear(config.out)
             wanted = {block.path.name: (block.info, block.episodes) for block in blocks}
             check_shards(config.out, COMMAND, wanted)
-            if config.shard_range is None:
-                remove_leftovers(config.out)
-            _write_missing(config, own, report)
+            try:
+                _write_missing(config, own, report)
+            finally:
+                remove_leftovers(block.path for block in own)
         _finish(config, blocks)
     except BrokenPipeError:  # of `report`
         raise

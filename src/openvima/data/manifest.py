@@ -285,10 +285,11 @@ def clear(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Delete what killed writers, perhaps on other machines, left of shards in a folder that is locked."""
-    for file in folder.glob(".*.arrow.*.tmp"):
-        file.unlink(missing_ok=True)
+def remove_leftovers(shards: Iterable[Path]) -> None:
+    """Delete what killed writers, perhaps on other machines, left of shards that are locked."""
+    for path in shards:
+        for file in path.parent.glob(f".{path.name}.*.tmp"):
+            file.unlink(missing_ok=True)
 
 
 def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> StorageError:

@@ -318,7 +318,6 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         if config.force:
             clear(config.out)
         check_shards(config.out, COMMAND, wanted)
-        remove_leftovers(config.out)
         missing = [block for block in blocks if _find_broken(block) is None]
         try:
             if missing:
@@ -331,6 +330,8 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
             if error.errno not in NO_SPACE:
                 raise
             raise storage_error(config.out, [block.path for block in blocks], error) from error
+        finally:
+            remove_leftovers(block.path for block in blocks)
         if not is_finished(config.out):
             _finish(config, data, blocks)
     return config.out
