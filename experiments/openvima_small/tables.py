@@ -1,6 +1,7 @@
 """Tables about openvima-small, in Markdown, by the name of their place in the pages."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from findings import (
     EVALUATIONS,
@@ -17,6 +18,7 @@ from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.naming import BUNDLED
 from openvima.report.published import PublishedModel, leading_models, published_models
 from openvima.report.table import Estimate, Line, Table, markdown
+from openvima.report.tables import paper_tables
 from openvima.report.text import ablation_name, counted
 from weights import shipped
 
@@ -86,18 +88,10 @@ def _level_table(
 
 
 def _task_table(results: Results | None, where: str = "") -> Table | None:
-    """Tasks by level."""
     if results is None:
         return None
-    rows = {(row.task, row.level): row for row in _plain(results)}
-    means = {mean.level: mean for mean in results.level_means() if not mean.ablation}
-    lines = [
-        Line(task, tuple(_rate(rows.get((task, level))) for level in means))
-        for task in dict.fromkeys(task for task, _ in rows)
-    ]
-    lines.append(Line("mean", _cells(means, [*means]), starts_group=True))
-    caption = f"{where} {_caption(row.episodes for row in rows.values())}".strip()
-    return Table("tasks", caption, ("task", *means), tuple(lines))
+    found = next(t for t in paper_tables(results, published=False) if t.label == f"tasks-{POLICY}")
+    return replace(found, caption=f"{where} {found.caption}".strip())
 
 
 def _text_table(results: Results | None) -> Table | None:

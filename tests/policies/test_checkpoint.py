@@ -189,7 +189,7 @@ def test_a_missing_file_is_named(saved, name: str) -> None:
         ("policy: network\nconfig: 3\n", "must be a mapping"),
         ("policy: network\nconfig: {}\n", "no architecture 'None'"),
         ("policy: network\nconfig: {architecture: vima}\n", "missing 4 required"),
-        ("a: " + "x" * 70_000, "more than 65536 bytes"),
+        ("a: " + "x" * 70_000, "more than 65,536 bytes"),
         ("a: 2026-13-77", "no valid YAML"),
         ("a: !!python/object/apply:os.mkdir [executed]\n", "no valid YAML"),
         ("1: 3\n", "does not describe a 'network' policy"),

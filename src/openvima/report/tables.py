@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+from openvima.errors import UnknownTaskError
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import Results
 from openvima.evaluation.statistics import mean_of_rates
@@ -21,7 +22,7 @@ from openvima.report.published import (
 )
 from openvima.report.table import Estimate, Line, Table
 from openvima.report.text import ablation_name, episodes_each
-from openvima.tasks.registry import list_tasks, task_spec
+from openvima.tasks.registry import task_spec
 
 
 def failure_causes(results: Results, policy: str) -> dict[str, Counter[str]]:
@@ -73,10 +74,17 @@ def family_table(results: Results, *, published: bool = True) -> Table:
 def _tasks(results: Results, level: str) -> dict[str, list[str]]:
     """Evaluated tasks of each family at a level."""
     found: dict[str, list[str]] = {family: [] for family in FAMILIES}
-    for task in filter(set(list_tasks()).__contains__, results.tasks(level)):
-        for family in task_spec(task).families:
+    for task in results.tasks(level):
+        for family in _families(task):
             found.setdefault(family, []).append(task)
     return {family: tasks for family, tasks in found.items() if tasks}
+
+
+def _families(task: str) -> tuple[str, ...]:
+    try:
+        return task_spec(task).families
+    except UnknownTaskError:
+        return ()
 
 
 def _mean(
@@ -121,7 +129,8 @@ def paper_tables(
     chosen = [
         _mean_table(results, published=published),
         family_table(results, published=published),
-        result_table(results, published=published and has_published_tasks(results)),
+        *[_task_table(results, policy) for policy in results.policy_names()],
+        *([result_table(results, published=True)] if has_published_tasks(results) and published else []),
         *ablation_tables(results),
         *map(_difference_table, comparisons),
     ]
@@ -138,10 +147,9 @@ def _mean_table(results: Results, *, published: bool) -> Table:
         for policy in results.policy_names()
     ]
     sizes = ", ".join(f"{len(results.tasks(level))} at {level}" for level in levels)
-    each = episodes_each(row for row in results.rows if not row.ablation)
     caption = (
-        f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. {each} a "
-        f"task.{unusual_settings(results)}"
+        f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
+        f"{_made_of(results)}"
     )
     elsewhere = published_rows(results, leading_models()) if published else []
     if elsewhere:
@@ -209,9 +217,23 @@ def ablation_tables(results: Results) -> list[Table]:
     return tables
 
 
+def _task_table(results: Results, policy: str) -> Table:
+    rows = [row for row in results.rows if (row.policy, row.ablation) == (policy, "")]
+    levels = [level for level in results.levels() if any(row.level == level for row in rows)]
+    tasks = list(dict.fromkeys(row.task for row in rows))
+    cells = {(row.task, row.level): Estimate(row.rate, row.interval) for row in rows}
+    lines = [Line(task, tuple(cells.get((task, level), "–") for level in levels)) for task in tasks]
+    played = {level: [task for task in tasks if (task, level) in cells] for level in levels}
+    means = (_mean(results, policy, level, tasks=own) for level, own in played.items())
+    lines.append(Line("mean", tuple(means), starts_group=True))
+    caption = f"Success rates of {policy} (%), with 95 % intervals. {_made_of(results, policy)}"
+    return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
+
+
 def _difference_table(comparison: Comparison) -> Table:
+    first = comparison.levels[0]
     lines = [
-        _difference_line(difference, starts_group=difference is comparison.levels[0])
+        _difference_line(difference, starts_group=difference is first)
         for difference in (*comparison.tasks, *comparison.means)
     ]
     a, b = (name.replace(ABLATION_SEPARATOR, ", ") for name in (comparison.a, comparison.b))
@@ -235,3 +257,9 @@ def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
         f"{difference.p_holm:.2g}",
     )
     return Line(difference.task or f"mean of {len(difference.pairs)}", cells, starts_group)
+
+
+def _made_of(results: Results, policy: str | None = None) -> str:
+    """Say how many episodes a number is made of."""
+    rows = [row for row in results.rows if not row.ablation and policy in (None, row.policy)]
+    return f"{episodes_each(rows)} a task.{unusual_settings(results)}"

@@ -147,7 +147,7 @@ def check_address(url: str) -> None:
         is_one = url.startswith(SERVER_SCHEMES) and parts.hostname and parts.port != 0
     except ValueError:  # the port is no number
         is_one = False
-    if not is_one:
+    if not is_one or not url.isprintable():
         shown = echo(repr(url))
         raise ConfigError(f"the address of a policy server is {shown}; it must be ws://HOST:PORT or wss://….")
 
