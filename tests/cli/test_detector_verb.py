@@ -70,12 +70,12 @@ def test_frames_of_a_level_are_generated_without_a_folder(detector, capsys):
     ("words", "message"),
     [
         (["--data", "DATA", "--held-out", "0"], "no demonstrations to evaluate on"),
-        (["--data", "DATA", "--level", "L3"], "--level is given instead"),
-        (["--held-out", "0.1"], "--held-out is a fraction of --data"),
+        (["--data", "DATA", "--held-out", "1.5"], "held-out is 1.5"),
+        (["--data", "DATA", "--level", "L3"], "leave one of them out"),
         (["--data", "nowhere"], "there is no folder nowhere"),
-        (["--frames", "0"], "frames is 0"),
+        (["--held-out", "0.1", "--frames", "0"], r"frames is 0; .* no data are given"),
         (["--level", "L9"], "no level 'L9'"),
-        (["--seed", "-1"], "seed -1"),
+        (["--seed", "-1"], "seed is -1"),
         (["--device", "abacus"], "device 'abacus' cannot be used here"),
     ],
 )

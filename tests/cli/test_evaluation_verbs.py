@@ -54,6 +54,9 @@ def test_demo_records_low_level_control(tmp_path, capsys):
     assert main([*words, "--policy", "random"]) == 2
     assert "control 'primitives'" in capsys.readouterr().err
     assert not path.exists()
+    episode = tmp_path / "episode.yaml"
+    assert main(["demo", "--episode", str(episode), "--control", "end_effector"]) == 2
+    assert "an episode file is played by primitives" in capsys.readouterr().err
 
 
 def test_evaluate_then_report(tmp_path, capsys):

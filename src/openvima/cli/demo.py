@@ -72,6 +72,8 @@ def main(
     level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
+    if boxes is not None and policy in ("oracle", "random"):
+        raise ConfigError(f"--boxes is {boxes!r}, but {policy} uses no boxes; name a trained policy.")
     from openvima.catalog import load_assets
     from openvima.env import EnvConfig, load_episode
     from openvima.evaluation.recording import record_episode

@@ -183,10 +183,19 @@ def _frames(
     from openvima.detector.frames import FrameSampler
     from openvima.errors import ConfigError
 
-    if frames < 1 or seed < 0:
-        raise ConfigError(f"frames is {frames} and seed {seed}; give at least 1 frame, and a seed from 0.")
-    if (level if data is not None else held_out) is not None:
-        raise ConfigError("--held-out is a fraction of --data, and --level is given instead of it.")
+    problems = []
+    if frames < 1:
+        problems.append(f"frames is {frames}; it must be at least 1.")
+    if held_out is not None and not 0 <= held_out <= 1:
+        problems.append(f"held-out is {held_out:g}; it must be between 0 and 1.")
+    if data is not None and level is not None:
+        problems.append(f"both data and level are given ({data} and {level}); leave one of them out.")
+    if data is None and held_out is not None:
+        problems.append(f"held-out is {held_out:g}, but no data are given; add --data.")
+    if seed < 0:
+        problems.append(f"seed is {seed}; it must not be negative.")
+    if problems:
+        raise ConfigError(" ".join(problems))
     if data is not None:
         from openvima.training.detector.stage import split_episodes
 

@@ -179,7 +179,7 @@ def main(
         Exit status.
     """
     from openvima.env import EnvConfig
-    from openvima.errors import LimitReachedError
+    from openvima.errors import ConfigError, LimitReachedError
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.ablations import IN_CONTEXT
     from openvima.evaluation.config import plan
@@ -217,6 +217,8 @@ def main(
         config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
     print_left_out(config.tasks, environment.prompts, config.levels)
     selection = VideoSelection(recording.videos, parse_list(recording.record_video))
+    if recording.record_video and not recording.report:
+        raise ConfigError("--record-video needs the report; drop --no-report.")
     if jobs.list_shards:
         for number, shard in enumerate(plan(config)):
             names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)

@@ -3,14 +3,13 @@
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
 from openvima.data.shard import DAMAGE_ERRORS
-from openvima.env.tabletop import TabletopEnv
+from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, one_line
 from openvima.evaluation.results import Row
 from openvima.evaluation.rollout_policies import Decision, Observation, RolloutPolicy
@@ -57,8 +56,15 @@ class ActionRecorder:
                 steps.append(numbers)
         return decisions
 
-    def __getattr__(self, name: str) -> Any:  # `near_ties` and `modalities`, where the policy has them
-        return getattr(self._policy, name)
+    @property
+    def near_ties(self) -> Sequence[bool]:
+        """Those of the policy."""
+        return getattr(self._policy, "near_ties", ())
+
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """What the policy asks observations to hold."""
+        return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
 
 
 class ActionReplay:
