@@ -74,7 +74,7 @@ try:
     from openvima.training.batches import BatchOrder
 except ImportError:  # of an older checkout
     from openvima.data.batching import BatchOrder
-    from openvima.data.object_cache import open_object_cache
+    from openvima.data.object_cache.cache import open_object_cache
 torch.set_num_threads(1)
 pa.set_cpu_count(1)
 folder = sys.argv[1]

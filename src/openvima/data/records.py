@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 import xxhash
 
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
@@ -330,14 +331,14 @@ def pixels(planes: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
     """
     from openvima.data.kernels import join_colours  # Numba takes a moment to be imported
 
-    joined = np.empty((len(planes), *IMAGE_SHAPE, 3), np.uint8)
-    flat = joined.reshape(-1, 3 * _NUM_PIXELS)
+    memory = pa.allocate_buffer(3 * _NUM_PIXELS * len(planes))  # whose pages are used again
+    flat = np.frombuffer(memory, np.uint8).reshape(-1, 3 * _NUM_PIXELS)
     parts = [planes] if isinstance(planes, np.ndarray) else [image[np.newaxis] for image in planes]
     end = 0
     for part in parts:
         start, end = end, end + len(part)
         join_colours(np.ascontiguousarray(part).reshape(-1, 3, _NUM_PIXELS), flat[start:end])
-    return joined
+    return flat.reshape(-1, *IMAGE_SHAPE, 3)
 
 
 def planes(pixels: np.ndarray) -> np.ndarray:
