@@ -25,7 +25,6 @@ from openvima.policies.variants import image_tokens, with_variant
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
 from openvima.tasks.prompts import description_of, synonyms, training_paraphrases
-from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.augmentation.prompts import DEFINITION, motion_text, text_of
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, AugmentationConfig, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
@@ -187,13 +186,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         _copy_weights(initial, network)
     elif config.t5:
         load_t5(network, config.t5)
-    processor = Processor.of(sizes.inputs, tokenizer)
-    return PolicyLearner(
-        network,
-        processor,
-        false_positive_prob=config.augmentation.false_positive_prob,
-        augmentation=demonstration_augmentation(config.augmentation),
-    )
+    return PolicyLearner(network, Processor.of(sizes.inputs, tokenizer), config.augmentation)
 
 
 def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | None) -> Tokenizer:

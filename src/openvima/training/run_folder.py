@@ -142,7 +142,7 @@ class RunFolder:
         shutil.rmtree(partial, ignore_errors=True)
         with naming(final, partial):
             partial.mkdir()
-            learner.write(partial, learner.state_dict())
+            learner.write(partial)
             tensors = {
                 f"{parameter}|{name}": tensor.detach().cpu().contiguous()
                 for parameter, values in optimizer.items()

@@ -200,11 +200,6 @@ def _clearance(placement: Placement) -> float:
     return _CLEARANCE_M + (0.06 if placement.fixed else 0.0)
 
 
-def draw_grayscale(count: int, prob: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw which of some objects have a grayscale prompt image, shape (count,), bool."""
-    return rng.random(count) < prob
-
-
 def to_grayscale(placement: Placement) -> Placement:
     """Return an object as a grayscale prompt image shows it: neutral texture, no scale."""
     return replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE)

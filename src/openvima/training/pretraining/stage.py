@@ -182,7 +182,7 @@ class ContrastivePretraining:
         """
         pairs = self._validation
         metrics = {"retrieval_accuracy": retrieval_accuracy(self.encoder, pairs)}
-        if pairs.second_view:
+        if pairs.rotations is not None:
             metrics["second_view_accuracy"] = retrieval_accuracy(self.encoder, pairs.second_view_pairs())
         if self.encoder.config.rotation_bins:
             metrics["rotation_accuracy"] = rotation_accuracy(self.encoder, pairs)
