@@ -26,11 +26,16 @@ from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
 from openvima.tasks.prompts import description_of, synonyms, training_paraphrases
 from openvima.training.augmentation.prompts import DEFINITION, motion_text, text_of
-from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, AugmentationConfig, TrainingConfig
+from openvima.training.config import (
+    DETECTED_PROB,
+    PRETRAINING_STEPS,
+    AugmentationConfig,
+    TrainingConfig,
+    flatten,
+)
 from openvima.training.learner import Learner, PolicyLearner, make_learner
 from openvima.training.loop import step_seed
 from openvima.training.pretraining.stage import caption_texts
-from openvima.training.validation import flatten
 from openvima.user_code import with_absolute_path
 
 _FOR_OBJECTS = (

@@ -28,6 +28,8 @@ from openvima.training.batches import Collate, Example
 from openvima.training.config import AugmentationConfig
 from openvima.user_code import call_function
 
+LossAndMetrics = tuple[torch.Tensor, dict[str, torch.Tensor]]
+
 
 class Learner(nn.Module):
     """Base class of trained modules; your own needs `collator`, `forward` and, for evaluation, `policy`.
@@ -49,7 +51,7 @@ class Learner(nn.Module):
         """
         raise NotImplementedError
 
-    def forward(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def forward(self, batch: Any) -> LossAndMetrics:
         """Return the loss and metrics by name, means over all steps of the batch."""
         raise NotImplementedError
 
@@ -120,7 +122,7 @@ class PolicyLearner(Learner):
             augmentation=augmentation,
         )
 
-    def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def forward(self, batch: Batch) -> LossAndMetrics:
         """Return the loss of the action head, and its metrics."""
         network, features = self.network, self.features
         if (images := batch.images) is not None:

@@ -17,7 +17,7 @@ from openvima.multiprocess import Report
 from openvima.policies.naming import WEIGHTS_FILE
 from openvima.training.batches import BatchOrder
 from openvima.training.detector.config import DetectorTrainingConfig
-from openvima.training.learner import Learner
+from openvima.training.learner import Learner, LossAndMetrics
 from openvima.training.loop import (
     Metrics,
     PlannedStage,
@@ -61,9 +61,7 @@ class DetectorLearner(Learner):
         self.network = network
         self._sampled = sampled
 
-    def forward(
-        self, batch: tuple[Sequence[Frame], torch.Generator]
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def forward(self, batch: tuple[Sequence[Frame], torch.Generator]) -> LossAndMetrics:
         """Return the sum of the losses, and each of them as "loss/NAME".
 
         Args:

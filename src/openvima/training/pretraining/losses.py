@@ -14,11 +14,11 @@ from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.pointer.words import Attributes
 from openvima.training.augmentation.crops import draw_channel_mixing
+from openvima.training.learner import LossAndMetrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.pairs import PROMPT, SCENE, SECOND_VIEW, AttributeLabels, Pairs
 
 _CHUNK = 256  # pairs that are encoded at a time in validation
-LossAndMetrics = tuple[torch.Tensor, dict[str, torch.Tensor]]
 
 
 def contrastive_loss(
