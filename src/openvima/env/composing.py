@@ -468,7 +468,7 @@ def _fill(
         return _object_image(known_object(given, handles, label))
     parts = entries(given, label)
     if len(parts) == 2 and all(isinstance(part, str) for part in parts):
-        name, texture = checked_appearance(*parts, label)
+        name, texture = checked_appearance(parts[0], parts[1], label)
         pose = Pose.planar(0.5, 0.0)
         return _object_image(Placement(0, name, texture, object_spec(name).size_max, pose))
     if not 1 <= len(parts) <= MAX_OBJECTS:
