@@ -35,7 +35,7 @@ from openvima.render.camera import VIEWS
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
 from openvima.tasks import list_tasks, task_spec
 from openvima.training.detector import DetectorTrainingConfig
-from openvima.training.detector.stage import DetectorLearner, FrameBatch
+from openvima.training.detector.stage import DetectorLearner
 from sim import circumstances
 
 FIRST_SEED = 3_000_000
@@ -81,7 +81,7 @@ def training_step(preset: str, frames: Sequence[Frame]) -> Callable[[], None]:
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
-        loss, _ = learner(FrameBatch.of([augment_frame(frame, rng) for frame in chosen], generator))
+        loss, _ = learner(([augment_frame(frame, rng) for frame in chosen], generator))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(learner.parameters(), DEFAULTS.optimizer.max_grad_norm)
         optimizer.step()

@@ -17,8 +17,8 @@ from openvima.policies.build import count_parameters, outline_network
 from openvima.policies.checkpoint import load_network, read_info, write_checkpoint
 from openvima.policies.naming import CONFIG_FILE, METRICS_FILE, WEIGHTS_FILE
 from openvima.policies.t5 import tokenizer_for
+from openvima.training.config import flatten
 from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, read_costs, whole_lines
-from openvima.training.validation import flatten
 from training_data import appearance_record, appearance_text
 
 RECORD = "training"  # folder beside the weights

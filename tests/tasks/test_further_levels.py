@@ -12,7 +12,7 @@ from openvima.scene import AtPose, ObjectImage, Placement, Problem, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.clutter import LEAST, MOST
 from openvima.tasks.compositions import COMPOSITIONS, template
-from openvima.tasks.referring_grammar import offset
+from openvima.tasks.table import offset
 from task_cases import judge_step, judged, moves, played
 
 SEEDS = range(5)

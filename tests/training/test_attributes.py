@@ -118,18 +118,17 @@ def test_magnified_objects_have_no_lengths(labeller):
 
 
 def test_pairs_are_labelled_as_rendered(pairs):
-    labels, view = pairs.attributes, pairs.second_view
-    assert labels is not None and view is not None
+    labels = pairs.attributes
+    assert labels is not None
     # Grayscale prompt images have another texture than their scene, and only they.
     is_same = labels.categories[:, 0] == labels.categories[:, 1]
     assert is_same[:, 1:].all()
     assert torch.equal(is_same[:, 0], ~pairs.is_grayscale)
-    shown = torch.stack([pairs.prompt_masks, pairs.scene_masks, view.masks], dim=1)
-    assert torch.equal(labels.boxes.any(dim=-1), shown)
+    assert torch.equal(labels.boxes.any(dim=-1), pairs.masks)
     np.testing.assert_allclose(labels.colours.sum(dim=-1), 1.0, rtol=1e-5)
     plain = render_pairs(("same_shape", "novel_adj"), num_scenes=2, seed=0, assets="procedural", **AUGMENTED)
     assert plain.attributes is None
-    assert torch.equal(plain.scene_crops, pairs.scene_crops[: len(plain.scenes)])
+    assert torch.equal(plain.crops[:, 1], pairs.crops[: len(plain.scenes), 1])
 
 
 class Ideal(torch.nn.Module):
@@ -163,9 +162,8 @@ def test_the_loss_falls_as_what_is_alike_is_projected_together(labeller):
 def test_a_few_steps_fit_the_attributes(pairs):
     network = build_network(replace(narrow_small(), attributes=AttributeConfig(32, 16)), seed=0)
     encoder, attributes = network.images, network.attributes
-    assert isinstance(attributes, Attributes) and pairs.second_view is not None
-    crops = torch.stack([pairs.prompt_crops, pairs.scene_crops, pairs.second_view.crops])
-    masks = torch.stack([pairs.prompt_masks, pairs.scene_masks, pairs.second_view.masks]).transpose(1, 2)
+    assert isinstance(attributes, Attributes)
+    crops, masks = pairs.crops.transpose(0, 1), pairs.masks.permute(1, 2, 0)
     with torch.no_grad():
         features = encoder.encode_images(crops).transpose(1, 2)
     before = attribute_accuracy(encoder, attributes, pairs)

@@ -85,7 +85,7 @@ def test_fine_tuning_adds_new_words_to_those_of_the_checkpoint(settings, tmp_pat
     config = resolve(TrainingConfig.of({**settings, "pretraining.steps": 0, "schedule.steps": 2}))
     first = build_learner(config, ["put the red bowl"])
     (tmp_path / "first").mkdir()
-    first.write(tmp_path / "first", first.state_dict())
+    first.write(tmp_path / "first")
     again = replace(config, init_from=str(tmp_path / "first"))
     second = build_learner(again, ["put it between"])
     before, after = (learner.processor.tokenizer.vocabulary for learner in (first, second))
@@ -114,7 +114,7 @@ def test_fine_tuning_compares_attributes_as_the_checkpoint_does(
     config = resolve(TrainingConfig.of({**settings, **steps, "preset": "shared"}))
     first = build_learner(config, ["put it there"])
     (tmp_path / "first").mkdir()
-    first.write(tmp_path / "first", first.state_dict())
+    first.write(tmp_path / "first")
     again = replace(config, preset="exclusive", init_from=str(tmp_path / "first"))
     assert build_learner(again, ["put it there"]).network.config == first.network.config
     fresh = build_learner(replace(again, init_from=None), ["put it there"])

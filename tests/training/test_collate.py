@@ -15,9 +15,9 @@ from openvima.perception.objects import GROUND_TRUTH, ObjectViews, crop_box
 from openvima.perception.preprocessing import IMAGE_SIZES, ImageStack
 from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.processor import Processor
-from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
 from openvima.training.augmentation.prompts import motion_prompt
 from openvima.training.batches import Example
+from openvima.training.config import AugmentationConfig
 from openvima.training.learner import PolicyCollate
 from plugged_extractors import NoisyExtractor
 from small_networks import collate_examples, examples_of
@@ -92,9 +92,8 @@ def test_training_and_inference_have_equal_inputs(layout, name, demonstrations_o
     batch = PolicyCollate(processor, 0.0, with_images=True)(given)
     assert_as_when_acting(batch, demos, naive, processor, [demo.prompt for demo in demos])
     # Motions, too: their frames show what was found before and after.
-    motions = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(1.0))(
-        given
-    )
+    augmentation = AugmentationConfig(inverse_dynamics_prob=1.0)
+    motions = PolicyCollate(processor, 0.0, with_images=True, augmentation=augmentation)(given)
     shown = [
         motion_prompt([demo.observation(t) for t in range(demo.num_steps + 1)], demo.objects)
         for demo in demos

@@ -15,7 +15,6 @@ from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.scene import ObjectRecord
 from openvima.tasks.prompts import describe, description_of, image_descriptions, synonyms
-from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.augmentation.prompts import (
     describe_objects,
     rename_objects,
@@ -80,11 +79,11 @@ def test_each_image_is_replaced_with_that_probability_and_the_others_stay(demos)
 def test_whole_prompts_become_text_with_a_probability_of_their_own(demos) -> None:
     episode = preprocess(demos["visual_manipulation"], "objects")
     rng = np.random.default_rng(0)
-    described = [describe_objects(episode, rng, image_prob=0.25, prompt_prob=0.5) for _ in range(1000)]
+    config = AugmentationConfig(text_description_prob=0.25, text_prompt_prob=0.5)
+    described = [describe_objects(episode, rng, config) for _ in range(1000)]
     shown = [each.prompt.image_names for each in described]
     assert 0.48 < np.mean([names == () for names in shown]) < 0.58  # 0.5 + 0.5 · 0.25²
     assert len(set(shown)) == 4  # the others one by one
-    assert describe_objects(episode, rng, image_prob=0.0) is episode
 
 
 def test_synonyms_are_aliases_of_the_catalogue(demos) -> None:
@@ -125,8 +124,7 @@ def test_it_changes_prompts_of_tasks_in_training_only(demos) -> None:
     example = Example(preprocess(demos["visual_manipulation"], "objects"))
 
     def batch(augmentation: AugmentationConfig, rngs: list[np.random.Generator] | None):
-        transforms = demonstration_augmentation(augmentation)
-        return PolicyCollate(processor, 0.0, with_images=True, augmentation=transforms)([example], rngs)
+        return PolicyCollate(processor, 0.0, with_images=True, augmentation=augmentation)([example], rngs)
 
     def words(augmentation: AugmentationConfig, *, is_training: bool) -> list[int]:
         made = batch(augmentation, [np.random.default_rng(0)] if is_training else None)

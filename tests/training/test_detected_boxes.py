@@ -12,6 +12,7 @@ from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.training import TrainingConfig, train
 from openvima.training.batches import BatchMaker, ExampleSource
+from openvima.training.config import LoaderConfig
 from openvima.training.source import alternative_source, split_examples
 from plugged_extractors import HOOK
 
@@ -20,7 +21,9 @@ from plugged_extractors import HOOK
 def sources(data: Path) -> tuple[ExampleSource, ExampleSource]:
     """Demonstrations with true boxes, and with those of the noisy extractor."""
     dataset = Dataset(data)
-    true, _ = split_examples(open_object_cache(dataset), validation_fraction=0.2, validation_episodes=9)
+    true, _ = split_examples(
+        open_object_cache(dataset), LoaderConfig(validation_fraction=0.2, validation_episodes=9)
+    )
     first_image = int(true.cache.image_counts().sum())
     return true, alternative_source(detected_object_cache(dataset, plugged_boxes(HOOK)), true, first_image)
 

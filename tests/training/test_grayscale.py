@@ -33,26 +33,26 @@ def rasteriser() -> Rasteriser:
     return Rasteriser(load_assets("procedural"))
 
 
-def pairs_of(rasteriser: Rasteriser, *placements: Placement, is_grayscale=()) -> Pairs:
+def pairs_of(rasteriser: Rasteriser, *placements: Placement, gray_slots=()) -> Pairs:
     """Pairs with a second view of the same scene."""
     scene, unturned = Scene(placements), {placement.id: 0.0 for placement in placements}
-    rows = pairs_of_scene(scene, {}, rasteriser, 0, (scene, unturned), is_grayscale=is_grayscale)
+    rows = pairs_of_scene(scene, {}, rasteriser, 0, (scene, unturned), gray_slots=gray_slots)
     return stack_rows(rows)
 
 
 def test_a_grayscale_prompt_image_is_that_of_the_tasks_whatever_texture_and_scale(rasteriser):
     low = replace(HIGH_HEART, id=8, texture="green", scale=(1.0, 1.0, 1.0), pose=Pose.planar(0.6, -0.1))
-    pairs = pairs_of(rasteriser, BLUE_A, HIGH_HEART, low, is_grayscale=[False, True, True])
-    assert pairs.is_grayscale.tolist() == [False, True, True] and pairs.prompt_masks.all()
+    pairs = pairs_of(rasteriser, BLUE_A, HIGH_HEART, low, gray_slots=[1, 2])
+    assert pairs.is_grayscale.tolist() == [False, True, True] and pairs.masks[:, 0].all()
     image = rasteriser.prompt(Prompt("{object}", (("object", gray_image(HIGH_HEART)),))).images["object"]
-    for crops in pairs.prompt_crops[1:]:
+    for crops in pairs.crops[1:, 0]:
         np.testing.assert_array_equal(crops, observe_prompt_image(image).crops[:, 0])
     plain = pairs_of(rasteriser, BLUE_A, HIGH_HEART, low)
     assert not plain.is_grayscale.any()
-    assert torch.equal(plain.scene_crops, pairs.scene_crops)
-    assert torch.equal(plain.prompt_crops[0], pairs.prompt_crops[0])
+    assert torch.equal(plain.crops[:, 1], pairs.crops[:, 1])
+    assert torch.equal(plain.crops[0, 0], pairs.crops[0, 0])
     same_texture = pairs_of(rasteriser, HIGH_HEART, replace(low, texture="red"))
-    assert not torch.equal(same_texture.prompt_crops[0], same_texture.prompt_crops[1])  # scale shows
+    assert not torch.equal(same_texture.crops[0, 0], same_texture.crops[1, 0])  # scale shows
 
 
 def test_a_grayscale_row_matches_its_shape_and_others_their_appearance(rasteriser):
@@ -60,7 +60,7 @@ def test_a_grayscale_row_matches_its_shape_and_others_their_appearance(rasterise
     red_a = replace(RED_A, id=9, pose=Pose.planar(0.4, 0.3))
     low_heart = replace(HIGH_HEART, id=10, scale=(1.0, 1.0, 1.0), pose=Pose.planar(0.6, -0.3))
     placements = (RED_A, BLUE_A, HIGH_HEART, purple_a, red_a, low_heart)
-    gray = pairs_of(rasteriser, *placements, is_grayscale=[True, False, True, False, False, False])
+    gray = pairs_of(rasteriser, *placements, gray_slots=[0, 2])
     assert find_matches(gray).int().tolist() == [
         [1, 1, 0, 1, 1, 0],  # a grayscale A
         [0, 1, 0, 0, 0, 0],
@@ -94,10 +94,8 @@ def test_a_grayscale_prompt_image_retrieves_any_object_of_its_shape(monkeypatch)
     seen = torch.ones(3, 2, dtype=torch.bool)
     is_grayscale = torch.tensor([True, False, True])
     pairs = Pairs(
-        crops[0],
-        seen,
-        crops[1],
-        seen,
+        crops.transpose(0, 1),
+        seen[:, None].expand(-1, 2, -1),
         torch.arange(3),
         torch.zeros(3, dtype=torch.int64),
         torch.tensor([7, 7, 8]),

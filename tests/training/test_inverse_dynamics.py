@@ -13,8 +13,8 @@ from openvima.data.preprocessed import preprocess
 from openvima.policies import preset
 from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
-from openvima.training.augmentation.demonstrations import DemonstrationAugmentation
 from openvima.training.batches import BatchMaker, Example
+from openvima.training.config import AugmentationConfig
 from openvima.training.learner import PolicyCollate
 from small_networks import rngs_of, source_of_episodes
 
@@ -27,7 +27,8 @@ def whole_motion(demo: Demonstration) -> list[dict]:
 
 def collate_of(processor: Processor, share: float) -> PolicyCollate:
     """With motions in place of such a share of the prompts."""
-    return PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(share))
+    augmentation = AugmentationConfig(inverse_dynamics_prob=share)
+    return PolicyCollate(processor, 0.0, with_images=True, augmentation=augmentation)
 
 
 def prompts_of(collate: PolicyCollate, episodes, rngs=None) -> list[tuple]:

@@ -61,13 +61,14 @@ def demonstrations() -> list[Demonstration]:
 def stage_of(model: PolicyNetwork, runs: Sequence[Demonstration], folder: Path) -> BehaviourCloning:
     """Training on all demonstrations in each step, and validation on them."""
     processor = Processor.of(model.config.inputs)
-    source, learner = source_of(runs, processor), PolicyLearner(model, processor)
+    source = source_of(runs, processor)
     config = TrainingConfig(
         data=folder,
         out=folder,
         loader=LoaderConfig(batch_size=len(runs)),
         augmentation=AugmentationConfig(false_positive_prob=0.0),
     )
+    learner = PolicyLearner(model, processor, config.augmentation)
     return BehaviourCloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
 
 

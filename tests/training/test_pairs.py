@@ -49,9 +49,9 @@ def rendered(num_scenes: int, *, seed: int = 0, tasks: tuple[str, ...] = TASKS, 
 
 def test_pairs_follow_from_the_seed():
     first, second, other = (rendered(4, seed=seed) for seed in (0, 0, 1))
-    assert torch.equal(first.scene_crops, second.scene_crops)
-    assert first.scene_crops.shape != other.scene_crops.shape or not torch.equal(
-        first.scene_crops, other.scene_crops
+    assert torch.equal(first.crops[:, 1], second.crops[:, 1])
+    assert first.crops[:, 1].shape != other.crops[:, 1].shape or not torch.equal(
+        first.crops[:, 1], other.crops[:, 1]
     )
 
 
@@ -60,9 +60,8 @@ def test_workers_change_nothing(monkeypatch):
     monkeypatch.setattr(pairs_module, "_CHUNK", 3)
     options = {"augmentation": HARD, "second_view": True}
     one, three = (rendered(7, **options, workers=workers) for workers in (1, 3))
-    for name in ("prompt_crops", "scene_crops", "appearances", "scenes", "is_grayscale"):
+    for name in ("crops", "appearances", "scenes", "is_grayscale"):
         assert torch.equal(getattr(one, name), getattr(three, name)), name
-    assert torch.equal(one.second_view.crops, three.second_view.crops)
 
 
 def test_processes_share_the_scenes(monkeypatch):
@@ -78,7 +77,7 @@ def test_processes_share_the_scenes(monkeypatch):
         for rank, count in ((0, 1), (0, 2), (1, 2))
     )
     assert one.scenes.unique().tolist() == list(range(5))
-    for name in ("scene_crops", "appearances", "scenes", "shapes"):
+    for name in ("crops", "appearances", "scenes", "shapes"):
         assert torch.equal(getattr(one, name), torch.cat([getattr(part, name) for part in parts]))
     categories = [part.attributes.categories for part in (one, *parts)]
     assert torch.equal(categories[0], torch.cat(categories[1:]))
@@ -120,9 +119,9 @@ def pairs():
 def test_bars_have_the_colour_of_the_background_and_the_rest_stays(pairs):
     occluded = with_occlusion(pairs, 1.0, step_generator(0, "gaps", 0))
     for before, after, background in (
-        (pairs.prompt_crops, occluded.prompt_crops, 255),
-        (pairs.scene_crops, occluded.scene_crops, 51),
-        (pairs.second_view.crops, occluded.second_view.crops, 51),
+        (pairs.crops[:, 0], occluded.crops[:, 0], 255),
+        (pairs.crops[:, 1], occluded.crops[:, 1], 51),
+        (pairs.crops[:, 2], occluded.crops[:, 2], 51),
     ):
         changed = after != before
         assert (after[changed] == background).all()
@@ -138,24 +137,24 @@ def test_some_objects_are_occluded_in_all_of_their_images(pairs):
     touched = [
         (after != before).flatten(1).any(1)
         for before, after in (
-            (pairs.prompt_crops, occluded.prompt_crops),
-            (pairs.scene_crops, occluded.scene_crops),
+            (pairs.crops[:, 0], occluded.crops[:, 0]),
+            (pairs.crops[:, 1], occluded.crops[:, 1]),
         )
     ]
     is_occluded = touched[0] | touched[1]
     assert 0.2 < is_occluded.float().mean() < 0.6
-    assert occluded.second_view.rotations[is_occluded].isnan().all()
+    assert occluded.rotations[is_occluded].isnan().all()
     assert torch.equal(
-        occluded.second_view.rotations[~is_occluded].nan_to_num(),
-        pairs.second_view.rotations[~is_occluded].nan_to_num(),
+        occluded.rotations[~is_occluded].nan_to_num(),
+        pairs.rotations[~is_occluded].nan_to_num(),
     )
 
 
 def test_probability_zero_changes_nothing_and_equal_seeds_occlude_equally(pairs):
     none = with_occlusion(pairs, 0.0, step_generator(0, "gaps", 0))
-    assert torch.equal(none.prompt_crops, pairs.prompt_crops.float())
-    assert torch.equal(none.second_view.rotations.nan_to_num(), pairs.second_view.rotations.nan_to_num())
-    same = [with_occlusion(pairs, 0.5, step_generator(0, "gaps", 2)).scene_crops for _ in range(2)]
+    assert torch.equal(none.crops[:, 0], pairs.crops[:, 0].float())
+    assert torch.equal(none.rotations.nan_to_num(), pairs.rotations.nan_to_num())
+    same = [with_occlusion(pairs, 0.5, step_generator(0, "gaps", 2)).crops[:, 1] for _ in range(2)]
     assert torch.equal(*same)
 
 
@@ -198,9 +197,8 @@ def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
 
 def test_a_second_view_leaves_the_scenes_unchanged():
     plain, twice = rendered(4), rendered(4, second_view=True)
-    assert plain.second_view is None
-    assert torch.equal(plain.prompt_crops, twice.prompt_crops)
-    assert torch.equal(plain.scene_crops, twice.scene_crops)
+    assert plain.rotations is None
+    assert torch.equal(plain.crops, twice.crops[:, :2])
 
 
 def test_hard_negatives_differ_in_one_respect():
@@ -246,16 +244,16 @@ def test_without_rotation_prompt_image_and_scene_have_the_same_crop():
     rasteriser = Rasteriser(load_assets("procedural"))
     rows = pairs_of_scene(scene, {}, rasteriser, 0, (scene, {5: 0.0}))
     drawn = stack_rows(rows)
-    assert drawn.second_view.rotations.tolist() == [[0.0, 0.0]]
-    red = (drawn.prompt_crops[0, 1, 0] == 255) & (drawn.prompt_crops[0, 1, 1] == 87)
-    also_red = (drawn.scene_crops[0, 1, 0] == 255) & (drawn.scene_crops[0, 1, 1] == 87)
+    assert drawn.rotations.tolist() == [[0.0, 0.0]]
+    red = (drawn.crops[0, 0, 1, 0] == 255) & (drawn.crops[0, 0, 1, 1] == 87)
+    also_red = (drawn.crops[0, 1, 1, 0] == 255) & (drawn.crops[0, 1, 1, 1] == 87)
     assert (red == also_red).float().mean() > 0.95
 
 
 def test_rotations_from_prompt_images_follow_from_the_heading():
     scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, 2.0)),))
     rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), 0, (scene, {5: 0.5}))
-    np.testing.assert_allclose(stack_rows(rows).second_view.rotations[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(stack_rows(rows).rotations[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [0.4, 1.9])
@@ -266,21 +264,21 @@ def test_a_mirrored_image_is_that_of_a_mirrored_heading(yaw):
     for heading in (yaw, -yaw - math.pi):
         scene = Scene((Placement(5, "letter T", "red", (0, 0, 0), Pose.planar(0.5, 0.0, heading)),))
         rows = pairs_of_scene(scene, {}, rasteriser, 0)
-        crops.append(stack_rows(rows).scene_crops[0, :, 0].float())
+        crops.append(stack_rows(rows).crops[0, 1, :, 0].float())
     difference = (crops[0].flip(-1) - crops[1]).abs()
     assert difference.mean() < 0.35 * (crops[0] - crops[1]).abs().mean()
 
 
 def test_horizontal_flips_reverse_rotations(pairs):
     mirrored = with_horizontal_flips(pairs, step_generator(0, "mirror", 0))
-    is_mirrored = (mirrored.scene_crops == pairs.scene_crops.flip(-1)).flatten(1).all(1)
-    shows = ~pairs.second_view.rotations[:, 0].isnan()
+    is_mirrored = (mirrored.crops[:, 1] == pairs.crops[:, 1].flip(-1)).flatten(1).all(1)
+    shows = ~pairs.rotations[:, 0].isnan()
     assert 0.2 < is_mirrored.float().mean() < 0.8
-    expected = torch.where(is_mirrored[:, None], -pairs.second_view.rotations, pairs.second_view.rotations)
-    assert torch.equal(mirrored.second_view.rotations[shows], expected[shows])
-    crops = pairs.second_view.crops
+    expected = torch.where(is_mirrored[:, None], -pairs.rotations, pairs.rotations)
+    assert torch.equal(mirrored.rotations[shows], expected[shows])
+    crops = pairs.crops[:, 2]
     flipped = torch.where(is_mirrored[:, None, None, None, None], crops.flip(-1), crops)
-    assert torch.equal(mirrored.second_view.crops, flipped)
+    assert torch.equal(mirrored.crops[:, 2], flipped)
 
 
 def test_rotations_are_correct_within_fifteen_degrees(encoder):

@@ -19,7 +19,7 @@ from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 from openvima.training import TrainingConfig, train
 from openvima.training.augmentation.demonstrations import (
     MAX_DISTRACTORS,
-    DemonstrationAugmentation,
+    augment,
     drop_unused_objects,
     with_distractors,
 )
@@ -255,7 +255,7 @@ def test_centred_picks_are_where_policies_point_and_solve_the_episode_as_well(ta
     for seed in range(2):
         demo = rollout_oracle(env, seed)
         episode = preprocess(demo, "objects")
-        centred = DemonstrationAugmentation(centres_picks=True)(episode, None)
+        centred = augment(episode, AugmentationConfig(centre_picks=True), None)
         env.reset(seed=seed)
         for t, action in enumerate(centred.actions):
             found = observe(env.observe())

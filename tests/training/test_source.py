@@ -19,12 +19,13 @@ from openvima.policies.processor import Processor
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training import TrainingConfig
 from openvima.training.augmentation.demonstrations import add_false_positives
-from openvima.training.batches import ExampleSource
+from openvima.training.batches import BatchOrder, ExampleSource
 from openvima.training.building import (
     resolve,
     training_texts,
 )
 from openvima.training.config import AugmentationConfig, LoaderConfig
+from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.policy import scene_tasks
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
@@ -32,7 +33,6 @@ from openvima.training.source import (
     make_order,
     open_demonstrations,
     repeat_tasks,
-    show_first,
     split_examples,
 )
 from small_networks import collate_examples, examples_of, rngs_of
@@ -120,25 +120,25 @@ def test_excluded_tasks_identify_a_run_in_any_order(settings):
 
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):
     cache = open_object_cache(Dataset(data))
-    training, kept = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
+    training, kept = split_examples(cache, LoaderConfig(validation_fraction=0.3, validation_episodes=100))
     assert names_of(training).isdisjoint(names_of(kept))
     assert len(names_of(training) | names_of(kept)) == 24
     assert 1 <= len(kept) <= 14
     of_one_task = open_object_cache(Dataset(data, tasks=["rotate"]))
-    _, fewer = split_examples(of_one_task, validation_fraction=0.3, validation_episodes=100)
+    _, fewer = split_examples(of_one_task, LoaderConfig(validation_fraction=0.3, validation_episodes=100))
     assert names_of(fewer) <= names_of(kept)
-    _, least = split_examples(cache, validation_fraction=0.3, validation_episodes=1)
+    _, least = split_examples(cache, LoaderConfig(validation_fraction=0.3, validation_episodes=1))
     assert len(least) == 1
     assert names_of(least) <= names_of(kept)
     with pytest.raises(DatasetError, match="no demonstration to train on"):
-        split_examples(cache, validation_fraction=1.0, validation_episodes=1)
+        split_examples(cache, LoaderConfig(validation_fraction=1.0, validation_episodes=1))
 
 
 def test_demonstrations_of_repeated_tasks_are_shown_as_often_as_asked_in_an_epoch(data, settings):
     cache = open_object_cache(Dataset(data))
-    training, _ = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
+    training, _ = split_examples(cache, LoaderConfig(validation_fraction=0.3, validation_episodes=100))
     repeats = TrainingConfig.of({**settings, "loader.repeat_tasks": "rotate=3, "}).loader.repeats
-    order = make_order(repeat_tasks(training, repeats), batch_size=1, seed=0, bucket=0, rank=0, num_ranks=1)
+    order = make_order(repeat_tasks(training, repeats), LoaderConfig(batch_size=1), 0, ONE_PROCESS)
     source = repeat_tasks(training, repeats)
     shown = Counter(source[int(order.rows(n)[0])].row for n in range(order.batches_per_epoch))
     assert shown == {e.row: 3 if e.episode.task == "rotate" else 1 for e in training}
@@ -149,16 +149,21 @@ def test_demonstrations_of_repeated_tasks_are_shown_as_often_as_asked_in_an_epoc
 
 def test_the_first_steps_show_some_tasks_alone_and_all_of_their_demonstrations(data):
     cache = open_object_cache(Dataset(data))
-    training, _ = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
+    training, _ = split_examples(cache, LoaderConfig(validation_fraction=0.3, validation_episodes=100))
     source = repeat_tasks(training, {"rotate": 3})
-    plain = make_order(source, batch_size=2, seed=0, bucket=0, rank=0, num_ranks=1)
-    order = show_first(plain, source, ["rotate"], steps=plain.batches_per_epoch)
+
+    def order_of(*tasks: str, steps: int) -> BatchOrder:
+        loader = LoaderConfig(batch_size=2, first_tasks=",".join(tasks), first_steps=steps)
+        return make_order(source, loader, 0, ONE_PROCESS)
+
+    plain = order_of(steps=0)
+    order = order_of("rotate", steps=plain.batches_per_epoch)
     shown = {source[row].row for n in range(order.first_batches) for row in order.rows(n)}
     assert shown == {example.row for example in training if example.episode.task == "rotate"}
     assert all((order.rows(n) == plain.rows(n)).all() for n in range(order.first_batches, 60))
-    assert show_first(plain, source, ["twist"], steps=5) is plain  # there are none of these
+    assert not order_of("twist", steps=5).first_batches  # there are none of these
     everything = [*{example.episode.task for example in training}, "twist"]
-    assert show_first(plain, source, everything, steps=5) is plain
+    assert not order_of(*everything, steps=5).first_batches
 
 
 def test_demonstrations_whose_prompts_define_words_are_found_once():
@@ -171,11 +176,12 @@ def test_demonstrations_whose_prompts_define_words_are_found_once():
 
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):
     cache = open_object_cache(Dataset(data))
-    _, few = split_examples(cache, validation_fraction=0.3, validation_episodes=3)
-    orders = [make_order(few, batch_size=64, seed=0, bucket=0, rank=rank, num_ranks=2) for rank in range(2)]
+    _, few = split_examples(cache, LoaderConfig(validation_fraction=0.3, validation_episodes=3))
+    cpu = torch.device("cpu")
+    orders = [make_order(few, LoaderConfig(), 0, Parallel(rank, 2, cpu)) for rank in range(2)]
     assert [order.batch_size for order in orders] == [2, 2]
     with pytest.raises(ConfigError, match="there are 3 demonstrations to train on and 4 processes"):
-        make_order(few, batch_size=64, seed=0, bucket=0, rank=0, num_ranks=4)
+        make_order(few, LoaderConfig(), 0, Parallel(0, 4, cpu))
 
 
 @pytest.mark.parametrize("layout", ["objects", "views"])

@@ -46,18 +46,11 @@ def save_network(network: MaskRCNN, folder: str | Path) -> None:
         write_network(network, partial)
 
 
-def write_network(network: MaskRCNN, folder: Path, weights: Mapping[str, torch.Tensor] | None = None) -> None:
-    """Write the files of a checkpoint into an existing folder.
-
-    Args:
-        network: The network.
-        folder: The folder.
-        weights: State dict to write instead of the network's own.
-    """
-    weights = network.state_dict() if weights is None else weights
+def write_network(network: MaskRCNN, folder: Path) -> None:
+    """Write the files of a checkpoint into an existing folder."""
     tensors = {
         name: tensor.detach().cpu().contiguous()
-        for name, tensor in weights.items()
+        for name, tensor in network.state_dict().items()
         if not name.endswith(_COUNTER)
     }
     write_safetensors(tensors, folder / WEIGHTS_FILE)

@@ -1,5 +1,6 @@
 """Composed episodes: scenes, prompts, photos and goals of users, checked and placed at rest."""
 
+import functools
 import inspect
 import itertools
 import math
@@ -447,99 +448,77 @@ _GOALS: dict[str, Callable[..., Goal]] = {
 MAX_PROMPT_CHARS = 1000
 
 
-@dataclass(frozen=True, slots=True)
-class ImageMaker:
-    """Makes prompt images of what users give.
+def _fill(
+    slot: str, given: object, handles: Handles, table: TableSampler, photo: Callable[[str], PhotoImage]
+) -> PromptFill:
+    """Make the image of a placeholder.
 
-    Args:
-        handles: Objects of the scene.
-        table: Sampler of the scene.
-        photo: Reads a PNG file.
+    Raises:
+        SceneError: It is none of the allowed forms.
     """
-
-    handles: Handles
-    table: TableSampler
-    photo: Callable[[str], PhotoImage]
-
-    def fill(self, slot: str, given: object) -> PromptFill:
-        """Make the image of one placeholder.
-
-        Raises:
-            SceneError: It is none of the allowed forms.
-        """
-        label = f"image {slot!r}"
-        if isinstance(given, ObjectImage | SceneImage | PhotoImage):
-            return given
-        if isinstance(given, Path) or (isinstance(given, str) and given.lower().endswith(".png")):
-            try:
-                return self.photo(str(given))
-            except InputFileError as error:
-                raise InputFileError(f"{label}: {error}") from None
-        if isinstance(given, str) or type(given) is int:
-            return _object_image(known_object(given, self.handles, label))
-        parts = entries(given, label)
-        if len(parts) == 2 and all(isinstance(part, str) for part in parts):
-            return self._from_catalogue(parts[0], parts[1], label)
-        if not 1 <= len(parts) <= MAX_OBJECTS:
-            raise SceneError(f"{label} shows {len(parts)} objects; a scene has 1 to {MAX_OBJECTS}.")
-        return self._scene(parts, label)
-
-    def _from_catalogue(self, object_name: object, texture: object, label: str) -> ObjectImage:
-        known, known_texture = checked_appearance(object_name, texture, label)
+    label = f"image {slot!r}"
+    if isinstance(given, ObjectImage | SceneImage | PhotoImage):
+        return given
+    if isinstance(given, Path) or (isinstance(given, str) and given.lower().endswith(".png")):
+        try:
+            return photo(str(given))
+        except InputFileError as error:
+            raise InputFileError(f"{label}: {error}") from None
+    if isinstance(given, str) or type(given) is int:
+        return _object_image(known_object(given, handles, label))
+    parts = entries(given, label)
+    if len(parts) == 2 and all(isinstance(part, str) for part in parts):
+        name, texture = checked_appearance(parts[0], parts[1], label)
         pose = Pose.planar(0.5, 0.0)
-        return _object_image(Placement(0, known, known_texture, object_spec(known).size_max, pose))
+        return _object_image(Placement(0, name, texture, object_spec(name).size_max, pose))
+    if not 1 <= len(parts) <= MAX_OBJECTS:
+        raise SceneError(f"{label} shows {len(parts)} objects; a scene has 1 to {MAX_OBJECTS}.")
+    shown_table = table.blank()
+    for n, entry in enumerate(parts):
+        known = _moved(entry, f"{label}, object {n}", handles)
+        placed = put(shown_table, known, on_top=True)  # what overlaps lies on top
+        check_inside(placed, table.assets, f"{label}, object {n} ({known.texture} {known.object})")
+    return SceneImage.of(shown_table.placements)
 
-    def _scene(self, listed: Sequence[Any], label: str) -> SceneImage:
-        """Place objects on an empty table; what overlaps lies on top."""
-        table = self.table.blank()
-        for n, entry in enumerate(listed):
-            given = self._moved(entry, f"{label}, object {n}")
-            placed = put(table, given, on_top=True)
-            check_inside(placed, table.assets, f"{label}, object {n} ({given.texture} {given.object})")
-        return SceneImage.of(table.placements)
 
-    def _moved(self, entry: object, label: str) -> SceneObject:
-        """Read an object of a prompt scene: one of its own, or one of the scene at another position."""
-        is_moved = (
-            isinstance(entry, Sequence)
-            and not isinstance(entry, str)
-            and 2 <= len(entry) <= 3
-            and not isinstance(entry[1], str)
-        )
-        if not is_moved:
-            return scene_object(entry, label, "")
-        handle, position, *yaw = entry  # type: ignore[misc]  # a sequence, as checked
-        known = known_object(handle, self.handles, label)
-        yaw_deg = yaw[0] if yaw else math.degrees(known.pose.yaw_rad)
-        moved = (known.object, known.texture, position, yaw_deg)
-        values = dict(zip(FIELDS[:4], moved, strict=True))
-        return scene_object({**values, "scale": known.scale[0]}, label, "")
+def _moved(entry: object, label: str, handles: Handles) -> SceneObject:
+    """Read an object of a prompt scene: one of its own, or one of the scene at another position."""
+    is_moved = (
+        isinstance(entry, Sequence)
+        and not isinstance(entry, str)
+        and 2 <= len(entry) <= 3
+        and not isinstance(entry[1], str)
+    )
+    if not is_moved:
+        return scene_object(entry, label, "")
+    handle, position, *yaw = entry  # type: ignore[misc]  # a sequence, as checked
+    known = known_object(handle, handles, label)
+    yaw_deg = yaw[0] if yaw else math.degrees(known.pose.yaw_rad)
+    moved = (known.object, known.texture, position, yaw_deg)
+    values = dict(zip(FIELDS[:4], moved, strict=True))
+    return scene_object({**values, "scale": known.scale[0]}, label, "")
 
 
 def _object_image(placement: Placement) -> ObjectImage:
     return ObjectImage(placement, MAGNIFICATION if placement.object == "small block" else 1.0)
 
 
-def _checked_text(text: object) -> str:
-    """Return a text in one line: other blanks than the space, such as ends of lines, become one."""
-    if isinstance(text, str) and len(text) <= 2 * MAX_PROMPT_CHARS and not text.isprintable():
-        text = " ".join(text.split())
-    if not isinstance(text, str) or not text.strip() or len(text) > MAX_PROMPT_CHARS:
-        raise SceneError(
-            f"prompt is {shown(text)}; give 1 to {MAX_PROMPT_CHARS} characters, not blanks alone, such as "
-            "'Put the {a} into the {b}.'"
-        )
-    return text
-
-
-def composed_prompt(text: object, images: object, fills: ImageMaker) -> Prompt:
+def _prompt(
+    text: object, images: object, handles: Handles, fill: Callable[[str, object], PromptFill]
+) -> Prompt:
     """Make a prompt of its text and the images that a user gives.
 
     Raises:
         SceneError: The text or an image is malformed, or a placeholder has no image.
         UnknownNameError, InputFileError: As for `compose`.
     """
-    text = _checked_text(text)
+    if isinstance(text, str) and len(text) <= 2 * MAX_PROMPT_CHARS and not text.isprintable():
+        text = " ".join(text.split())  # other blanks than the space, such as ends of lines, become one
+    if not isinstance(text, str) or not text.strip() or len(text) > MAX_PROMPT_CHARS:
+        raise SceneError(
+            f"prompt is {shown(text)}; give 1 to {MAX_PROMPT_CHARS} characters, not blanks alone, such as "
+            "'Put the {a} into the {b}.'"
+        )
     if not isinstance(images, Mapping | None):
         raise SceneError(f"images is {shown(images)}; give a mapping of placeholders to images.")
     slots = image_names(text)
@@ -547,10 +526,10 @@ def composed_prompt(text: object, images: object, fills: ImageMaker) -> Prompt:
     if unused := [name for name in given if name not in slots]:
         raise SceneError(unknown_name("placeholder in the prompt for image", unused[0], slots))
     for slot in slots:
-        if slot not in given and slot not in fills.handles:
+        if slot not in given and slot not in handles:
             what = "image or object for placeholder"
-            raise SceneError(unknown_name(what, slot, fills.handles, handles_hint(fills.handles)))
-    return Prompt(text, tuple((slot, fills.fill(slot, given.get(slot, slot))) for slot in slots))
+            raise SceneError(unknown_name(what, slot, handles, handles_hint(handles)))
+    return Prompt(text, tuple((slot, fill(slot, given.get(slot, slot))) for slot in slots))
 
 
 COMPOSE_KEYS = ("objects", "prompt", "images", "goals", "max_steps", "end_effector")
@@ -635,10 +614,10 @@ def composed(values: Mapping[str, Any], *, assets: Assets, photo: Callable[[str]
     for given in scene_objects(values.get("objects")):
         handles[given.name] = add_object(table, given, handles)
     listed = () if values.get("goals") is None else entries(values["goals"], "goals")
-    fills = ImageMaker(handles, table, photo)
+    fill = functools.partial(_fill, handles=handles, table=table, photo=photo)
     problem = Problem(
         table.scene(),
-        composed_prompt(values.get("prompt"), values.get("images"), fills),
+        _prompt(values.get("prompt"), values.get("images"), handles, fill),
         tuple(_goal(each, f"goal {n}", handles, end_effector, assets) for n, each in enumerate(listed)),
     )
     return Episode(COMPOSED, "train", "user", 0, problem, oracle_max_steps=max_steps, max_steps=max_steps)

@@ -70,26 +70,18 @@ class EnvConfig:
             task,
             level=level,
             domain=domain,
-            assets=self.assets,
-            compat=self.compat,
-            prompts=self.prompts,
             realtime=realtime,
             control=self.control,
-            **self.options(task),
+            **self._sampling(task),
         )
 
     def sample(self, task: str, level: str, seed: int, *, domain: str) -> "Episode":
         """Sample an episode; see `openvima.tasks.sample_episode`."""
-        return sample_episode(
-            task,
-            level=level,
-            seed=seed,
-            domain=domain,
-            assets=self.assets,
-            compat=self.compat,
-            prompts=self.prompts,
-            **self.options(task),
-        )
+        return sample_episode(task, level=level, seed=seed, domain=domain, **self._sampling(task))
+
+    def _sampling(self, task: str) -> dict[str, Any]:
+        shared = {"assets": self.assets, "compat": self.compat, "prompts": self.prompts}
+        return {**shared, **self.options(task)}
 
     def options(self, task: str) -> dict[str, Any]:
         """Return the options of a task.

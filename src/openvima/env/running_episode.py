@@ -104,11 +104,7 @@ class PrimitiveRun:
         """Execute a checked action, and evaluate the goals."""
         self.frames = []
         assert isinstance(self.world, World)
-        execution = self.world.execute(
-            action,
-            monitor=self.monitor if goals.needs_monitoring(self.episode.problem) else None,
-            record=self.record if realtime else None,
-        )
+        execution = self.world.execute(action, **self.watchers(realtime=realtime))
         self.grasped, self.joint_path = execution.grasped, execution.joint_path
         self.num_steps += 1
         self.judge()
@@ -117,13 +113,17 @@ class PrimitiveRun:
         """Execute a primitive."""
         self.step(action, realtime=realtime)
 
-    def monitor(self, scene: Scene) -> None:
-        """Check the constraints that hold during motion."""
-        self.progress = goals.monitor(self.episode.problem, self.progress, scene)
+    def watchers(self, *, realtime: bool) -> dict[str, Any]:
+        """Return what is called during motion: to test constraints, and to keep video frames."""
 
-    def record(self, scene: Scene, joints: np.ndarray) -> None:
-        """Keep a video frame."""
-        self.frames.append(VideoFrame(scene, np.array(joints)))
+        def monitor(scene: Scene) -> None:
+            self.progress = goals.monitor(self.episode.problem, self.progress, scene)
+
+        def record(scene: Scene, joints: np.ndarray) -> None:
+            self.frames.append(VideoFrame(scene, np.array(joints)))
+
+        is_monitored = goals.needs_monitoring(self.episode.problem)
+        return {"monitor": monitor if is_monitored else None, "record": record if realtime else None}
 
     def judge(self) -> None:
         """Evaluate goals and constraints; everything is at rest."""
@@ -176,11 +176,7 @@ class ToolRun(PrimitiveRun):
         if action != self.advice:
             self.follower = None
         self.advice = None
-        has_ended = world.command(
-            action,
-            monitor=self.monitor if goals.needs_monitoring(self.episode.problem) else None,
-            record=self.record if realtime else None,
-        )
+        has_ended = world.command(action, **self.watchers(realtime=realtime))
         self.grasped = world.grasped
         self.joint_path = np.array([before, world.joints], np.float32)
         self.num_steps += 1

@@ -159,7 +159,9 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         control: str = PRIMITIVES,
         **task_options: Any,
     ) -> None:
-        _check_render_mode(render_mode)
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise ConfigError(f"render_mode is {render_mode!r}; allowed are None and {', '.join(modes)}.")
         self.task = task
         self.level = task_spec(task).checked_level(level)
         parameters = inspect.signature(TabletopEnv.__init__).parameters.values()
@@ -183,7 +185,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         self.action_space = _action_space(control)
         self._rasteriser = Rasteriser(self.assets)
         self._run: PrimitiveRun | None = None
-        self._prepared: tuple[tuple[Any, ...], PrimitiveRun] | None = None  # what it depends on, and itself
+        self._prepared: tuple[dict[str, Any], PrimitiveRun] | None = None  # what it depends on, and itself
 
     def __repr__(self) -> str:
         run = self._run
@@ -225,7 +227,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         prepared, self._prepared = self._prepared, None
         if given is None:
             seed = _draw_seed(self.np_random) if seed is None else seed
-            self._run = prepared[1] if prepared and prepared[0] == self._settings(seed) else self._build(seed)
+            settings = self._settings(seed)
+            self._run = prepared[1] if prepared and prepared[0] == settings else self._build(settings)
         else:
             self._run = RUNS[self.control](given, self.assets, self.compat)
         return self.observe(), self._info()
@@ -244,7 +247,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             ConfigError: The seed is not an integer from 0 to 2**63 - 1.
         """
         seed = _draw_seed(copy.deepcopy(self.np_random)) if seed is None else checked_seed(seed)
-        self._prepared = self._settings(seed), self._build(seed)
+        settings = self._settings(seed)
+        self._prepared = settings, self._build(settings)
 
     def step(
         self, action: Mapping[str, Any] | Action | np.ndarray | ToolCommand
@@ -468,28 +472,15 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             raise ConfigError(f"control is {self.control!r}; commands need control {END_EFFECTOR!r}.")
         return run
 
-    def _settings(self, seed: int) -> tuple[Any, ...]:
+    def _settings(self, seed: int) -> dict[str, Any]:
         """All that the start of an episode depends on."""
+        names = ("task", "level", "domain", "assets", "compat", "prompts", "control")
         options = copy.deepcopy(self.task_options)
-        return (
-            *(seed, self.task, self.level, self.domain, self.assets, self.compat),
-            *(self.prompts, self.control, options),
-        )
+        return {"seed": seed, **{name: getattr(self, name) for name in names}, **options}
 
-    def _build(self, seed: int) -> PrimitiveRun:
-        return RUNS[self.control](self._sample(seed), self.assets, self.compat)
-
-    def _sample(self, seed: int) -> Episode:
-        return sample_episode(
-            self.task,
-            level=self.level,
-            seed=seed,
-            domain=self.domain,
-            assets=self.assets,
-            compat=self.compat,
-            prompts=self.prompts,
-            **self.task_options,
-        )
+    def _build(self, settings: dict[str, Any]) -> PrimitiveRun:
+        sampling = {name: value for name, value in settings.items() if name != "control"}
+        return RUNS[self.control](sample_episode(**sampling), self.assets, self.compat)
 
     def _images(self, *, depth: bool = False) -> dict[View, Image]:
         world = self._running().world
@@ -551,12 +542,6 @@ def _action_space(control: str) -> spaces.Space:
     return spaces.Dict(
         {key: spaces.Box(*bounds[key.split("_")[1]], dtype=np.float32) for key in ACTION_SHAPES}
     )
-
-
-def _check_render_mode(render_mode: str | None) -> None:
-    modes = TabletopEnv.metadata["render_modes"]
-    if render_mode is not None and render_mode not in modes:
-        raise ConfigError(f"render_mode is {render_mode!r}; allowed are None and {', '.join(modes)}.")
 
 
 def _draw_seed(rng: np.random.Generator) -> int:

@@ -93,17 +93,13 @@ def write_checkpoint(
     tokenizer: Tokenizer | None = None,
     *,
     dtype: torch.dtype = torch.float32,
-    weights: Mapping[str, torch.Tensor] | None = None,
 ) -> None:
-    """Write the files of a checkpoint into a partial folder; see `save_checkpoint`.
-
-    `weights` replaces the network's state dict where the network holds only a part of it.
-    """
+    """Write the files of a checkpoint into a partial folder; see `save_checkpoint`."""
     precision = described(dtype)
     if precision not in _PRECISIONS:
         raise InputFileError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
-    weights = network.state_dict() if weights is None else weights
-    tensors = {name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in weights.items()}
+    weights = network.state_dict().items()
+    tensors = {name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in weights}
     check_finite(tensors, folder / WEIGHTS_FILE)  # as beyond the range of float16
     write_safetensors(tensors, folder / WEIGHTS_FILE)
     values = {

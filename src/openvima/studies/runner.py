@@ -22,7 +22,7 @@ from openvima.report.videos import require_extra
 from openvima.studies.plan import COST_FILE, Plan, Training, plan_study, record_of
 from openvima.studies.results import study_costs, study_page, study_points
 from openvima.studies.study import Demonstrations, Study, StudyInputs
-from openvima.training.validation import flatten
+from openvima.training.config import flatten
 
 SETTINGS_FILE = "settings.json"
 RESULTS_FILE = "study.json"

@@ -17,7 +17,7 @@ from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, object_spec
 from openvima.errors import SamplingError
 from openvima.scene import AtPose, DistractorsApart, InZone, Placement, Problem, ZoneKeptClear
 from openvima.scene.goal import object_of
-from openvima.tasks.table import NO_SCALE, Reject, TableSampler, is_in_the_way
+from openvima.tasks.table import NO_SCALE, Reject, TableSampler, is_in_the_way, offset
 
 LEVEL = "L5"
 LEAST, MOST = 3, 10  # objects added
@@ -144,10 +144,7 @@ def _blocks_for(task: str, problem: Problem, moved: list[Placement]) -> Reject:
     def blocks(new: Placement) -> bool:
         if any(isinstance(goal, InZone) for goal in problem.goals):
             return abs(new.pose.y) < _SWEPT_TABLE_Y_M
-        if any(
-            new.pose.planar_distance(place.pose) < reach_m + _GAP_M or is_in_the_way(new, place)
-            for place, reach_m in places
-        ):
+        if any(is_in_the_way(new, place, reach_m + _GAP_M) for place, reach_m in places):
             return True
         return task == "manipulate_old_neighbor" and _is_neighbour(new, *moved)
 
@@ -156,7 +153,7 @@ def _blocks_for(task: str, problem: Problem, moved: list[Placement]) -> Reject:
 
 def _is_neighbour(new: Placement, dragged: Placement, neighbour: Placement) -> bool:
     """Whether an object lies in the direction of a neighbour, and not much farther away."""
-    (dx, dy), (nx, ny) = ((p.pose.x - dragged.pose.x, p.pose.y - dragged.pose.y) for p in (neighbour, new))
+    line = (neighbour.pose.x - dragged.pose.x, neighbour.pose.y - dragged.pose.y)
     length = dragged.pose.planar_distance(neighbour.pose)
-    along, across = (nx * dx + ny * dy) / length, abs(nx * dy - ny * dx) / length
+    along, across = (part / length for part in offset(new, dragged, line))
     return 0 < along < 2 * length and across < along

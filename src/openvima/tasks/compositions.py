@@ -26,12 +26,11 @@ from openvima.scene import (
     Tolerance,
 )
 from openvima.tasks.manipulate_old_neighbor import NEIGHBOURS
-from openvima.tasks.novel_words import NOUNS, choose_words, gray_image
+from openvima.tasks.novel_words import NOUNS, gray_image
 from openvima.tasks.options import FewDistractors
 from openvima.tasks.placing import ANGLES_DEG, rotation_goal
-from openvima.tasks.referring_grammar import offset
 from openvima.tasks.registry import register_task
-from openvima.tasks.table import TableSampler, is_in_the_way
+from openvima.tasks.table import TableSampler, is_in_the_way, offset
 
 COMPOSITIONS: dict[str, tuple[str, ...]] = {
     "put_then_put": ("put", "put"),
@@ -115,10 +114,7 @@ class Composition:
         return self.base
 
     def _reaches_a_place(self, new: Placement) -> bool:
-        return any(
-            is_in_the_way(new, place) or new.pose.planar_distance(place.pose) < APART_M
-            for place in self.places
-        )
+        return any(is_in_the_way(new, place, APART_M) for place in self.places)
 
 
 Goals = tuple[AtPose, ...]
@@ -160,7 +156,7 @@ def _restore(made: Composition, n: int) -> Goals:
 
 def _define(made: Composition, n: int) -> Goals:
     defined = made.new_object(asymmetric=True)
-    (made.fills["name"],) = choose_words(made.table, NOUNS)
+    made.fills["name"] = made.table.shuffled(NOUNS)[0]
     made.fills[f"object_{n}"] = gray_image(defined)
     made.shapes.add(defined.object)
     return ()

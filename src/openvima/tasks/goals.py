@@ -72,7 +72,9 @@ def advance(problem: Problem, progress: Progress, scene: Scene) -> tuple[Progres
     """
     progress = monitor(problem, progress, scene)
     open_before = progress.open_goals
-    progress = replace(progress, open_goals=_still_open(problem, open_before, scene))
+    stage = problem.stage_of(open_before[0]) if open_before else range(0)
+    still_open = tuple(i for i in open_before if i not in stage or not problem.goals[i].is_met(scene))
+    progress = replace(progress, open_goals=still_open)
     return progress, _outcome(problem, open_before, progress, scene)
 
 
@@ -102,11 +104,6 @@ def measure(problem: Problem, progress: Progress, scene: Scene) -> dict[str, flo
         stated, key=lambda distance: distance[0] + LEVER_M * distance[1], default=(math.inf, math.inf)
     )
     return {"goals_met": goals_met, "distance_m": distance_m, "angle_rad": angle_rad}
-
-
-def _still_open(problem: Problem, open_goals: tuple[int, ...], scene: Scene) -> tuple[int, ...]:
-    stage = problem.stage_of(open_goals[0]) if open_goals else range(0)
-    return tuple(i for i in open_goals if i not in stage or not problem.goals[i].is_met(scene))
 
 
 def _outcome(problem: Problem, open_before: tuple[int, ...], progress: Progress, scene: Scene) -> Outcome:

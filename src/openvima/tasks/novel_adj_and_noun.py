@@ -12,7 +12,6 @@ from openvima.scene import Problem, Prompt
 from openvima.tasks.novel_words import (
     COMPARISONS,
     NOUNS,
-    choose_words,
     gray_image,
     place_base_and_pair,
     sample_adjective_example,
@@ -47,7 +46,7 @@ def sample(
             twin or of the target.
     """
     example = sample_adjective_example(table)
-    noun, base_noun = choose_words(table, NOUNS, 2)
+    noun, base_noun = table.shuffled(NOUNS)[:2]
     introductions = table.shuffled(INTRODUCTIONS)
     base, target, others = place_base_and_pair(
         table, example, num_distractors=num_distractors, difficulty=difficulty

@@ -8,7 +8,7 @@ Source:   VIMA paper, task list of the appendix, "Novel noun".
 """
 
 from openvima.scene import Problem, Prompt
-from openvima.tasks.novel_words import NOUNS, choose_words, gray_image
+from openvima.tasks.novel_words import NOUNS, gray_image
 from openvima.tasks.options import Difficulty, NumDistractors, textures_by_difficulty
 from openvima.tasks.placing import into_base, of_a_third_shape, place_base_and_target, place_distractors
 from openvima.tasks.registry import register_task
@@ -38,7 +38,7 @@ def sample(
         num_distractors: Further objects, 0 … 6.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
-    noun, base_noun = choose_words(table, NOUNS, 2)
+    noun, base_noun = table.shuffled(NOUNS)[:2]
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     base, target = place_base_and_target(
         table, dragged_textures=dragged_textures, base_textures=base_textures

@@ -1,6 +1,5 @@
 """Invented words: nouns, and adjectives defined by comparing objects that differ in one attribute alone."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,11 +11,6 @@ from openvima.tasks.table import NO_SCALE, TableSampler
 
 ADJECTIVES = ("daxer", "blicker", "modier", "kobar")
 NOUNS = ("dax", "blicket", "wug", "zup")
-
-
-def choose_words(table: TableSampler, words: Sequence[str], count: int = 1) -> tuple[str, ...]:
-    """Draw distinct words."""
-    return tuple(table.shuffled(words)[:count])
 
 
 def gray_image(placement: Placement) -> ObjectImage:
@@ -74,7 +68,7 @@ COMPARISONS = " ".join(
 
 def sample_adjective_example(table: TableSampler) -> AdjectiveExample:
     """Draw an adjective, its meaning, and pairs of objects that illustrate it."""
-    (adjective,) = choose_words(table, ADJECTIVES)
+    adjective = table.shuffled(ADJECTIVES)[0]
     meaning = table.choose(MEANINGS)
     more, less = _attributes(table, meaning)
     is_flipped = table.choose((False, True))
@@ -84,7 +78,10 @@ def sample_adjective_example(table: TableSampler) -> AdjectiveExample:
         texture = table.choose(table.pool.dragged_textures)
         size = table.sample_size(object_name)
         for slot, attribute in ((f"demo_blicker_obj_{n}", more), (f"demo_less_blicker_obj_{n}", less)):
-            fills[slot] = _image(object_name, attribute.texture(texture), size, attribute.scale)
+            shown = Placement(
+                _NO_ID, object_name, attribute.texture(texture), size, _ORIGIN, scale=attribute.scale
+            )
+            fills[slot] = ObjectImage(shown)
     asked, other = (less, more) if is_flipped else (more, less)
     return AdjectiveExample(fills, asked, other)
 
@@ -131,7 +128,3 @@ def _attributes(table: TableSampler, meaning: str) -> tuple[Attribute, Attribute
     else:
         low, high = Attribute(shade="light"), Attribute(shade="dark")
     return (low, high) if meaning in ("shorter", "lighter") else (high, low)
-
-
-def _image(object_name: str, texture: str, size: Vector3, scale: Vector3) -> ObjectImage:
-    return ObjectImage(Placement(_NO_ID, object_name, texture, size, _ORIGIN, scale=scale))

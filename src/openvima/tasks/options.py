@@ -5,10 +5,8 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated, Any, Literal
 
-from openvima.catalog import Pool
 from openvima.errors import ConfigError, echo, unknown_name
 from openvima.tasks.registry import TaskSpec, task_spec
 from openvima.tasks.table import TableSampler
@@ -30,8 +28,7 @@ def textures_by_difficulty(table: TableSampler, difficulty: str) -> tuple[tuple[
         table: Its pool is used; "medium" draws once.
         difficulty: "easy": the pool's; "medium": both from one of the two lists; "hard": swapped.
     """
-    pool: Pool = table.pool
-    dragged, base = pool.dragged_textures, pool.base_textures
+    dragged, base = table.pool.dragged_textures, table.pool.base_textures
     if difficulty == "hard":
         return base, dragged
     if difficulty == "medium":
@@ -62,7 +59,21 @@ class TaskOptions:
         """
         if not isinstance(text, str):
             raise ConfigError(f"task_options is {echo(repr(text))}; give text such as 'num_distractors=3'.")
-        return _parse(text)
+        found: dict[tuple[str, str], str] = {}
+        for entry in filter(None, (part.strip() for part in text.split(","))):
+            match = _ENTRY.fullmatch(entry)
+            if match is None:
+                raise ConfigError(
+                    f"task option {echo(repr(entry))} is not [TASK.]NAME=VALUE, such as num_distractors=3 or "
+                    "rotate.difficulty=hard."
+                )
+            key = (match[1] or "", match[2])
+            if key in found:
+                raise ConfigError(
+                    f"task option {echo(entry.partition('=')[0])} is given twice; give one value."
+                )
+            found[key] = match[3]
+        return TaskOptions(tuple((task, name, found[task, name]) for task, name in sorted(found)))
 
     def __str__(self) -> str:
         return ",".join(f"{task and task + '.'}{name}={value}" for task, name, value in self.entries)
@@ -104,23 +115,6 @@ def option_descriptions(spec: TaskSpec) -> dict[str, str]:
         if name in descriptions:
             descriptions[name] = " ".join(text.split())
     return descriptions
-
-
-@lru_cache
-def _parse(text: str) -> TaskOptions:
-    found: dict[tuple[str, str], str] = {}
-    for entry in filter(None, (part.strip() for part in text.split(","))):
-        match = _ENTRY.fullmatch(entry)
-        if match is None:
-            raise ConfigError(
-                f"task option {echo(repr(entry))} is not [TASK.]NAME=VALUE, such as num_distractors=3 or "
-                "rotate.difficulty=hard."
-            )
-        key = (match[1] or "", match[2])
-        if key in found:
-            raise ConfigError(f"task option {echo(entry.partition('=')[0])} is given twice; give one value.")
-        found[key] = match[3]
-    return TaskOptions(tuple((task, name, found[task, name]) for task, name in sorted(found)))
 
 
 def _convert(spec: TaskSpec, name: str, value: str) -> Any:

@@ -107,6 +107,7 @@ def visible_point(
         OracleError: The object is not visible within the workspace.
     """
     from openvima.render.labels import CELL_M, cell_centres, label_raster
+    from openvima.tasks.kernels import squared_depths
 
     labels = label_raster(scene, assets)
     rows, columns = np.nonzero(labels == object_id)
@@ -116,22 +117,15 @@ def visible_point(
     if rng is not None:
         x, y = (points[rng.integers(len(points))] - CELL_M / 2).tolist()
         return x, y
-    depths = _squared_depths(labels, object_id, rows, columns)
+    top, left = int(rows.min()), int(columns.min())
+    window = np.empty((int(rows.max()) - top + 1, int(columns.max()) - left + 1), np.int32)
+    squared_depths(labels, object_id, top, left, np.empty_like(window), window)
+    depths = window[rows - top, columns - left]
     deepest = points[depths == depths.max()]
     pose = scene[object_id].pose
     offsets = deepest - (pose.x, pose.y)
     x, y = deepest[np.argmin((offsets * offsets).sum(axis=1))].tolist()
     return x, y
-
-
-def _squared_depths(labels: np.ndarray, object_id: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Squared distances of an object's cells to the nearest other cell, in the order given."""
-    from openvima.tasks.kernels import squared_depths
-
-    top, left = int(rows.min()), int(columns.min())
-    depths = np.empty((int(rows.max()) - top + 1, int(columns.max()) - left + 1), np.int32)
-    squared_depths(labels, object_id, top, left, np.empty_like(depths), depths)
-    return depths[rows - top, columns - left]
 
 
 def _pick_and_place(goal: AtPose, pose: Pose, point: tuple[float, float], *, compat: bool) -> Action:

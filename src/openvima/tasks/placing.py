@@ -86,12 +86,6 @@ _TRIES = 20  # for all objects together
 _SPARE_STEPS = 2
 
 
-def object_counts(difficulty: str, num_distractors: int | None) -> tuple[int, int]:
-    """Return the number of objects to gather and of distractors, by default that of the difficulty."""
-    num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
-    return NUM_DRAGGED[difficulty], num_distractors
-
-
 def gathering_problem(
     table: TableSampler,
     template: str,
@@ -99,7 +93,8 @@ def gathering_problem(
     base: Placement,
     dragged_appearances: tuple[Sequence[str], Sequence[str]],
     distractor_objects: Sequence[str],
-    counts: tuple[int, int],
+    difficulty: str,
+    num_distractors: int | None,
     after_bowl: bool | None,
 ) -> Problem:
     """Place the objects and build the problem.
@@ -112,7 +107,8 @@ def gathering_problem(
         base: The base.
         dragged_appearances: Shapes and textures of the dragged objects, drawn independently.
         distractor_objects: Shapes of distractors.
-        counts: Number of dragged objects and of distractors.
+        difficulty: "easy", "medium" or "hard": decides the number of dragged objects.
+        num_distractors: By default that of the difficulty.
         after_bowl: Whether the bowl's smaller tolerance applies to every base, as in VIMA-Bench after the
             first bowl of an environment. None: with `compat` if the pool contains a bowl.
 
@@ -122,7 +118,8 @@ def gathering_problem(
     if after_bowl is None:
         after_bowl = table.compat and "bowl" in table.pool.base_objects
     tolerance = Tolerance(BOWL_TOLERANCE_M if after_bowl or base.object == "bowl" else TOLERANCE_M)
-    num_dragged, _ = counts
+    num_dragged = NUM_DRAGGED[difficulty]
+    num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
     dragged: list[Placement] = []
 
     def draw() -> tuple[str, str]:
@@ -141,7 +138,7 @@ def gathering_problem(
         near = (base, *dragged) if len(dragged) == num_dragged else (base,)
         return not table.compat and any(tolerance.accepts(new.pose, other.pose) for other in near)
 
-    placed = table.place("object", draw, count=sum(counts), tries=_TRIES, reject=reject)
+    placed = table.place("object", draw, count=num_dragged + num_distractors, tries=_TRIES, reject=reject)
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(template, base_obj=ObjectImage(base)),

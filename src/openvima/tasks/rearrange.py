@@ -106,10 +106,4 @@ def _in_the_way_of(targets: list[Placement], table: TableSampler) -> Reject:
     """Return a test for placements that crowd or, without `compat`, reach a target."""
     reach = 0.0 if table.compat else TOLERANCE.position_m
 
-    def is_blocking(place: Placement) -> bool:
-        return any(
-            is_in_the_way(place, target) or place.pose.planar_distance(target.pose) < reach
-            for target in targets
-        )
-
-    return is_blocking
+    return lambda place: any(is_in_the_way(place, target, reach) for target in targets)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from openvima.catalog import TEXTURES
 from openvima.scene import ObjectImage, Placement
+from openvima.tasks.table import offset
 
 AHEAD_M = 0.06  # of what is left of an object
 BESIDE_M, BESIDE_PART = 0.04, 0.125  # what might be, also as a part of the distance across
@@ -101,12 +102,6 @@ def _named(*placements: Placement) -> dict[str, Fill]:
 # Relations
 
 
-def offset(placement: Placement, other: Placement, direction: tuple[int, int]) -> tuple[float, float]:
-    """Return how far an object is from another along a direction (steps of x and y), and across it, in m."""
-    dx, dy = placement.pose.x - other.pose.x, placement.pose.y - other.pose.y
-    return dx * direction[0] + dy * direction[1], abs(dx * direction[1] - dy * direction[0])
-
-
 def _beside(direction: tuple[int, int]) -> Pick:
     def pick(candidates: Group, named: Group) -> Placement | None:
         offsets = {p.id: offset(p, named[0], direction) for p in candidates}
@@ -126,14 +121,9 @@ def _by_distance(sign: int) -> Pick:
 
 def _between(candidates: Group, named: Group) -> Placement | None:
     one, other = named
-    dx, dy = other.pose.x - one.pose.x, other.pose.y - one.pose.y
-    length = math.hypot(dx, dy)
-
-    def along_and_across(p: Placement) -> tuple[float, float]:
-        x, y = p.pose.x - one.pose.x, p.pose.y - one.pose.y
-        return (x * dx + y * dy) / length**2, abs(x * dy - y * dx) / length**2
-
-    places = {p.id: along_and_across(p) for p in candidates}
+    line = (other.pose.x - one.pose.x, other.pose.y - one.pose.y)
+    squared = math.hypot(*line) ** 2
+    places = {p.id: [part / squared for part in offset(p, one, line)] for p in candidates}
     wide = [p for p in candidates if WHOLE[0] < places[p.id][0] < WHOLE[1] and places[p.id][1] < WIDE]
     narrow = [p for p in wide if MIDDLE[0] < places[p.id][0] < MIDDLE[1] and places[p.id][1] < NARROW]
     return narrow[0] if narrow and len(wide) == 1 else None

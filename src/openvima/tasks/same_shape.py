@@ -11,7 +11,7 @@ Source:   VIMA paper, task list of the appendix, "Visual reasoning".
 from openvima.catalog import Pool, object_spec
 from openvima.scene import Problem
 from openvima.tasks.options import Difficulty, SomeDistractors
-from openvima.tasks.placing import gathering_problem, object_counts
+from openvima.tasks.placing import gathering_problem
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -34,7 +34,6 @@ def sample(
         after_bowl: Whether the bowl's tolerance applies to every base; see `gathering_problem`.
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
-    counts = object_counts(difficulty, num_distractors)
     pool = table.pool
     by_base = {name: _by_profile(pool, name) for name in pool.base_objects}
     texture = table.choose(pool.base_textures)
@@ -46,7 +45,8 @@ def sample(
         base=base,
         dragged_appearances=(alike, pool.dragged_textures),
         distractor_objects=different,
-        counts=counts,
+        difficulty=difficulty,
+        num_distractors=num_distractors,
         after_bowl=after_bowl,
     )
 

@@ -9,7 +9,7 @@ Source:   VIMA paper, task list of the appendix, "Visual reasoning".
 
 from openvima.scene import Problem
 from openvima.tasks.options import Difficulty, SomeDistractors
-from openvima.tasks.placing import gathering_problem, object_counts
+from openvima.tasks.placing import gathering_problem
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -32,7 +32,6 @@ def sample(
         after_bowl: Whether the bowl's tolerance applies to every base; see `gathering_problem`.
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
-    counts = object_counts(difficulty, num_distractors)
     pool = table.pool
     texture = table.choose(pool.base_textures)
     base = table.place_one("base", lambda: (table.choose(pool.base_objects), texture))
@@ -42,6 +41,7 @@ def sample(
         base=base,
         dragged_appearances=(pool.dragged_objects, (texture,)),
         distractor_objects=pool.dragged_objects,
-        counts=counts,
+        difficulty=difficulty,
+        num_distractors=num_distractors,
         after_bowl=after_bowl,
     )

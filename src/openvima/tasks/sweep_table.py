@@ -1,9 +1,10 @@
 """Shared parts of the sweeping tasks: area, line, groups of small blocks, and the problem."""
 
+import itertools
 import math
 from collections.abc import Callable
 
-from openvima.catalog import Vector3, object_spec
+from openvima.catalog import object_spec
 from openvima.errors import SamplingError
 from openvima.scene import (
     InZone,
@@ -21,6 +22,8 @@ from openvima.scene import (
 from openvima.tasks.pushes import Rectangle
 from openvima.tasks.table import TableSampler
 
+Corner = tuple[float, float]
+
 BLOCK = "small block"
 _COMPAT_TRIES = 10
 _TRIES = 500  # many, so that crowded groups of three are not underrepresented
@@ -30,10 +33,10 @@ _GAP_M = 0.001
 def scattered_blocks(
     table: TableSampler,
     texture: str,
-    *,
-    corner: tuple[float, float],
+    corner: Corner,
     spread_m: float,
     count: int,
+    *,
     outside: Zone,
 ) -> list[Placement]:
     """Scatter small blocks over a square by rejection sampling of the whole group.
@@ -56,32 +59,26 @@ def scattered_blocks(
     """
     sizes = [table.sample_size(BLOCK) for _ in range(count)]
     for _ in range(_COMPAT_TRIES if table.compat else _TRIES):
-        poses = [_scattered_pose(table, corner, spread_m) for _ in range(count)]
+        drawn = [table.rng.random(3).tolist() for _ in range(count)]
+        poses = [
+            Pose.planar(corner[0] + spread_m * x, corner[1] + spread_m * y, 2 * math.pi * rotation)
+            for x, y, rotation in drawn
+        ]
         if not all(in_workspace(pose) for pose in poses):
             continue
-        if table.compat or not (_overlap(poses, sizes) or _enter(poses, outside)):
+        footprints = [
+            Rectangle.of_box(pose, size[0], size[1]) for pose, size in zip(poses, sizes, strict=True)
+        ]
+        is_free = not any(
+            one.comes_near(other, _GAP_M) for one, other in itertools.combinations(footprints, 2)
+        ) and not any(outside.contains(point) for pose in poses for point in block_points(pose))
+        if table.compat or is_free:
             return [
                 table.add(BLOCK, texture, size=size, pose=pose)
                 for size, pose in zip(sizes, poses, strict=True)
             ]
     raise SamplingError(f"no valid poses for {count} small blocks near {corner}.")
 
-
-def _scattered_pose(table: TableSampler, corner: tuple[float, float], spread_m: float) -> Pose:
-    x, y, rotation = table.rng.random(3).tolist()
-    return Pose.planar(corner[0] + spread_m * x, corner[1] + spread_m * y, 2 * math.pi * rotation)
-
-
-def _overlap(poses: list[Pose], sizes: list[Vector3]) -> bool:
-    footprints = [Rectangle.of_box(pose, size[0], size[1]) for pose, size in zip(poses, sizes, strict=True)]
-    return any(a.comes_near(b, _GAP_M) for i, a in enumerate(footprints) for b in footprints[:i])
-
-
-def _enter(poses: list[Pose], zone: Zone) -> bool:
-    return any(zone.contains(point) for pose in poses for point in block_points(pose))
-
-
-Corner = tuple[float, float]
 
 MAGNIFICATION = 7  # of the small block in the prompt
 CORNERS: tuple[Corner, Corner] = ((0.57, -0.22), (0.58, 0.03))  # m, lower corners of the squares of blocks
@@ -145,13 +142,12 @@ def sweep_problem(
     num_distractors = num_swept if num_distractors is None else num_distractors
     bounds, line, zone, zone_marker = lay_out(bounds_texture, line_texture)
 
-    def scatter(texture: str, corner: Corner, spread_m: float, count: int) -> list[Placement]:
-        return scattered_blocks(table, texture, corner=corner, spread_m=spread_m, count=count, outside=zone)
-
     if num_distractors > len(NUMBER_WORDS):  # more than published find no place in a small square
         distractor_spread_m = SWEPT_SPREAD_M
-    swept = scatter(swept_texture, swept_corner, SWEPT_SPREAD_M, num_swept)
-    distractors = scatter(distractor_texture, distractor_corner, distractor_spread_m, num_distractors)
+    swept = scattered_blocks(table, swept_texture, swept_corner, SWEPT_SPREAD_M, num_swept, outside=zone)
+    distractors = scattered_blocks(
+        table, distractor_texture, distractor_corner, distractor_spread_m, num_distractors, outside=zone
+    )
     words = ("any", *NUMBER_WORDS[:num_swept], "all")
     word = table.choose(words)
     ids = tuple(block.id for block in swept)

@@ -171,22 +171,20 @@ def published_sweep(goal: InZone, scene: Scene, problem: Problem) -> Sweep:
         scene: Where the objects are now.
         problem: The episode's problem.
     """
-    pose = scene[goal.object_id].pose
-    place = (pose.x, pose.y)
-    return Sweep(goal, place, _target(goal, place, problem))
-
-
-def _target(goal: InZone, place: Point, problem: Problem) -> Point:
-    (x, y), zone = place, goal.zone
+    pose, zone = scene[goal.object_id].pose, goal.zone
+    x, y = place = (pose.x, pose.y)
+    end = (zone.x, zone.y)
     for line in (c.zone for c in problem.constraints if isinstance(c, NeverTouches) and c.zone.x > zone.x):
-        half_length, side = line.size_y / 2, -1.0 if y < 0 else 1.0
-        lane_y = math.copysign(half_length + _LANE_M, side)
+        half_length = line.size_y / 2
+        lane_y = math.copysign(half_length + _LANE_M, -1.0 if y < 0 else 1.0)
         is_beside = abs(y) >= half_length + _DIVIDER_M
         if not is_beside and x > line.x:
-            return (line.x + WORKSPACE_HIGH[0]) / 2, lane_y
+            end = (line.x + WORKSPACE_HIGH[0]) / 2, lane_y
+            break
         if is_beside and x > line.x - _PAST_LINE_M:
-            return zone.x - _BEHIND_CENTRE_M, lane_y
-    return zone.x, zone.y
+            end = zone.x - _BEHIND_CENTRE_M, lane_y
+            break
+    return Sweep(goal, place, end)
 
 
 _NUDGE_M, _SHOVE_M = 0.012, 0.03  # allowed overlap with blocks of goals already met

@@ -16,28 +16,6 @@ from openvima.scene import FIRST_OBJECT_ID, WORKSPACE_HIGH, WORKSPACE_LOW, EndEf
 _NUM_STEPS = 1000  # the error falls as one over this number
 
 
-def smallest_circle_centre(points: np.ndarray) -> tuple[float, float]:
-    """Return the centre of the smallest circle that encloses points of the plane.
-
-    Args:
-        points: Shape (N, 2), float64, metres.
-
-    Returns:
-        x, y in metres, accurate to about a thousandth of the radius.
-
-    Source: Bădoiu and Clarkson, "Smaller core-sets for balls" (2003): shrinking steps towards the
-    farthest point.
-    """
-    points = np.unique(points, axis=0)
-    centre = points[0]
-    for step in range(2, _NUM_STEPS):
-        away = points - centre
-        farthest = int(np.argmax(away[:, 0] ** 2 + away[:, 1] ** 2))
-        centre = centre + away[farthest] / step
-    x, y = centre.tolist()
-    return x, y
-
-
 T = TypeVar("T")
 Reject = Callable[[Placement], bool]
 
@@ -231,7 +209,7 @@ class TableSampler:
         size = size or self.sample_size(object_name)
         new = self._at_rest(object_name, texture, size, pose, scale, fixed)
         if on_top:
-            height_m = self._height_below(new)
+            height_m = float(self._heights[self.covered(new)].max(initial=0.0))  # of what is below
             new = new.at(new.pose.moved(dz=height_m)) if height_m else new
         return self._put(new if z is None else new.at(Pose((pose.x, pose.y, z), pose.quaternion)))
 
@@ -342,10 +320,6 @@ class TableSampler:
             self._stamp(labels, heights, placement)
         return labels, heights
 
-    def _height_below(self, placement: Placement) -> float:
-        """Height in metres of the highest point under an object."""
-        return float(self._heights[self.covered(placement)].max(initial=0.0))
-
     def _footprint_is_free(self, object_name: str, size: Vector3, pose: Pose) -> bool:
         geometry = self.assets.geometry(object_name, size)
         corners = pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
@@ -384,13 +358,20 @@ def is_in_hollow(placement: Placement, base: Placement) -> bool:
     return base.object in HOLLOW_OBJECTS and is_in_the_way(placement, base)
 
 
-def is_in_the_way(placement: Placement, other: Placement) -> bool:
-    """Whether two objects crowd each other, by nominal size and position alone.
+def is_in_the_way(placement: Placement, other: Placement, apart_m: float = 0.0) -> bool:
+    """Whether two objects crowd each other, by nominal size and position alone, or are nearer than `apart_m`.
 
     Source: VIMA-Bench; its square windows ignore the headings.
     """
     reach = max((placement.size[axis] + other.size[axis]) / 2 + _CROWDING_MARGIN_M for axis in (0, 1))
-    return placement.pose.planar_distance(other.pose) <= reach
+    distance = placement.pose.planar_distance(other.pose)
+    return distance <= reach or distance < apart_m
+
+
+def offset(placement: Placement, other: Placement, direction: tuple[float, float]) -> tuple[float, float]:
+    """Return how far an object is from another along and across a direction in x and y, times its length."""
+    dx, dy = placement.pose.x - other.pose.x, placement.pose.y - other.pose.y
+    return dx * direction[0] + dy * direction[1], abs(dx * direction[1] - dy * direction[0])
 
 
 _ON_TABLE_M = 0.003  # above its height at rest
@@ -433,6 +414,19 @@ def _reach_m(assets: Assets, object_name: str, size: Vector3) -> float:
 
 @functools.lru_cache(maxsize=256)
 def _circle_centre_m(assets: Assets, object_name: str, size: Vector3) -> tuple[float, float]:
-    """Centre of the smallest circle around an object's mesh, in its link frame, in metres."""
+    """Centre of the smallest circle around an object's mesh, in its link frame, in metres.
+
+    It is accurate to about a thousandth of the radius.
+
+    Source: Bădoiu and Clarkson, "Smaller core-sets for balls" (2003): shrinking steps towards the
+    farthest point.
+    """
     vertices = assets.geometry(object_name, size).visual.vertices
-    return smallest_circle_centre(vertices.reshape(-1, 3)[:, :2])
+    points = np.unique(vertices.reshape(-1, 3)[:, :2], axis=0)
+    centre = points[0]
+    for step in range(2, _NUM_STEPS):
+        away = points - centre
+        farthest = int(np.argmax(away[:, 0] ** 2 + away[:, 1] ** 2))
+        centre = centre + away[farthest] / step
+    x, y = centre.tolist()
+    return x, y

@@ -15,11 +15,11 @@ from openvima.perception.preprocessing import IMAGE_SIZES
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.training.batches import BatchMaker, ExampleSource, read_batches
 from openvima.training.config import TrainingConfig
-from openvima.training.learner import Learner, PolicyLearner
+from openvima.training.learner import Learner, LossAndMetrics, PolicyLearner
 from openvima.training.loop import Metrics
-from openvima.training.parallel import ONE_PROCESS, Parallel
+from openvima.training.parallel import Parallel
 from openvima.training.pretraining.stage import crop_parameters
-from openvima.training.source import find_definers, make_order, show_first
+from openvima.training.source import find_definers, make_order
 
 CHUNK = 64  # demonstrations per batch of precomputed features
 MAX_FEATURES = 4_000_000  # images, about 1 kB each; above, features are computed in every step
@@ -54,17 +54,7 @@ class BehaviourCloning:
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
         self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
         self._training, self._validation, self._alternatives = training, validation, alternatives
-        self._order = make_order(
-            training,
-            batch_size=config.loader.batch_size,
-            seed=config.seed,
-            bucket=config.loader.bucket_batches,
-            rank=parallel.rank,
-            num_ranks=parallel.num_ranks,
-        )
-        loader = config.loader
-        if loader.first_steps:
-            self._order = show_first(self._order, training, loader.early_tasks, loader.first_steps)
+        self._order = make_order(training, config.loader, config.seed, parallel)
         self._batches: Iterator[list[tuple[Any, int]]] = iter(())
         self._next_step = -1
 
@@ -131,7 +121,7 @@ class BehaviourCloning:
         workers = min(config.loader.num_workers, num_cpus())
         return iter(read_batches(self._order, make, first=step, num_workers=workers))
 
-    def _call(self, batch: Any, module: nn.Module) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def _call(self, batch: Any, module: nn.Module) -> LossAndMetrics:
         device = self._parallel.device
         with self._parallel.autocast(self._config.runtime.precision):
             loss, metrics = module(batch if device.type == "cpu" else batch.to(device))
@@ -156,9 +146,7 @@ def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
     return bool(pretraining.steps or (config.init_from and encoder.config.appearance_width))
 
 
-def freeze_crops(
-    learner: PolicyLearner, caches: Sequence[ObjectCache], parallel: Parallel = ONE_PROCESS
-) -> None:
+def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache], parallel: Parallel) -> None:
     """Freeze the crop encoder, and precompute the features of all images unless there are too many.
 
     Args:

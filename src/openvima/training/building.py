@@ -25,13 +25,17 @@ from openvima.policies.variants import image_tokens, with_variant
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
 from openvima.tasks.prompts import description_of, synonyms, training_paraphrases
-from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.augmentation.prompts import DEFINITION, motion_text, text_of
-from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, AugmentationConfig, TrainingConfig
+from openvima.training.config import (
+    DETECTED_PROB,
+    PRETRAINING_STEPS,
+    AugmentationConfig,
+    TrainingConfig,
+    flatten,
+)
 from openvima.training.learner import Learner, PolicyLearner, make_learner
 from openvima.training.loop import step_seed
 from openvima.training.pretraining.stage import caption_texts
-from openvima.training.validation import flatten
 from openvima.user_code import with_absolute_path
 
 _FOR_OBJECTS = (
@@ -187,13 +191,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         _copy_weights(initial, network)
     elif config.t5:
         load_t5(network, config.t5)
-    processor = Processor.of(sizes.inputs, tokenizer)
-    return PolicyLearner(
-        network,
-        processor,
-        false_positive_prob=config.augmentation.false_positive_prob,
-        augmentation=demonstration_augmentation(config.augmentation),
-    )
+    return PolicyLearner(network, Processor.of(sizes.inputs, tokenizer), config.augmentation)
 
 
 def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | None) -> Tokenizer:

@@ -1,22 +1,19 @@
 """Settings of a training run, as nested frozen dataclasses that are validated together."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_type_hints
 
 from openvima.errors import ConfigError, echo, unknown_name
 from openvima.input_files import settle
-from openvima.policies.config_fields import Range, problems_of
+from openvima.policies.config_fields import Range, options_of, problems_of
 from openvima.policies.naming import BUNDLED
 from openvima.policies.presets import PRESETS, own_policies
-from openvima.training.validation import (
-    Count,
-    Probability,
-    Steps,
-    path_settings,
-    setting_types,
-)
+
+Count = Annotated[int, Range(1)]
+Steps = Annotated[int, Range(0)]
+Probability = Annotated[float, Range(0, 1)]
 
 PRETRAINING_STEPS = 400  # of presets with an appearance embedding
 DETECTED_PROB = 0.5  # where a detector is named
@@ -27,6 +24,33 @@ _NOT_IDENTITY = {
     "schedule": ("checkpoint_every", "keep_every"),
     "runtime": ("device", "threads", "workers", "tensorboard", "wandb"),
 }
+
+
+def flatten(values: Any, prefix: str = "") -> dict[str, Any]:
+    """Flatten nested settings; names are joined by dots."""
+    if not isinstance(values, Mapping):
+        return {prefix: values}
+    result: dict[str, Any] = {}
+    for name, value in values.items():
+        result |= flatten(value, f"{prefix}.{name}" if prefix else str(name))
+    return result
+
+
+def setting_types(kind: type, prefix: str = "") -> dict[str, Any]:
+    """Return the type of every setting of a dataclass by its dotted name."""
+    types: dict[str, Any] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        types |= (
+            setting_types(hint, f"{prefix}{name}.")
+            if isinstance(hint, type) and is_dataclass(hint)
+            else {prefix + name: hint}
+        )
+    return types
+
+
+def path_settings(kind: type) -> list[str]:
+    """Return the settings of a dataclass itself that are paths."""
+    return [name for name, hint in get_type_hints(kind).items() if Path in options_of(hint)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """`Learner`, the trained module: it makes batches of demonstrations, and computes a loss."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,12 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer
-from openvima.training.augmentation.demonstrations import (
-    NO_AUGMENTATION,
-    DemonstrationAugmentation,
-    add_false_positives,
-)
+from openvima.training.augmentation.demonstrations import add_false_positives, augment
 from openvima.training.batches import Collate, Example
+from openvima.training.config import AugmentationConfig
 from openvima.user_code import call_function
+
+LossAndMetrics = tuple[torch.Tensor, dict[str, torch.Tensor]]
 
 
 class Learner(nn.Module):
@@ -51,7 +51,7 @@ class Learner(nn.Module):
         """
         raise NotImplementedError
 
-    def forward(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def forward(self, batch: Any) -> LossAndMetrics:
         """Return the loss and metrics by name, means over all steps of the batch."""
         raise NotImplementedError
 
@@ -68,15 +68,11 @@ class Learner(nn.Module):
             "to evaluate the run."
         )
 
-    def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
-        """Write a checkpoint.
-
-        Args:
-            folder: The folder.
-            weights: State dict of the learner.
-        """
+    def write(self, folder: Path) -> None:
+        """Write a checkpoint."""
         # Copies, since a file holds no tensors that share memory, as tied weights do.
-        tensors = {name: t.detach().to("cpu", copy=True).contiguous() for name, t in weights.items()}
+        weights = self.state_dict().items()
+        tensors = {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in weights}
         write_safetensors(tensors, folder / WEIGHTS_FILE)
 
     def read(self, folder: Path) -> None:
@@ -102,17 +98,11 @@ class PolicyLearner(Learner):
     Args:
         network: The network; it is trained in place.
         processor: Its processor.
-        false_positive_prob: Probability that a view of a step contains a false detection.
-        augmentation: Transforms of demonstrations.
+        augmentation: How demonstrations are augmented.
     """
 
     def __init__(
-        self,
-        network: PolicyNetwork,
-        processor: Processor,
-        *,
-        false_positive_prob: float = 0.0,
-        augmentation: DemonstrationAugmentation = NO_AUGMENTATION,
+        self, network: PolicyNetwork, processor: Processor, augmentation: AugmentationConfig
     ) -> None:
         super().__init__()
         self.network = network
@@ -120,19 +110,19 @@ class PolicyLearner(Learner):
         self.input_kind = processor.input_kind
         self.score = network.score
         self.features: torch.Tensor | None = None  # of all images, if their encoder is frozen
-        self._false_positive_prob, self._augmentation = false_positive_prob, augmentation
+        self._augmentation = augmentation
 
     def collator(self) -> "PolicyCollate":
         """Return a `PolicyCollate`."""
-        with_images = self.features is None
+        augmentation = self._augmentation
         return PolicyCollate(
             self.processor,
-            self._false_positive_prob,
-            with_images=with_images,
-            augmentation=self._augmentation,
+            augmentation.false_positive_prob,
+            with_images=self.features is None,
+            augmentation=augmentation,
         )
 
-    def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def forward(self, batch: Batch) -> LossAndMetrics:
         """Return the loss of the action head, and its metrics."""
         network, features = self.network, self.features
         if (images := batch.images) is not None:
@@ -143,11 +133,9 @@ class PolicyLearner(Learner):
         prompt = network.encode_prompt(batch.prompts, features)
         return network.loss(prompt, batch.history, features, batch.targets)
 
-    def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
+    def write(self, folder: Path) -> None:
         """Write a checkpoint that `load_policy` takes."""
-        prefix = "network."
-        own = {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
-        write_checkpoint(self.network, folder, self.processor.tokenizer, weights=own)
+        write_checkpoint(self.network, folder, self.processor.tokenizer)
 
     def read(self, folder: Path) -> None:
         """Load the weights of a checkpoint, which must have the same vocabulary."""
@@ -170,6 +158,10 @@ class PolicyLearner(Learner):
         return {**sizes, "vocabulary": {"words": len(words.words), "digest": words.digest()}}
 
 
+_UNCHANGED = AugmentationConfig()
+
+
+@dataclass(frozen=True, slots=True)
 class PolicyCollate:
     """Makes batches for a policy of this package.
 
@@ -178,20 +170,15 @@ class PolicyCollate:
         false_positive_prob: Probability that a view of a step contains a false detection.
         with_images: Add the images in use to the batch, each once. Otherwise indices count through the
             images of all demonstrations.
-        augmentation: Transforms of demonstrations; not in validation, unless all are inverse dynamics.
+        augmentation: How demonstrations are augmented, by default not at all; not in validation, unless all
+            are inverse dynamics.
     """
 
-    def __init__(
-        self,
-        processor: Processor,
-        false_positive_prob: float,
-        *,
-        with_images: bool,
-        augmentation: DemonstrationAugmentation = NO_AUGMENTATION,
-    ) -> None:
-        self._processor = processor
-        self._probability, self._with_images = false_positive_prob, with_images
-        self._augmentation = augmentation
+    processor: Processor
+    false_positive_prob: float
+    _: KW_ONLY
+    with_images: bool
+    augmentation: AugmentationConfig = _UNCHANGED
 
     def __call__(
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
@@ -201,25 +188,26 @@ class PolicyCollate:
             each for example in examples for each in (example.other, example.definer) if each is not None
         ]
         shown = [*examples, *added]
-        first_images = None if self._with_images else [example.base for example in shown]
+        first_images = None if self.with_images else [example.base for example in shown]
         numbered = number_images([example.episode for example in shown], first_images)
         others = iter(numbered[len(examples) :])
         episodes = [
-            self._augmentation(
+            augment(
                 episode,
+                self.augmentation,
                 rng,
-                None if example.other is None else next(others),
-                None if example.definer is None else next(others),
+                other=None if example.other is None else next(others),
+                definer=None if example.definer is None else next(others),
                 keeps_prompt=example.keeps_prompt,
             )
             for example, episode, rng in zip(examples, numbered, rngs or [None] * len(examples), strict=False)
         ]
-        batch = self._processor.collate(episodes)
+        batch = self.processor.collate(episodes)
         if rngs is not None:
             batch = add_false_positives(
-                batch, self._processor.layout, probability=self._probability, rngs=rngs
+                batch, self.processor.layout, probability=self.false_positive_prob, rngs=rngs
             )
-        return batch.with_images([episode.images for episode in numbered]) if self._with_images else batch
+        return batch.with_images([episode.images for episode in numbered]) if self.with_images else batch
 
 
 def make_learner(name: str) -> Learner:

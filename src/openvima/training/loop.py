@@ -250,34 +250,29 @@ class Trainer:
             self._on_report(self._done(), sum(stage.num_steps for stage in self._stages), note)
 
     def _run_stage(self, stage: Stage, num_steps: int) -> None:
+        """Take the remaining steps of a stage; after a SIGTERM write a checkpoint and stop."""
         optimizer = _optimizer(self.learner, stage, self.config.optimizer.weight_decay)
         if self.progress.step:
             load_named_state(self.learner, optimizer, self.run.optimizer_state())
         self._last = (self.progress.step, time.monotonic())
-        came: list[int] = []
-        with exchange_sigterm(_raise_terminated, lambda number, frame: came.append(number)):
-            self._take_steps(stage, optimizer, num_steps, came)
-
-    def _take_steps(
-        self, stage: Stage, optimizer: torch.optim.Optimizer, num_steps: int, sigterms: Sequence[int]
-    ) -> None:
-        """Take the remaining steps of a stage; after a SIGTERM write a checkpoint and stop."""
-        window: list[Metrics] = []
-        for step in range(self.progress.step, num_steps):
-            window.append(self._step(stage, optimizer, step, num_steps))
-            self.progress = replace(self.progress, step=step + 1)
-            saves = self._saves_at(step + 1) or step + 1 == num_steps
-            logs = saves or (step + 1) % LOG_EVERY == 0
-            # Several processes stop after the same step, and so ask each other, when they log anyway.
-            may_end = logs or self.parallel.num_ranks == 1
-            ends = may_end and self.parallel.mean({"ends": float(bool(sigterms))})["ends"] > 0
-            if logs or ends:
-                self._log(stage, self.parallel.mean(_mean(window)))
-                window = []
-            if saves or ends:
-                self._save(stage, optimizer, validates=saves)
-            if ends:
-                raise Terminated
+        sigterms: list[int] = []
+        with exchange_sigterm(_raise_terminated, lambda number, frame: sigterms.append(number)):
+            window: list[Metrics] = []
+            for step in range(self.progress.step, num_steps):
+                window.append(self._step(stage, optimizer, step, num_steps))
+                self.progress = replace(self.progress, step=step + 1)
+                saves = self._saves_at(step + 1) or step + 1 == num_steps
+                logs = saves or (step + 1) % LOG_EVERY == 0
+                # Several processes stop after the same step, and so ask each other, when they log anyway.
+                may_end = logs or self.parallel.num_ranks == 1
+                ends = may_end and self.parallel.mean({"ends": float(bool(sigterms))})["ends"] > 0
+                if logs or ends:
+                    self._log(stage, self.parallel.mean(_mean(window)))
+                    window = []
+                if saves or ends:
+                    self._save(stage, optimizer, validates=saves)
+                if ends:
+                    raise Terminated
 
     def _saves_at(self, step: int) -> bool:
         """Whether a checkpoint is due."""
@@ -412,8 +407,6 @@ def _format(metrics: Metrics) -> str:
 
 def _mean(window: Sequence[Metrics]) -> Metrics:
     """Average each metric over the steps that have it."""
-    values: dict[str, list[float]] = {}
-    for metrics in window:
-        for name, value in metrics.items():
-            values.setdefault(name, []).append(value)
+    names = dict.fromkeys(name for metrics in window for name in metrics)
+    values = {name: [metrics[name] for metrics in window if name in metrics] for name in names}
     return {name: sum(found) / len(found) for name, found in values.items()}

@@ -201,11 +201,7 @@ class _Stages:
     def _examples(self) -> tuple[ExampleSource, ExampleSource]:
         """Demonstrations to train on, and held-out ones."""
         loader = self.config.loader
-        training, validation = split_examples(
-            self._caches[0][0],
-            validation_fraction=loader.validation_fraction,
-            validation_episodes=loader.validation_episodes,
-        )
+        training, validation = split_examples(self._caches[0][0], loader)
         return repeat_tasks(training, loader.repeats), validation
 
     @cached_property

@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from reprlib import repr as short
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin
 
 from openvima.errors import ConfigError, InputFileError, unknown_name
 from openvima.input_files import read_yaml
+from openvima.policies.config_fields import options_of
 from openvima.policies.presets import PRESETS
-from openvima.training.config import TrainingConfig
-from openvima.training.validation import convert, flatten, setting_types
+from openvima.training.config import TrainingConfig, flatten, setting_types
 
 # VIMA, Jiang et al. 2023, with what later re-implementations report where the paper is silent: AdamW without
 # decay, the rate falls to its end within the first half of the run.
@@ -219,7 +219,16 @@ def read_settings(file: Path, *, trust_code: bool = False) -> dict[str, Any]:
             f"{file} names code to run: {', '.join(code)}. Nothing was executed. If you trust the file, add "
             "--trust-code."
         )
-    return {name: convert(value, known[name]) for name, value in values.items()}
+    return {name: _number(value, known[name]) for name, value in values.items()}
+
+
+def _number(value: Any, hint: Any) -> Any:
+    """Convert text to a number where a setting is one: YAML reads 1e-4, without a point, as text."""
+    kinds = {get_args(each)[0] if get_origin(each) is Annotated else each for each in options_of(hint)}
+    try:
+        return float(value) if isinstance(value, str) and float in kinds else value
+    except ValueError:  # reported by `problems_of`
+        return value
 
 
 def _is_code(value: object) -> bool:

@@ -47,9 +47,9 @@ from openvima.policies.naming import (
     checkpoint_order,
 )
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
+from openvima.training.config import flatten
 from openvima.training.learner import Learner
 from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER
-from openvima.training.validation import flatten
 
 TIMINGS_FILE = "timings_log.jsonl"
 SESSIONS_FILE = "sessions_log.jsonl"
@@ -142,7 +142,7 @@ class RunFolder:
         shutil.rmtree(partial, ignore_errors=True)
         with naming(final, partial):
             partial.mkdir()
-            learner.write(partial, learner.state_dict())
+            learner.write(partial)
             tensors = {
                 f"{parameter}|{name}": tensor.detach().cpu().contiguous()
                 for parameter, values in optimizer.items()
@@ -150,7 +150,9 @@ class RunFolder:
             }
             write_safetensors(tensors, partial / OPTIMIZER_FILE)
             atomic_write_file(partial / STATE_FILE, json.dumps(asdict(progress)))
-            self._sync(partial)
+            sync_files(partial)  # as well as the metrics of the steps before it
+            if (self.path / METRICS_FILE).exists():
+                sync_file(self.path / METRICS_FILE)
             shutil.rmtree(final, ignore_errors=True)
             partial.rename(final)
             sync_folder(self.checkpoints)
@@ -166,20 +168,24 @@ class RunFolder:
             InputFileError: The checkpoint is damaged or does not fit.
         """
         checkpoint = self.latest()
-        progress = _read_progress(checkpoint) if checkpoint else Progress()
-        if checkpoint:
-            learner.read(checkpoint)
+        if checkpoint is None:
+            return Progress()
+        file = checkpoint / STATE_FILE
+        try:
+            progress = Progress(**read_json(file))
+        except (OSError, ValueError, TypeError) as error:
+            raise InputFileError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
+        learner.read(checkpoint)
         return progress
 
     def optimizer_state(self) -> dict[str, dict[str, torch.Tensor]]:
         """Read the optimizer state of the last checkpoint, by name of the parameter.
 
         Raises:
-            InputFileError: There is none, or it is damaged.
+            InputFileError: It is damaged.
         """
         checkpoint = self.latest()
-        if checkpoint is None:
-            raise InputFileError(f"{self.checkpoints} holds no checkpoint to resume from.")
+        assert checkpoint is not None  # it says how many steps are done
         state: dict[str, dict[str, torch.Tensor]] = {}
         for key, tensor in read_safetensors(checkpoint / OPTIMIZER_FILE).items():
             parameter, _, name = key.partition("|")
@@ -207,20 +213,15 @@ class RunFolder:
         ]
         atomic_write_file(file, "".join(kept))
 
-    def _sync(self, checkpoint: Path) -> None:
-        """Wait until a checkpoint and the metrics of the steps before it are on the disk."""
-        sync_files(checkpoint)
-        if (self.path / METRICS_FILE).exists():
-            sync_file(self.path / METRICS_FILE)
-
     def _settle(self, progress: Progress) -> None:
         """Name the best checkpoint, and delete those that are neither it, the last nor permanent."""
         if progress.best_checkpoint:
             atomic_write_file(self.checkpoints / BEST_FILE, progress.best_checkpoint)
-        last = self.latest()
-        for other in self.checkpoints.iterdir():
-            is_used = other == last or other.name == progress.best_checkpoint or self._is_kept(other.name)
-            if other.is_dir() and not is_used:
+        kept, every = {self.latest(), self.checkpoints / progress.best_checkpoint}, self._keep_every
+        for other in filter(Path.is_dir, self.checkpoints.iterdir()):
+            step = other.name.rpartition("-")[2]
+            is_permanent = every is not None and step.isdigit() and int(step) % every == 0
+            if not (is_permanent or other in kept):
                 shutil.rmtree(other)
 
     def _differences(self, settings: dict[str, Any]) -> list[str]:
@@ -242,18 +243,6 @@ class RunFolder:
             shutil.rmtree(folder, ignore_errors=True)
         for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
             (self.path / name).unlink(missing_ok=True)
-
-    def _is_kept(self, name: str) -> bool:
-        step = name.rpartition("-")[2]
-        return self._keep_every is not None and step.isdigit() and int(step) % self._keep_every == 0
-
-
-def _read_progress(checkpoint: Path) -> Progress:
-    file = checkpoint / STATE_FILE
-    try:
-        return Progress(**read_json(file))
-    except (OSError, ValueError, TypeError) as error:
-        raise InputFileError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
 
 
 def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -327,9 +316,6 @@ def git_state(folder: Path) -> dict[str, Any] | None:
     return {"commit": commit, "changed": bool(ask("status", "--porcelain", "--untracked-files=no"))}
 
 
-_TIMES = ("seconds_since_start", "cpu_seconds_since_start")
-
-
 def read_costs(run: Path) -> dict[str, Any]:
     """Return steps, time and CPU time of a run.
 
@@ -345,17 +331,15 @@ def read_costs(run: Path) -> dict[str, Any]:
     steps: dict[str, int] = {}
     for record in _records(run / METRICS_FILE):
         steps[record["name"]] = max(record["step"], steps.get(record["name"], 0))
-    totals, last = dict.fromkeys(_TIMES, 0.0), dict.fromkeys(_TIMES, 0.0)
+    seconds, cpu_seconds, last = 0.0, 0.0, (0.0, 0.0)
     for record in _records(run / TIMINGS_FILE):
-        is_new = record[_TIMES[0]] < last[_TIMES[0]]  # a session begins at 0
-        for name in _TIMES:
-            totals[name] += record[name] - (0.0 if is_new else last[name])
-            last[name] = record[name]
-    return {
-        "steps": steps,
-        "seconds": round(totals[_TIMES[0]], 1),
-        "cpu_seconds": round(totals[_TIMES[1]], 1),
-    }
+        now = (record["seconds_since_start"], record["cpu_seconds_since_start"])
+        if now[0] < last[0]:  # a session begins at 0
+            last = (0.0, 0.0)
+        seconds += now[0] - last[0]
+        cpu_seconds += now[1] - last[1]
+        last = now
+    return {"steps": steps, "seconds": round(seconds, 1), "cpu_seconds": round(cpu_seconds, 1)}
 
 
 def _records(file: Path) -> list[dict[str, Any]]:

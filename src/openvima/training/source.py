@@ -1,6 +1,6 @@
 """The demonstrations of a run before its first step: opened, checked, and split for validation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.training.batches import BatchOrder, ExampleSource
 from openvima.training.config import LoaderConfig
+from openvima.training.parallel import Parallel
 from openvima.training.run_folder import held_out_demonstrations
 
 _PRIOR_DEMONSTRATIONS = 10_000  # enough for the marginals of 100 bins
@@ -75,17 +76,14 @@ def check_scenes(dataset: Dataset) -> None:
             raise DatasetError(UNKNOWN_SCENES.format(f"shard {name}"))
 
 
-def split_examples(
-    cache: ObjectCache, *, validation_fraction: float, validation_episodes: int
-) -> tuple[ExampleSource, ExampleSource]:
+def split_examples(cache: ObjectCache, loader: LoaderConfig) -> tuple[ExampleSource, ExampleSource]:
     """Split demonstrations into training and validation.
 
     The split follows from task and seed, so that it stays the same when data are added.
 
     Args:
         cache: All demonstrations.
-        validation_fraction: Fraction to hold out.
-        validation_episodes: Maximum number of them.
+        loader: Which fraction to hold out, and how many at most.
 
     Raises:
         DatasetError: There is none to train on.
@@ -94,15 +92,13 @@ def split_examples(
     counts = cache.image_counts()
     bases = np.cumsum(counts) - counts
     lengths = cache.lengths()
-    training, kept = (
-        np.flatnonzero(hashes >= validation_fraction),
-        np.flatnonzero(hashes < validation_fraction),
-    )
+    training = np.flatnonzero(hashes >= loader.validation_fraction)
+    kept = np.flatnonzero(hashes < loader.validation_fraction)
     if not len(training):
         raise DatasetError(
             "there is no demonstration to train on; generate some, or lower loader.validation_fraction."
         )
-    kept = np.sort(kept[np.argsort(hashes[kept], kind="stable")[:validation_episodes]])
+    kept = np.sort(kept[np.argsort(hashes[kept], kind="stable")[: loader.validation_episodes]])
     first, second = (ExampleSource(cache, rows, bases, lengths[rows]) for rows in (training, kept))
     return first, second
 
@@ -112,17 +108,6 @@ def repeat_tasks(source: ExampleSource, repeats: Mapping[str, int]) -> ExampleSo
     counts = [repeats.get(task, 1) for task in _tasks_of(source)]
     rows, lengths = np.repeat(source.rows, counts), np.repeat(source.lengths, counts, axis=0)
     return replace(source, rows=rows, lengths=lengths)
-
-
-def show_first(order: BatchOrder, source: ExampleSource, tasks: Sequence[str], steps: int) -> BatchOrder:
-    """Let the first batches show the demonstrations of some tasks alone, if there are these and others."""
-    is_first = np.isin(_tasks_of(source), tasks)
-    if is_first.all() or not is_first.any():
-        return order
-    # Those that are repeated are taken once.
-    places = np.flatnonzero(is_first)
-    places = places[np.unique(source.rows[places], return_index=True)[1]]
-    return replace(order, first_batches=steps, first_episodes=places)
 
 
 def find_definers(source: ExampleSource) -> list[int]:
@@ -157,26 +142,36 @@ def read_actions(source: ExampleSource) -> torch.Tensor:
     return torch.from_numpy(np.concatenate([source[row].episode.actions for row in rows]))
 
 
-def make_order(
-    source: ExampleSource, *, batch_size: int, seed: int, bucket: int, rank: int, num_ranks: int
-) -> BatchOrder:
+def make_order(source: ExampleSource, loader: LoaderConfig, seed: int, parallel: Parallel) -> BatchOrder:
     """Return the order of demonstrations; a batch is at most as large as the data.
 
     Raises:
         ConfigError: The processes cannot share the demonstrations, or a batch of them, equally.
     """
+    num_ranks = parallel.num_ranks
     if len(source) < num_ranks:
         raise ConfigError(
             f"there are {len(source)} demonstrations to train on and {num_ranks} processes; start fewer of "
             "these, or generate more."
         )
-    batch_size = min(batch_size, len(source) // num_ranks * num_ranks)
-    return BatchOrder(
+    order = BatchOrder(
         len(source),
-        batch_size=batch_size,
+        batch_size=min(loader.batch_size, len(source) // num_ranks * num_ranks),
         seed=seed,
-        lengths=source.lengths if bucket else None,
-        bucket=max(1, bucket),
-        rank=rank,
+        lengths=source.lengths if loader.bucket_batches else None,
+        bucket=max(1, loader.bucket_batches),
+        rank=parallel.rank,
         num_ranks=num_ranks,
     )
+    return _show_first(order, source, loader) if loader.first_steps else order
+
+
+def _show_first(order: BatchOrder, source: ExampleSource, loader: LoaderConfig) -> BatchOrder:
+    """Let the first batches show the demonstrations of some tasks alone, if there are these and others."""
+    is_first = np.isin(_tasks_of(source), loader.early_tasks)
+    if is_first.all() or not is_first.any():
+        return order
+    # Those that are repeated are taken once.
+    places = np.flatnonzero(is_first)
+    places = places[np.unique(source.rows[places], return_index=True)[1]]
+    return replace(order, first_batches=loader.first_steps, first_episodes=places)

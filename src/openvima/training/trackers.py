@@ -5,7 +5,7 @@ import secrets
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from openvima.atomic_io import atomic_write_file
 from openvima.imports import import_extra
@@ -18,42 +18,7 @@ WANDB_FOLDER = "wandb_log"
 _ID_FILE = "id.txt"
 
 
-class Tracker(Protocol):
-    """Where metrics and animations of a run are logged; steps are counted through all stages."""
-
-    def add(self, prefix: str, values: Mapping[str, float], step: int) -> None:
-        """Log named numbers."""
-        ...
-
-    def add_animations(self, prefix: str, animations: Sequence[Animation], step: int) -> None:
-        """Log rollouts, each with the picture of its prompt."""
-        ...
-
-    def close(self) -> None:
-        """Write what is left."""
-        ...
-
-
-def open_trackers(config: RunConfig, run: Path, first: int) -> list[Tracker]:
-    """Open the trackers that the settings ask for.
-
-    Args:
-        config: Settings of the run.
-        run: The run folder.
-        first: First step of this session; TensorBoard's later events are purged.
-
-    Raises:
-        MissingExtraError: `wandb` is asked for and not installed. TensorBoard is then left out.
-    """
-    trackers: list[Tracker] = []
-    if config.runtime.wandb:
-        trackers.append(WandbTracker(run, config.runtime.wandb, config.identity()))
-    if config.runtime.tensorboard and find_spec("tensorboard") is not None:
-        trackers.append(TensorBoardTracker(run, first))
-    return trackers
-
-
-class TensorBoardTracker(Tracker):
+class TensorBoardTracker:
     """Writes TensorBoard events to `RUN/tensorboard_log`.
 
     Args:
@@ -90,7 +55,7 @@ class TensorBoardTracker(Tracker):
         self._writer.close()
 
 
-class WandbTracker(Tracker):
+class WandbTracker:
     """Logs to a project of Weights & Biases, whose variables, such as WANDB_MODE=offline, apply.
 
     A resumed run continues the same run there.
@@ -138,3 +103,26 @@ class WandbTracker(Tracker):
     def close(self) -> None:
         """Upload or write what is left."""
         self._session.finish()
+
+
+Tracker: TypeAlias = TensorBoardTracker | WandbTracker
+"""Where metrics and animations of a run are logged; steps are counted through all stages."""
+
+
+def open_trackers(config: RunConfig, run: Path, first: int) -> list[Tracker]:
+    """Open the trackers that the settings ask for.
+
+    Args:
+        config: Settings of the run.
+        run: The run folder.
+        first: First step of this session; TensorBoard's later events are purged.
+
+    Raises:
+        MissingExtraError: `wandb` is asked for and not installed. TensorBoard is then left out.
+    """
+    trackers: list[Tracker] = []
+    if config.runtime.wandb:
+        trackers.append(WandbTracker(run, config.runtime.wandb, config.identity()))
+    if config.runtime.tensorboard and find_spec("tensorboard") is not None:
+        trackers.append(TensorBoardTracker(run, first))
+    return trackers

@@ -10,7 +10,7 @@ import torch
 from torch.nn import functional as F
 
 from openvima.render.rasteriser import FLOOR_RGB, SHEET_RGB
-from openvima.training.pretraining.pairs import Pairs, SecondView
+from openvima.training.pretraining.pairs import SECOND_VIEW, Pairs
 
 
 def with_horizontal_flips(pairs: Pairs, generator: torch.Generator) -> Pairs:
@@ -18,23 +18,16 @@ def with_horizontal_flips(pairs: Pairs, generator: torch.Generator) -> Pairs:
 
     Both cameras look at the table from its middle, so that mirrored images are images of mirrored objects.
     """
-    view = pairs.second_view
-    assert view is not None, "only pairs with a second view are flipped"
+    assert pairs.rotations is not None, "only pairs with a second view are flipped"
     is_flipped = (torch.rand(len(pairs.scenes), generator=generator) < 0.5).to(pairs.scenes.device)
-
-    def flip(crops: torch.Tensor) -> torch.Tensor:
-        return torch.where(is_flipped[:, None, None, None, None], crops.flip(-1), crops)
-
-    rotations = torch.where(is_flipped[:, None], -view.rotations, view.rotations)
     return replace(
         pairs,
-        prompt_crops=flip(pairs.prompt_crops),
-        scene_crops=flip(pairs.scene_crops),
-        second_view=SecondView(flip(view.crops), view.masks, rotations),
+        crops=torch.where(is_flipped.view(-1, 1, 1, 1, 1, 1), pairs.crops.flip(-1), pairs.crops),
+        rotations=torch.where(is_flipped[:, None], -pairs.rotations, pairs.rotations),
     )
 
 
-_PROMPT_BACKGROUND, _SCENE_BACKGROUND = FLOOR_RGB[0], SHEET_RGB[0]  # both are gray
+_BACKGROUNDS = (FLOOR_RGB[0], SHEET_RGB[0], SHEET_RGB[0])  # of each image; all are gray
 _NUM_BARS, _NUM_BRACES = (3, 8), (0, 3)  # bars across a crop, and visible strips that cross them
 _BAR_WIDTH = (0.2, 0.6)  # fraction of the distance between bars
 _MARGIN = (0.03, 0.2)  # from the border of a crop to the bars
@@ -55,25 +48,17 @@ def with_occlusion(pairs: Pairs, prob: float, generator: torch.Generator) -> Pai
         prob: Probability for each object.
         generator: Source of the draws.
     """
-    count, device = len(pairs.scenes), pairs.scene_crops.device
-    drawn_KD = torch.rand(count, 6, generator=generator)
+    device, rotations = pairs.crops.device, pairs.rotations
+    drawn_KD = torch.rand(len(pairs.scenes), 6, generator=generator)
     is_chosen_K = drawn_KD[:, 0] < prob
-
-    def occlude(crops: torch.Tensor, background: int) -> torch.Tensor:
-        crops = crops.float()
-        is_occluded = _bars(drawn_KD, crops.shape[-1], generator) & is_chosen_K[:, None, None]
-        return crops.masked_fill(is_occluded[:, None, None].to(device), background)
-
-    view = pairs.second_view
-    if view:
-        rotations = view.rotations.masked_fill(is_chosen_K[:, None].to(device), math.nan)
-        view = SecondView(occlude(view.crops, _SCENE_BACKGROUND), view.masks, rotations)
-    return replace(
-        pairs,
-        prompt_crops=occlude(pairs.prompt_crops, _PROMPT_BACKGROUND),
-        scene_crops=occlude(pairs.scene_crops, _SCENE_BACKGROUND),
-        second_view=view,
-    )
+    images = list(pairs.crops.float().unbind(1))
+    for number in (*range(SECOND_VIEW, len(images)), 0, 1):  # the order of the draws
+        is_occluded = _bars(drawn_KD, images[number].shape[-1], generator) & is_chosen_K[:, None, None]
+        is_occluded = is_occluded[:, None, None].to(device)
+        images[number] = images[number].masked_fill(is_occluded, _BACKGROUNDS[number])
+    if rotations is not None:
+        rotations = rotations.masked_fill(is_chosen_K[:, None].to(device), math.nan)
+    return replace(pairs, crops=torch.stack(images, dim=1), rotations=rotations)
 
 
 def _bars(drawn_KD: torch.Tensor, size: int, generator: torch.Generator) -> torch.Tensor:
@@ -110,17 +95,8 @@ def with_box_jitter(pairs: Pairs, pixels: float, generator: torch.Generator) -> 
         pixels: Largest shift of a crop, and half of the largest change of its size, in its own pixels.
         generator: Source of the draws.
     """
-    view = pairs.second_view
-    return replace(
-        pairs,
-        prompt_crops=_jitter(pairs.prompt_crops, pixels, generator),
-        scene_crops=_jitter(pairs.scene_crops, pixels, generator),
-        second_view=replace(view, crops=_jitter(view.crops, pixels, generator)) if view else None,
-    )
-
-
-def _jitter(crops: torch.Tensor, pixels: float, generator: torch.Generator) -> torch.Tensor:
-    flat = crops.flatten(0, -4).float()
+    by_image = pairs.crops.transpose(0, 1)  # the order of the draws
+    flat = by_image.flatten(0, 2).float()
     draws = (2 * torch.rand(len(flat), 3, generator=generator) - 1).to(flat.device)
     draws *= 2 * pixels / _CROP_PX  # the borders are at −1 and 1
     theta = flat.new_zeros(len(flat), 2, 3)
@@ -128,7 +104,7 @@ def _jitter(crops: torch.Tensor, pixels: float, generator: torch.Generator) -> t
     theta[:, :, 2] = draws[:, 1:]
     grid = F.affine_grid(theta, list(flat.shape), align_corners=False)
     sampled = F.grid_sample(flat, grid, padding_mode="border", align_corners=False)
-    return sampled.unflatten(0, crops.shape[:-3])
+    return replace(pairs, crops=sampled.unflatten(0, by_image.shape[:3]).transpose(0, 1))
 
 
 def draw_channel_mixing(generator: torch.Generator) -> torch.Tensor:

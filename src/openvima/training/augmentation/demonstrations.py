@@ -3,10 +3,10 @@
 Shape suffixes: B batch, T steps, V views, N objects in view (slots of a view).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import Literal, TypeAlias
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Literal
 
 import numpy as np
 import torch
@@ -46,8 +46,6 @@ def drop_unused_objects(
         rng: Draws the objects.
         prob: Probability of the first for each unused object, and of the second for each that is left.
     """
-    if not prob:
-        return episode
     ids = np.setdiff1d(episode.objects.ids, [episode.pick_ids, episode.place_ids])
     is_unobserved, is_unprompted = rng.random((2, len(ids))) < prob
     prompt = episode.prompt
@@ -133,103 +131,58 @@ def centre_picks(episode: PreprocessedEpisode) -> PreprocessedEpisode:
     return replace(episode, actions=actions)
 
 
-Transform: TypeAlias = Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
-
-
-@dataclass(frozen=True, slots=True)
-class Randomly:
-    """Augments a fraction of the demonstrations.
-
-    Args:
-        prob: Probability per demonstration.
-        augment: What happens to these.
-    """
-
-    prob: float
-    augment: Transform
-
-    def __call__(self, episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
-        """Augment a demonstration, or leave it as it is."""
-        return self.augment(episode, rng) if self.prob and rng.random() < self.prob else episode
-
-
-@dataclass(frozen=True, slots=True)
-class DemonstrationAugmentation:
-    """Transforms of demonstrations, which have either an inverse-dynamics prompt or that of their task.
+def augment(
+    episode: PreprocessedEpisode,
+    config: AugmentationConfig,
+    rng: np.random.Generator | None,
+    *,
+    other: PreprocessedEpisode | None = None,
+    definer: PreprocessedEpisode | None = None,
+    keeps_prompt: bool = False,
+) -> PreprocessedEpisode:
+    """Augment a demonstration, which then has an inverse-dynamics prompt or that of its task.
 
     Args:
-        inverse_dynamics_prob: Probability of the inverse-dynamics prompt.
-        centres_picks: Whether picks are moved, see `centre_picks`.
-        of_inverse_dynamics: Transforms of demonstrations with that prompt.
-        of_tasks: Transforms of those with the prompt of their task, after distractors were inserted.
+        episode: The demonstration.
+        config: Probabilities of what happens to it.
+        rng: Source of all draws; None, as in validation: only what is certain happens.
+        other: A demonstration from which distractors are inserted; None inserts none.
+        definer: One from whose prompt unused definitions are inserted; None inserts none.
+        keeps_prompt: Whether no draw exchanges the prompt for that of inverse dynamics.
     """
-
-    inverse_dynamics_prob: float = 0.0
-    centres_picks: bool = False
-    of_inverse_dynamics: tuple[Transform, ...] = ()
-    of_tasks: tuple[Transform, ...] = ()
-
-    def __call__(
-        self,
-        episode: PreprocessedEpisode,
-        rng: np.random.Generator | None,
-        other: PreprocessedEpisode | None = None,
-        definer: PreprocessedEpisode | None = None,
-        *,
-        keeps_prompt: bool = False,
-    ) -> PreprocessedEpisode:
-        """Augment a demonstration; without a generator, as in validation, only what is certain happens.
-
-        Args:
-            episode: The demonstration.
-            rng: Source of all draws.
-            other: A demonstration from which distractors are inserted; None inserts none.
-            definer: One from whose prompt unused definitions are inserted; None inserts none.
-            keeps_prompt: Whether no draw exchanges the prompt for that of inverse dynamics.
-        """
-        if self.centres_picks:
-            episode = centre_picks(episode)
-        prob = self.inverse_dynamics_prob
-        is_drawn = rng is not None and prob > 0 and rng.random() < prob and not keeps_prompt
-        is_inverse = prob == 1 or is_drawn
-        if is_inverse:
-            episode = with_motion_prompt(episode)
-        elif rng is not None and other is not None:
-            episode = with_distractors(episode, other, rng)
-        if rng is not None:
-            for transform in self.of_inverse_dynamics if is_inverse else self.of_tasks:
-                episode = transform(episode, rng)
-            if definer is not None and not is_inverse:
-                episode = with_unused_definitions(episode, definer, rng)
+    if config.centre_picks:
+        episode = centre_picks(episode)
+    prob = config.inverse_dynamics_prob
+    is_drawn = rng is not None and prob > 0 and rng.random() < prob and not keeps_prompt
+    is_inverse = prob == 1 or is_drawn
+    if is_inverse:
+        episode = with_motion_prompt(episode)
+    if rng is None:
         return episode
-
-
-NO_AUGMENTATION = DemonstrationAugmentation()
-
-
-def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugmentation:
-    """Return the transforms that the settings ask for."""
-    shuffle = Randomly(config.shuffle_prompt_objects_prob, shuffle_prompt_objects)
-    return DemonstrationAugmentation(
-        config.inverse_dynamics_prob,
-        config.centre_picks,
-        of_inverse_dynamics=(partial(drop_unused_objects, prob=config.drop_unused_objects_prob), shuffle),
-        of_tasks=(
-            Randomly(config.paraphrase_prob, paraphrase),  # before others change the text
-            Randomly(config.rename_objects_prob, rename_objects),
-            Randomly(config.turn_comparisons_prob, turn_comparisons),
-            Randomly(config.shuffle_sentences_prob, shuffle_sentences),
-            # after those that look for images
-            partial(
-                describe_objects,
-                image_prob=config.text_description_prob,
-                synonym_prob=config.synonym_prob,
-                prompt_prob=config.text_prompt_prob,
-            ),
-            partial(mask_words, prob=config.unknown_word_prob),
-            shuffle,
-        ),
-    )
+    if is_inverse:
+        if config.drop_unused_objects_prob:
+            episode = drop_unused_objects(episode, rng, prob=config.drop_unused_objects_prob)
+    else:
+        if other is not None:
+            episode = with_distractors(episode, other, rng)
+        for prob, change in (
+            (config.paraphrase_prob, paraphrase),  # before others change the text
+            (config.rename_objects_prob, rename_objects),
+            (config.turn_comparisons_prob, turn_comparisons),
+            (config.shuffle_sentences_prob, shuffle_sentences),
+        ):
+            if prob and rng.random() < prob:
+                episode = change(episode, rng)
+        if config.describes_objects:  # after those that look for images
+            episode = describe_objects(episode, rng, config)
+        if config.unknown_word_prob:
+            episode = mask_words(episode, rng, prob=config.unknown_word_prob)
+    prob = config.shuffle_prompt_objects_prob
+    if prob and rng.random() < prob:
+        episode = shuffle_prompt_objects(episode, rng)
+    if definer is not None and not is_inverse:
+        episode = with_unused_definitions(episode, definer, rng)
+    return episode
 
 
 NUM_VIEWS = len(VIEWS)

@@ -22,6 +22,7 @@ from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 from openvima.tasks.prompts import rephrase, synonyms, training_paraphrases, with_phrases
 from openvima.tasks.registry import task_spec
 from openvima.tasks.sweep_table import NUMBER_WORDS
+from openvima.training.config import AugmentationConfig
 
 DEFINITION = "This is a {noun} {image}."  # as in `novel_noun`
 
@@ -214,12 +215,7 @@ _FORMS = "all {x}. {x}. is a zup {x}"  # plural, articles and colon, which descr
 
 
 def describe_objects(
-    episode: PreprocessedEpisode,
-    rng: np.random.Generator,
-    *,
-    image_prob: float,
-    synonym_prob: float = 0.0,
-    prompt_prob: float = 0.0,
+    episode: PreprocessedEpisode, rng: np.random.Generator, config: AugmentationConfig
 ) -> PreprocessedEpisode:
     """Replace object images of a task prompt by texture and name of the object.
 
@@ -228,15 +224,12 @@ def describe_objects(
     Args:
         episode: The demonstration.
         rng: Draws the images.
-        image_prob: Probability for each image.
-        synonym_prob: Probability that a description names the object by an alias of the catalogue.
-        prompt_prob: Probability for each demonstration that all its images are replaced.
+        config: `text_description_prob`, `text_prompt_prob` and `synonym_prob` count.
     """
-    if not (image_prob or prompt_prob):
-        return episode
-    prob = 1.0 if prompt_prob and rng.random() < prompt_prob else image_prob
-    if synonym_prob:
-        episode = with_synonyms(episode, synonym_prob, rng)
+    prompt_prob = config.text_prompt_prob
+    prob = 1.0 if prompt_prob and rng.random() < prompt_prob else config.text_description_prob
+    if config.synonym_prob:
+        episode = with_synonyms(episode, config.synonym_prob, rng)
     return with_descriptions(episode, prob, rng)
 
 
@@ -289,8 +282,6 @@ def mask_words(episode: PreprocessedEpisode, rng: np.random.Generator, *, prob: 
         rng: Draws the words.
         prob: Probability for each word.
     """
-    if not prob:
-        return episode
 
     def mask(found: re.Match[str]) -> str:
         is_word = found[0][0] != "{"

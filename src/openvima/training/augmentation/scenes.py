@@ -66,22 +66,20 @@ def _with_random_shape(
     is_container = placement.object in _CONTAINERS
     if not is_container and placement.object not in _MOVABLE:
         return placement
-    name = random_name(_container_kind(settings, rng) if is_container else _movable_kind(settings, rng), rng)
+    name = random_name(_random_kind(is_container=is_container, settings=settings, rng=rng), rng)
     if common is not None and is_container:
         name = common.setdefault(placement.object, name)
     return at_rest(replace(placement, object=name), assets)
 
 
-def _movable_kind(settings: PretrainingConfig, rng: np.random.Generator) -> str:
+def _random_kind(*, is_container: bool, settings: PretrainingConfig, rng: np.random.Generator) -> str:
+    if is_container:
+        if _draw(settings.grating_prob, rng):
+            return "grating"
+        return "eared container" if _draw(settings.eared_prob, rng) else "container"
     if not _draw(settings.ring_and_block_prob, rng):
         return "shape"
     return "ring" if rng.random() < 0.5 else "block"
-
-
-def _container_kind(settings: PretrainingConfig, rng: np.random.Generator) -> str:
-    if _draw(settings.grating_prob, rng):
-        return "grating"
-    return "eared container" if _draw(settings.eared_prob, rng) else "container"
 
 
 def _draw(prob: float, rng: np.random.Generator) -> bool:
@@ -122,7 +120,7 @@ def _near(pose: Pose, rng: np.random.Generator) -> tuple[float, float]:
 _KINDS = ("height", "shade", "texture", "shape")
 _STRETCH = (1.35, 2.2)  # ratio of heights
 _TRIES = 20
-_CLEARANCE_M = 0.12
+_CLEARANCE_M = {False: 0.12, True: 0.18}  # from movable and from fixed objects
 
 
 def with_hard_negatives(
@@ -191,18 +189,10 @@ def _free_position(placements: Sequence[Placement], rng: np.random.Generator) ->
     low, high = np.array(WORKSPACE_LOW) + EDGE_M, np.array(WORKSPACE_HIGH) - EDGE_M
     for _ in range(_TRIES):
         x, y = rng.uniform(low, high).tolist()
-        if all(math.hypot(x - p.pose.x, y - p.pose.y) >= _clearance(p) for p in placements):
+        distances = [math.hypot(x - p.pose.x, y - p.pose.y) for p in placements]
+        if all(d >= _CLEARANCE_M[p.fixed] for d, p in zip(distances, placements, strict=True)):
             return x, y
     return None
-
-
-def _clearance(placement: Placement) -> float:
-    return _CLEARANCE_M + (0.06 if placement.fixed else 0.0)
-
-
-def draw_grayscale(count: int, prob: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw which of some objects have a grayscale prompt image, shape (count,), bool."""
-    return rng.random(count) < prob
 
 
 def to_grayscale(placement: Placement) -> Placement:

@@ -8,8 +8,7 @@ from typing import Annotated
 from openvima.detector.config import DETECTORS
 from openvima.errors import unknown_name
 from openvima.policies.config_fields import Range
-from openvima.training.config import OptimizerConfig, RunConfig, ScheduleConfig
-from openvima.training.validation import Count, Probability
+from openvima.training.config import Count, OptimizerConfig, Probability, RunConfig, ScheduleConfig
 
 _OPTIMIZER = OptimizerConfig(max_grad_norm=5.0)
 _SCHEDULE = ScheduleConfig(steps=4200, warmup_steps=100, checkpoint_every=200)

@@ -1,7 +1,6 @@
 """Detector training: the split of the demonstrations, the learner, and the stage of the training loop."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from openvima.multiprocess import Report
 from openvima.policies.naming import WEIGHTS_FILE
 from openvima.training.batches import BatchOrder
 from openvima.training.detector.config import DetectorTrainingConfig
-from openvima.training.learner import Learner
+from openvima.training.learner import Learner, LossAndMetrics
 from openvima.training.loop import (
     Metrics,
     PlannedStage,
@@ -49,39 +48,6 @@ def split_episodes(dataset: Dataset, fraction: float) -> tuple[np.ndarray, np.nd
     return np.flatnonzero(hashes >= fraction), np.flatnonzero(hashes < fraction)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameBatch:
-    """Frames of one size.
-
-    Args:
-        images: Shape (B, 3, H, W), uint8.
-        objects: Those of each image.
-        generator: Samples the anchors and proposals of the losses.
-    """
-
-    images: torch.Tensor
-    objects: Sequence[Instances]
-    generator: torch.Generator
-
-    @staticmethod
-    def of(frames: Sequence[Frame], generator: torch.Generator) -> "FrameBatch":
-        """Stack frames into tensors."""
-        images = torch.from_numpy(np.stack([frame.rgb for frame in frames]))
-        objects = [
-            Instances(
-                torch.from_numpy(frame.boxes), torch.from_numpy(frame.masks), torch.ones(len(frame.boxes))
-            )
-            for frame in frames
-        ]
-        return FrameBatch(images, objects, generator)
-
-    def to(self, device: torch.device) -> "FrameBatch":
-        """Return the batch on another device; random numbers come from the CPU."""
-        return FrameBatch(
-            self.images.to(device), [objects.to(device) for objects in self.objects], self.generator
-        )
-
-
 class DetectorLearner(Learner):
     """A Mask R-CNN, trained on frames with known objects.
 
@@ -95,19 +61,28 @@ class DetectorLearner(Learner):
         self.network = network
         self._sampled = sampled
 
-    def forward(self, batch: FrameBatch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the sum of the losses, and each of them as "loss/NAME"."""
-        losses = self.network.losses(
-            batch.images, batch.objects, sampled=self._sampled, generator=batch.generator
-        )
+    def forward(self, batch: tuple[Sequence[Frame], torch.Generator]) -> LossAndMetrics:
+        """Return the sum of the losses, and each of them as "loss/NAME".
+
+        Args:
+            batch: Frames of one size, and what samples the anchors and proposals of the losses, on the CPU.
+        """
+        frames, generator = batch
+        device = next(self.parameters()).device
+        images = torch.from_numpy(np.stack([frame.rgb for frame in frames])).to(device)
+        objects = [
+            Instances(
+                torch.from_numpy(frame.boxes), torch.from_numpy(frame.masks), torch.ones(len(frame.boxes))
+            ).to(device)
+            for frame in frames
+        ]
+        losses = self.network.losses(images, objects, sampled=self._sampled, generator=generator)
         parts = {f"loss/{name}": value.detach() for name, value in losses.items()}
         return torch.stack(list(losses.values())).sum(), parts
 
-    def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
+    def write(self, folder: Path) -> None:
         """Write a checkpoint that `load_detector` takes."""
-        prefix = "network."
-        own = {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
-        write_network(self.network, folder, own)
+        write_network(self.network, folder)
 
     def read(self, folder: Path) -> None:
         """Load the weights of a checkpoint."""
@@ -219,7 +194,7 @@ class DetectorStage:
     ) -> torch.Tensor:
         """Add the weighted losses of some frames to sums, and return the weighted loss."""
         with self._parallel.autocast(self._config.runtime.precision):
-            loss, losses = self._learner(FrameBatch.of(frames, generator).to(self._parallel.device))
+            loss, losses = self._learner((frames, generator))
         for name, value in {"loss": loss, **losses}.items():
             sums[name] = sums.get(name, 0.0) + value.item() * weight
         return loss * weight

@@ -14,11 +14,11 @@ from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.pointer.words import Attributes
 from openvima.training.augmentation.crops import draw_channel_mixing
+from openvima.training.learner import LossAndMetrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
-from openvima.training.pretraining.pairs import AttributeLabels, Pairs
+from openvima.training.pretraining.pairs import PROMPT, SCENE, SECOND_VIEW, AttributeLabels, Pairs
 
 _CHUNK = 256  # pairs that are encoded at a time in validation
-LossAndMetrics = tuple[torch.Tensor, dict[str, torch.Tensor]]
 
 
 def contrastive_loss(
@@ -50,26 +50,22 @@ def contrastive_loss(
 
     Source: InfoNCE (van den Oord et al. 2018), symmetric as in CLIP.
     """
-    mixing = draw_channel_mixing(generator).to(pairs.scene_crops.device)
-    view = pairs.second_view
-    others = [] if view is None else [view]
-    crops = [pairs.prompt_crops, pairs.scene_crops, *(other.crops for other in others)]
-    features = _encode(encoder, torch.stack(crops), mixing, parallel)
-    seen = [pairs.prompt_masks, pairs.scene_masks, *(other.masks for other in others)]
-    masks = torch.stack(seen).transpose(1, 2)
+    mixing = draw_channel_mixing(generator).to(pairs.crops.device)
+    features = _encode(encoder, pairs.crops, mixing, parallel)
+    masks = pairs.masks.permute(1, 2, 0)
     prompt, scene, *second = encoder.embed_appearance(features, masks)
     loss, accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
     metrics = {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
-    if view is None:
+    if pairs.rotations is None:
         return loss, metrics
-    rows = view.masks.any(dim=1)
+    rows = pairs.masks[:, SECOND_VIEW].any(dim=1)
     is_same = pairs.appearances[rows, None] == pairs.appearances[None, rows]
     view_loss, accuracy = info_nce(second[0][rows], scene[rows], is_same, temperature=temperature)
     loss = (loss + view_loss) / 2
     metrics |= {"loss/second_view": view_loss.detach(), "second_view_accuracy": accuracy}
     if encoder.config.rotation_bins:
-        of_rotations = rotation_loss(encoder, features, masks, view.rotations)
-        is_correct = is_rotation_correct(encoder, features, masks, view.rotations)
+        of_rotations = rotation_loss(encoder, features, masks, pairs.rotations)
+        is_correct = is_rotation_correct(encoder, features, masks, pairs.rotations)
         loss, metrics["loss/rotation"] = loss + of_rotations, of_rotations.detach()
         metrics["rotation_accuracy"] = is_correct.float().mean()
     if attributes and pairs.attributes:
@@ -79,9 +75,10 @@ def contrastive_loss(
 
 
 def _encode(
-    encoder: ObjectEncoder, crops_SKVCYX: torch.Tensor, mixing: torch.Tensor, parallel: Parallel
+    encoder: ObjectEncoder, crops_KSVCYX: torch.Tensor, mixing: torch.Tensor, parallel: Parallel
 ) -> torch.Tensor:
     """Encode crops of S images of K objects, with mixed channels, to features (S, V, K, F)."""
+    crops_SKVCYX = crops_KSVCYX.transpose(0, 1).contiguous()
     mixed = torch.einsum("cd,skvdyx->skvcyx", mixing, crops_SKVCYX.to(mixing.dtype))
     features_NF = parallel.in_parts(encoder.encode_images, mixed.flatten(0, 2))
     return features_NF.unflatten(0, crops_SKVCYX.shape[:3]).transpose(1, 2)
@@ -129,8 +126,8 @@ def _chunks(pairs: Pairs) -> list[Pairs]:
 def retrieval_accuracy(encoder: ObjectEncoder, pairs: Pairs) -> float:
     """Fraction of prompt images whose nearest object of the scene is a match."""
     parts = _chunks(pairs)
-    prompt = torch.cat([embed(encoder, p.prompt_crops, p.prompt_masks) for p in parts])
-    scene = torch.cat([embed(encoder, p.scene_crops, p.scene_masks) for p in parts])
+    prompt = torch.cat([embed(encoder, p.crops[:, PROMPT], p.masks[:, PROMPT]) for p in parts])
+    scene = torch.cat([embed(encoder, p.crops[:, SCENE], p.masks[:, SCENE]) for p in parts])
     is_other_scene = pairs.scenes[:, None] != pairs.scenes[None, :]
     nearest = (prompt @ scene.T).masked_fill(is_other_scene, -2.0).argmax(1)
     is_correct = pairs.appearances[nearest] == pairs.appearances
@@ -180,12 +177,18 @@ def rotation_accuracy(encoder: ObjectEncoder, pairs: Pairs) -> float:
     """Fraction of rotations to the second view estimated within 15 degrees; NaN if there is none."""
     is_correct = []
     for part in _chunks(pairs):
-        view = part.second_view
-        assert view is not None
-        features = encoder.encode_images(torch.stack([part.scene_crops, view.crops])).transpose(1, 2)
-        masks = torch.stack([part.scene_masks, view.masks]).transpose(1, 2)
-        is_correct.append(is_rotation_correct(encoder, features, masks, view.rotations))
+        assert part.rotations is not None
+        features, masks = _features(encoder, part, [SCENE, SECOND_VIEW])
+        is_correct.append(is_rotation_correct(encoder, features, masks, part.rotations))
     return float(torch.cat(is_correct).double().mean())
+
+
+def _features(
+    encoder: ObjectEncoder, pairs: Pairs, images: Sequence[int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Encode crops of some of the S images; return features (S, V, K, F), and masks (S, V, K)."""
+    crops = pairs.crops[:, images].transpose(0, 1)
+    return encoder.encode_images(crops).transpose(1, 2), pairs.masks[:, images].permute(1, 2, 0)
 
 
 @torch.no_grad()
@@ -213,7 +216,6 @@ def _compare_rotations(
 # second. In between nothing is learned: a red and blue stripe is neither like red nor unlike it.
 _COLOUR_LIMITS = (0.7, 0.4)
 _LENGTH_LIMITS = (1.12, 1.3)
-_PROMPT, _SCENE = 0, 1  # images that are labelled; those of the second view are as in the scene
 
 
 def attribute_loss(
@@ -240,7 +242,7 @@ def attribute_loss(
     """
     projected_3KPW = attributes(features_3VKF, labels.boxes.permute(1, 2, 0, 3), masks_3VK)
     projected_PMW = projected_3KPW.flatten(0, 1).transpose(0, 1)
-    images = _images(labels, (_PROMPT, _SCENE, _SCENE))
+    images = _images(labels, (PROMPT, SCENE, SCENE))  # the second view has no labels of its own
     same_PMM, different_PMM = _compare_attributes(images, images)
     is_seen_M = masks_3VK.any(dim=1).flatten()
     is_pair_MM = is_seen_M & is_seen_M[:, None]
@@ -271,12 +273,11 @@ def attribute_accuracy(encoder: ObjectEncoder, attributes: Attributes, pairs: Pa
     projected = []
     for part in _chunks(pairs):
         assert part.attributes is not None
-        features = encoder.encode_images(torch.stack([part.prompt_crops, part.scene_crops])).transpose(1, 2)
-        masks = torch.stack([part.prompt_masks, part.scene_masks]).transpose(1, 2)
+        features, masks = _features(encoder, part, [PROMPT, SCENE])
         boxes = part.attributes.boxes[:, : len(masks)].permute(1, 2, 0, 3)
         projected.append(attributes(features, boxes, masks).transpose(1, 2))  # (2, P, K, W)
     prompt_PKW, scene_PKW = torch.cat(projected, dim=2)  # of (2, P, K, W)
-    same_PKK, different_PKK = _compare_attributes(_images(labels, [_PROMPT]), _images(labels, [_SCENE]))
+    same_PKK, different_PKK = _compare_attributes(_images(labels, [PROMPT]), _images(labels, [SCENE]))
     is_other_KK = (pairs.scenes[:, None] == pairs.scenes) & ~torch.eye(
         len(pairs.scenes), dtype=torch.bool, device=pairs.scenes.device
     )

@@ -26,7 +26,6 @@ from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
 from openvima.training.augmentation.scenes import (
-    draw_grayscale,
     rearrange,
     to_grayscale,
     with_hard_negatives,
@@ -146,63 +145,51 @@ def _histogram(texture: np.ndarray) -> np.ndarray:
     return cells.reshape(-1).astype(np.float32)
 
 
-_NUM_COLUMNS, _NUM_VIEW_COLUMNS = 8, 3  # of `Pairs` without its other records, and of `SecondView`
+_NUM_COLUMNS = 7  # of `Pairs` without its labels
 _CHUNK = 100  # scenes of a job
 _DOMAIN = "user"  # neither training nor evaluation episodes are reused
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SecondView(TensorRecord):
-    """K objects in the rearranged view of their scene.
-
-    Args:
-        crops: Shape (K, 2, 3, 32, 32), uint8.
-        masks: Whether it is visible in the view, shape (K, 2), bool.
-        rotations: From the prompt image to the scene, and from there to the second view, counter-clockwise
-            seen from above, in radians; NaN for shapes with rotational symmetry. Shape (K, 2), float32.
-    """
-
-    crops: torch.Tensor
-    masks: torch.Tensor
-    rotations: torch.Tensor
+PROMPT, SCENE, SECOND_VIEW = 0, 1, 2
+"""Images of an object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs(TensorRecord):
-    """K objects, each in a prompt image and in a scene.
+    """K objects, each in a prompt image and in a scene, and perhaps in a rearranged view of the scene.
 
     Args:
-        prompt_crops: Shape (K, 2, 3, 32, 32), uint8.
-        prompt_masks: Whether it is visible in the view, shape (K, 2), bool.
-        scene_crops: Shape (K, 2, 3, 32, 32), uint8.
-        scene_masks: Shape (K, 2), bool.
+        crops: In each of S images, shape (K, S, 2, 3, 32, 32), uint8; S is 3 with the second view, else 2.
+        masks: Whether it is visible in the view, shape (K, S, 2), bool.
         appearances: `name_id` of its pair of shape and texture, shape (K,), int64.
         scenes: Index of its scene, shape (K,), int64.
         shapes: `name_id` of its shape, shape (K,), int64.
         is_grayscale: Whether its prompt image is grayscale and matches by shape, shape (K,), bool.
-        second_view: The objects in the rearranged view; None if there is none.
+        rotations: From the prompt image to the scene, and from there to the second view, counter-clockwise
+            seen from above, in radians; NaN for shapes with rotational symmetry. Shape (K, 2), float32; None
+            without the second view.
         attributes: What the objects are like; None if they are not labelled.
     """
 
-    prompt_crops: torch.Tensor
-    prompt_masks: torch.Tensor
-    scene_crops: torch.Tensor
-    scene_masks: torch.Tensor
+    crops: torch.Tensor
+    masks: torch.Tensor
     appearances: torch.Tensor
     scenes: torch.Tensor
     shapes: torch.Tensor
     is_grayscale: torch.Tensor
-    second_view: SecondView | None = None
+    rotations: torch.Tensor | None = None
     attributes: AttributeLabels | None = None
 
     def second_view_pairs(self) -> "Pairs":
         """Return the pairs with the second view as prompt images, where it shows the object."""
-        view = self.second_view
-        assert view is not None
-        is_visible = torch.nonzero(view.masks.any(dim=1))[:, 0]
-        in_colour = torch.zeros_like(self.is_grayscale)
-        pairs = replace(self, prompt_crops=view.crops, prompt_masks=view.masks, is_grayscale=in_colour)
-        return pairs.select(is_visible)
+        images = [SECOND_VIEW, SCENE]
+        pairs = replace(
+            self,
+            crops=self.crops[:, images],
+            masks=self.masks[:, images],
+            is_grayscale=torch.zeros_like(self.is_grayscale),
+        )
+        return pairs.select(torch.nonzero(self.masks[:, SECOND_VIEW].any(dim=1))[:, 0])
 
 
 NO_AUGMENTATION = PretrainingConfig()
@@ -244,7 +231,7 @@ def render_pairs(
     say = report and (lambda done: report(done, len(numbers), "rendering scenes"))
     found = {chunk.start: columns for chunk, columns in imap_unordered(job, chunks, workers, report=say)}
     columns = zip(*(found[chunk.start] for chunk in chunks), strict=True)
-    pairs = _record([torch.from_numpy(np.concatenate(column)) for column in columns])
+    pairs = _record([np.concatenate(column) for column in columns])
     return map_tensors(pairs.to(parallel.device), parallel.rows_of_all)
 
 
@@ -277,14 +264,14 @@ def _columns_of_scenes(
         if prob := augmentation.hard_negative_prob:
             scene = with_hard_negatives(scene, prob, shades, rasteriser.assets, rng)
         view = rearrange(scene, rng) if second_view else None
-        is_grayscale = draw_grayscale(len(scene.placements), augmentation.grayscale_prob, rng)
+        gray_slots = np.flatnonzero(rng.random(len(scene.placements)) < augmentation.grayscale_prob)
         rows += pairs_of_scene(
             scene,
             _magnifications(episode),
             rasteriser,
             number,
             view,
-            is_grayscale=is_grayscale,
+            gray_slots=gray_slots,
             labeller=labeller,
         )
         count(number - numbers.start + 1)
@@ -293,17 +280,13 @@ def _columns_of_scenes(
 
 def stack_rows(rows: Sequence[tuple]) -> Pairs:
     """Stack the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
-    return _record([torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)])
+    return _record([np.stack(column) for column in zip(*rows, strict=True)])
 
 
-def _record(columns: Sequence[torch.Tensor]) -> Pairs:
-    first, others = columns[:_NUM_COLUMNS], columns[_NUM_COLUMNS:]
-    view, labels = others[:_NUM_VIEW_COLUMNS], others[_NUM_VIEW_COLUMNS:]
-    return Pairs(
-        *first,
-        second_view=SecondView(*view) if view else None,
-        attributes=AttributeLabels(*labels) if labels else None,
-    )
+def _record(columns: Sequence[np.ndarray]) -> Pairs:
+    tensors = list(map(torch.from_numpy, columns))
+    labels = tensors[_NUM_COLUMNS:]
+    return Pairs(*tensors[:_NUM_COLUMNS], attributes=AttributeLabels(*labels) if labels else None)
 
 
 def pairs_of_scene(
@@ -313,7 +296,7 @@ def pairs_of_scene(
     number: int,
     second_view: tuple[Scene, dict[int, float]] | None = None,
     *,
-    is_grayscale: Sequence[bool] | np.ndarray = (),
+    gray_slots: Sequence[int] | np.ndarray = (),
     labeller: AttributeLabeller | None = None,
 ) -> list[tuple]:
     """Render a scene and prompt images of its visible objects.
@@ -324,43 +307,39 @@ def pairs_of_scene(
         rasteriser: Renders.
         number: Index of the scene.
         second_view: The rearranged scene, and rotations by object id.
-        is_grayscale: For each object of the scene whether its prompt image is grayscale; none by default.
+        gray_slots: Which objects of the scene have a grayscale prompt image.
         labeller: Labels what the objects are like; only with a second view.
 
     Returns:
-        For each visible object the fields of `Pairs`, and those of `SecondView` and `AttributeLabels` if
-        there are any.
+        For each visible object the fields of `Pairs`, without rotations if there is no second view, and
+        those of `AttributeLabels` if it is labelled.
     """
-    seen = _observe(scene, rasteriser)
-    seen_again = _observe(second_view[0], rasteriser) if second_view else None
+    views = [_observe(scene, rasteriser)]
+    if second_view:
+        views.append(_observe(second_view[0], rasteriser))
     pairs = []
     for slot, placement in enumerate(scene.placements):
-        if not seen.masks[:, slot].any():
+        if not views[0].masks[:, slot].any():
             continue
-        is_gray = bool(len(is_grayscale)) and bool(is_grayscale[slot])
-        shown, magnification = (
-            to_grayscale(placement) if is_gray else placement,
-            magnifications.get(placement.object, 1.0),
-        )
-        prompt = _prompt_image(shown, magnification, rasteriser)
+        is_gray = slot in gray_slots
+        shown = to_grayscale(placement) if is_gray else placement
+        magnification = magnifications.get(placement.object, 1.0)
+        images = [(_prompt_image(shown, magnification, rasteriser), 0), *((view, slot) for view in views)]
         # Hard negatives, which come with a second view, may be stretched.
         scale = placement.scale if second_view else ()
         pair = (
-            prompt.crops[:, 0],
-            prompt.masks[:, 0],
-            seen.crops[:, slot],
-            seen.masks[:, slot],
+            np.stack([image.crops[:, place] for image, place in images]),
+            np.stack([image.masks[:, place] for image, place in images]),
             name_id(placement.object, placement.texture, *map(str, scale)),
             np.int64(number),
             name_id(placement.object),
             np.bool_(is_gray),
         )
-        if second_view and seen_again:
-            rotations = _rotations(placement, second_view[1][placement.id])
-            pair = (*pair, seen_again.crops[:, slot], seen_again.masks[:, slot], rotations)
+        if second_view:
+            pair = (*pair, _rotations(placement, second_view[1][placement.id]))
             if labeller:
                 labels = (labeller(shown, is_magnified=magnification != 1), labeller(placement))
-                boxes = np.stack([prompt.boxes[:, 0], seen.boxes[:, slot], seen_again.boxes[:, slot]])
+                boxes = np.stack([image.boxes[:, place] for image, place in images])
                 pair = (*pair, *map(np.stack, zip(*labels, strict=True)), boxes)
         pairs.append(pair)
     return pairs

@@ -131,7 +131,7 @@ class ContrastivePretraining:
         seed: int,
         pairs: Pairs,
         parallel: Parallel,
-        encode: Callable[[str], list[int]] | None = None,
+        encode: Callable[[str], list[int]],
     ) -> None:
         assert network.object_encoder is not None  # `resolved` has checked it
         self.encoder = network.object_encoder
@@ -142,7 +142,6 @@ class ContrastivePretraining:
         self._config, self._seed, self._parallel = config, seed, parallel
         self._attributes = attributes_of(network) if config.attribute_loss_weight else None
         if self._attributes:
-            assert encode is not None
             rng = np.random.default_rng(step_seed(seed, "captions", 0))
             self._captions = sample_captions(_NUM_CAPTIONS, encode, rng).to(pairs.scenes.device)
 
@@ -182,7 +181,7 @@ class ContrastivePretraining:
         """
         pairs = self._validation
         metrics = {"retrieval_accuracy": retrieval_accuracy(self.encoder, pairs)}
-        if pairs.second_view:
+        if pairs.rotations is not None:
             metrics["second_view_accuracy"] = retrieval_accuracy(self.encoder, pairs.second_view_pairs())
         if self.encoder.config.rotation_bins:
             metrics["rotation_accuracy"] = rotation_accuracy(self.encoder, pairs)
