@@ -55,13 +55,10 @@ def arm_parts(end_effector: EndEffector) -> tuple[tuple[int, int, Rgb, TriangleM
     """
     with np.load(Path(__file__).with_name("arm.npz")) as file:
         parts, corners = file[f"{end_effector}/parts"], file[f"{end_effector}/corners"]
-    meshes = (
-        TriangleMesh(
-            *(np.ascontiguousarray(half) for half in np.split(mesh, 2, axis=2)), np.zeros((len(mesh), 3, 2))
-        )
-        for mesh in np.split(corners, np.cumsum(parts[:-1, 5]))
-    )
-    return tuple(
-        (link, id, (red, green, blue), mesh)
-        for (link, id, red, green, blue, _), mesh in zip(parts.tolist(), meshes, strict=True)
-    )
+    found = []
+    meshes = np.split(corners, np.cumsum(parts[:-1, 5]))
+    for (link, id, red, green, blue, count), mesh in zip(parts.tolist(), meshes, strict=True):
+        vertices, normals = (np.ascontiguousarray(half) for half in np.split(mesh, 2, axis=2))
+        part = TriangleMesh(vertices, normals, np.zeros((count, 3, 2)))
+        found.append((link, id, (red, green, blue), part))
+    return tuple(found)
