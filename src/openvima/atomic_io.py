@@ -52,7 +52,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield temporary
             sync_file(temporary)
             os.replace(temporary, path)
-            sync_folder(path.parent)
+            sync_file(path.parent)
     except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -118,7 +118,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
                 shutil.rmtree(backup, ignore_errors=True)
                 os.replace(path, backup)
             os.replace(temporary, path)
-            sync_folder(path.parent)
+            sync_file(path.parent)
             shutil.rmtree(backup, ignore_errors=True)
     finally:
         restore_folder(path)
@@ -169,10 +169,13 @@ def _backup_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.old")
 
 
-def sync_file(file: Path) -> None:
-    """Wait until the content of a file is on the disk."""
-    with open(file, "rb+") as stream:
-        os.fsync(stream.fileno())
+def sync_file(path: Path) -> None:
+    """Wait until the content of a file, or the names in a folder, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def sync_files(folder: Path) -> None:
@@ -180,15 +183,6 @@ def sync_files(folder: Path) -> None:
     for file in folder.rglob("*"):
         if file.is_file():
             sync_file(file)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a rename durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 LOCK_NAME = ".lock"

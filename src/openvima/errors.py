@@ -186,10 +186,9 @@ def echo(text: str, limit: int = MAX_ECHO) -> str:
         text: What a client, a server or a file holds; it may be hostile to the terminal that shows it.
         limit: Characters to keep.
     """
-    kept = "".join(
-        c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text[:limit]
-    )
-    return kept if len(text) <= limit else kept[: limit - 1] + "…"
+    first = text[: limit + 1]
+    shown = (c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in first)
+    return cut("".join(shown), limit)
 
 
 def one_line(error: BaseException) -> str:

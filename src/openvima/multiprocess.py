@@ -265,20 +265,17 @@ def imap_with_engine(
     if engine == "processes":
         yield from imap_unordered(job, items, num_workers or 1, report=report)
         return
-    ray, num_workers = _import_ray(), num_workers or (1 if address is None else None)
-    with _connected(ray, address, num_workers):
-        yield from _run_all(ray, job, items, num_workers or len(items), report or (lambda done: None))
-
-
-def _import_ray() -> ModuleType:
     # Read when Ray is imported: no usage statistics, no deprecation warnings.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    return import_extra(
+    ray = import_extra(
         "ray",
         "running on a Ray cluster needs ray: pip install openvima[scale]. "
         "Without it, --engine processes uses the CPUs of this machine.",
     )
+    num_workers = num_workers or (1 if address is None else None)
+    with _connected(ray, address, num_workers):
+        yield from _run_all(ray, job, items, num_workers or len(items), report or (lambda done: None))
 
 
 @contextlib.contextmanager
@@ -330,9 +327,15 @@ def _run_all(
     num_workers: int,
     report: Callable[[int], None],
 ) -> Iterator[tuple[Any, Any]]:
-    total = 0
+    total, errors = 0, ray.exceptions
+    # What Ray raises where a process or machine died, alone or with a result that was still on it.
+    lost = errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError
+    own = {name: value for name, value in os.environ.items() if name.startswith("OPENVIMA_")}
+    # Ray shares workers between equal environments. One that was cancelled may have stopped in the middle of
+    # an import or a compilation, so each call has workers of its own.
+    environment = {**own, **WORKER_VARIABLES, "OPENVIMA_CALL": str(time.time_ns())}
     # Ray's own retries have no limit where memory runs out.
-    remote = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": _environment()})(_run_counted)
+    remote = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": environment})(_run_counted)
     waiting, running, deaths = deque(range(len(items))), {}, Counter[int]()
     try:
         while True:
@@ -346,7 +349,7 @@ def _run_all(
                 slot = running.pop(reference)
                 try:
                     result, number, found = ray.get(reference)
-                except _lost(ray):
+                except lost:
                     deaths[slot] += 1
                     if deaths[slot] > RETRIES:
                         raise
@@ -356,44 +359,24 @@ def _run_all(
                 total += number
                 yield items[slot], result
             report(total)
-    except ray.exceptions.RayTaskError as error:
-        if isinstance(error.cause, ray.exceptions.RayError):  # the job could not be unpickled
+    except errors.RayTaskError as error:
+        if isinstance(error.cause, errors.RayError):  # the job could not be unpickled
             raise ConfigError(
                 f"a machine of the Ray cluster cannot do the work ({one_line(error.cause)}). "
                 "All of them need this version of openvima, with what its extras and your tasks import."
             ) from None
         raise error.cause from None  # what the job raised
-    except ray.exceptions.RayError as error:
+    except errors.RayError as error:
         raise WorkerError(
             f"a worker of the Ray cluster died ({one_line(error)}); often for lack of memory. "
             "Finished files are kept; repeat the command to resume."
         ) from None
     finally:
-        _stop(ray, list(running))
-
-
-def _lost(ray: ModuleType) -> tuple[type[Exception], ...]:
-    """What Ray raises where a process or machine died, alone or with a result that was still on it."""
-    errors = ray.exceptions
-    return errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError
-
-
-def _stop(ray: ModuleType, references: list[Any]) -> None:
-    """Cancel jobs and wait for their clean-up."""
-    if not references:
-        return
-    with contextlib.suppress(ray.exceptions.RayError):
-        for reference in references:
-            ray.cancel(reference)
-        ray.wait(references, num_returns=len(references), timeout=CANCEL_S)
-
-
-def _environment() -> dict[str, str]:
-    """Environment of the workers: one thread each, and this package's variables."""
-    own = {name: value for name, value in os.environ.items() if name.startswith("OPENVIMA_")}
-    # Ray shares workers between equal environments. One that was cancelled may have stopped in the middle of
-    # an import or a compilation, so each call has workers of its own.
-    return {**own, **WORKER_VARIABLES, "OPENVIMA_CALL": str(time.time_ns())}
+        with contextlib.suppress(errors.RayError):
+            for reference in running:
+                ray.cancel(reference)
+            if running:  # wait for their clean-up
+                ray.wait(list(running), num_returns=len(running), timeout=CANCEL_S)
 
 
 def _run_counted(job: Job, item: Any, folder: str) -> tuple[Any, int, list[UnknownWordWarning]]:

@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import Any
 
 from openvima.errors import ConfigError, OpenVimaError
+from openvima.input_files import open_regular
 
 FORM = "MODULE:FUNCTION or FILE.py:FUNCTION"
 _NAME = re.compile(r"(.+\.py|[^\W\d]\w*(\.[^\W\d]\w*)*):[^\W\d]\w*")
@@ -81,8 +82,6 @@ def load_file(path: Path, *, what: str) -> ModuleType:
     Raises:
         ConfigError: There is no such Python file, or its code raises.
     """
-    from openvima.input_files import open_regular  # imports a YAML parser
-
     try:
         with open_regular(path) as stream:
             code = stream.read()
@@ -170,12 +169,11 @@ def _is_file(where: str) -> bool:
 def _load_module(name: str, what: str) -> ModuleType:
     try:
         return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-            raise ConfigError(f"{what} names {name!r}, which raised {described(error)}.") from error
-        hint = f"name it as {name}.py:FUNCTION" if Path(f"{name}.py").is_file() else "set PYTHONPATH"
-        raise ConfigError(f"{what} names {name!r}, and there is no such module; {hint}.") from None
     except (Exception, SystemExit) as error:
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing and f"{name}.".startswith(f"{missing}."):
+            hint = f"name it as {name}.py:FUNCTION" if Path(f"{name}.py").is_file() else "set PYTHONPATH"
+            raise ConfigError(f"{what} names {name!r}, and there is no such module; {hint}.") from None
         raise ConfigError(f"{what} names {name!r}, which raised {described(error)}.") from error
 
 

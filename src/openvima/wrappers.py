@@ -13,7 +13,7 @@ from gymnasium import spaces
 from openvima.errors import ActionError, ConfigError, echo
 from openvima.perception.objects import TOP, ObjectViews, observe, observe_prompt_image
 from openvima.render.camera import CAMERAS
-from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, PromptImage
 from openvima.scene.action import END_EFFECTOR, HIGHEST_TIP_Z_M
 from openvima.scene.goal import object_of
 from openvima.tasks.goals import LEVER_M
@@ -90,7 +90,31 @@ class FlatAction(gymnasium.ActionWrapper):
         return np.array([*scaled.flat, np.sin(angle_rad), np.cos(angle_rad)], np.float32)
 
 
-class FlatObservation(gymnasium.ObservationWrapper):
+class _PromptedObservation(gymnasium.ObservationWrapper):
+    """Encodes a prompt once an episode, and its words anew with the end effector and the tool."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
+        self._num_words = NUM_BUCKETS + 1 + TOOL_SIZE * (self._base.control == END_EFFECTOR)
+        self._prompt, self._words = None, np.zeros(0, np.float32)
+        self._images = np.zeros(0)
+
+    def _encode_words(self, observation: Mapping[str, Any]) -> np.ndarray:
+        """Return words, end effector and tool, and keep the images of the prompt of a new episode."""
+        prompt = self._base.prompt
+        if self._prompt is not prompt:
+            parts = prompt.sequence()
+            self._images = self._encode_images([part for part in parts if not isinstance(part, str)])
+            self._prompt, self._words = prompt, _words(parts)
+        tool = _tool(observation["tool"]) if "tool" in observation else ()
+        return np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
+
+    def _encode_images(self, images: list[PromptImage]) -> np.ndarray:
+        raise NotImplementedError
+
+
+class FlatObservation(_PromptedObservation):
     """Gives observations as one vector: float32, each value −1 … 1.
 
     It holds what policies over objects see, no state of the simulator: `max_objects` rows for objects on the
@@ -119,12 +143,9 @@ class FlatObservation(gymnasium.ObservationWrapper):
 
     def __init__(self, env: gymnasium.Env, *, max_objects: int = 18, max_prompt_objects: int = 18) -> None:
         super().__init__(env)
-        self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
         self.max_objects, self.max_prompt_objects = max_objects, max_prompt_objects
-        size = (max_objects + max_prompt_objects) * OBJECT_SIZE + NUM_BUCKETS + 1
-        size += TOOL_SIZE * (self._base.control == END_EFFECTOR)
+        size = (max_objects + max_prompt_objects) * OBJECT_SIZE + self._num_words
         self.observation_space = spaces.Box(-1, 1, (size,), np.float32)
-        self._prompt, self._encoded = None, np.zeros(0, np.float32)
 
     def observation(self, observation: Mapping[str, Any]) -> np.ndarray:
         """Return an observation of the running episode as a vector.
@@ -132,11 +153,9 @@ class FlatObservation(gymnasium.ObservationWrapper):
         Raises:
             ConfigError: There are more objects than rows.
         """
-        if self._prompt is not self._base.prompt:  # of a new episode
-            self._prompt, self._encoded = self._base.prompt, self._encoded_prompt()
+        words = self._encode_words(observation)
         objects = self._rows([(observe(observation), True)], "max_objects")
-        tool = _tool(observation["tool"]) if "tool" in observation else ()
-        return np.concatenate([objects.ravel(), self._encoded, [observation["ee"]], tool], dtype=np.float32)
+        return np.concatenate([objects.ravel(), self._images.ravel(), words])
 
     def rows(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Split vectors into objects, objects of the prompt, and words with the end effector and the tool.
@@ -153,11 +172,9 @@ class FlatObservation(gymnasium.ObservationWrapper):
         shape = (*observation.shape[:-1], -1, OBJECT_SIZE)
         return objects.reshape(shape), prompt.reshape(shape), words
 
-    def _encoded_prompt(self) -> np.ndarray:
-        parts = self._base.prompt.sequence()
-        images = [part for part in parts if not isinstance(part, str)]
+    def _encode_images(self, images: list[PromptImage]) -> np.ndarray:
         seen = [(observe_prompt_image(image), image.kind == "scene") for image in images]
-        return np.concatenate([self._rows(seen, "max_prompt_objects").ravel(), _words(parts)])
+        return self._rows(seen, "max_prompt_objects")
 
     def _rows(self, images: list[tuple[ObjectViews, bool]], limit: str) -> np.ndarray:
         """One row for each object of images, shape (limit, 56), with its position if it is on the table."""
@@ -180,7 +197,7 @@ class FlatObservation(gymnasium.ObservationWrapper):
         return rows
 
 
-class ImageObservation(gymnasium.ObservationWrapper):
+class ImageObservation(_PromptedObservation):
     """Gives observations as a flat dictionary of images and words, such as SB3's `MultiInputPolicy` takes.
 
     | key | value |
@@ -201,19 +218,16 @@ shape (3 × max_prompt_images, 64, 128), zeros where there is none |
 
     def __init__(self, env: gymnasium.Env, *, max_prompt_images: int = 4) -> None:
         super().__init__(env)
-        self._base: Any = env.unwrapped  # a TabletopEnv, as in `FlatObservation`
         if "rgb" not in self._base.modalities:
             raise ConfigError(f"modalities are {self._base.modalities}; ImageObservation needs rgb.")
         self.max_prompt_images = max_prompt_images
         shape = CAMERAS["top"].height // 2, CAMERAS["top"].width // 2
         images = {**dict.fromkeys(CAMERAS, 3), "prompt": 3 * max_prompt_images}
-        num_words = NUM_BUCKETS + 1 + TOOL_SIZE * (self._base.control == END_EFFECTOR)
         parts: dict[str, spaces.Space] = {
             name: spaces.Box(0, 255, (channels, *shape), np.uint8) for name, channels in images.items()
         }
-        parts["words"] = spaces.Box(-1, 1, (num_words,), np.float32)
+        parts["words"] = spaces.Box(-1, 1, (self._num_words,), np.float32)
         self.observation_space = spaces.Dict(parts)
-        self._prompt, self._images, self._words = None, np.zeros(0, np.uint8), np.zeros(0, np.float32)
 
     def observation(self, observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Return an observation of the running episode as a flat dictionary.
@@ -221,25 +235,19 @@ shape (3 × max_prompt_images, 64, 128), zeros where there is none |
         Raises:
             ConfigError: The prompt has more than `max_prompt_images` images.
         """
-        if self._prompt is not self._base.prompt:  # of a new episode
-            self._prompt = self._base.prompt
-            self._encode_prompt()
-        tool = _tool(observation["tool"]) if "tool" in observation else ()
+        words = self._encode_words(observation)
         images = {view: _shrunk(image) for view, image in observation["rgb"].items()}
-        words = np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
         return {**images, "prompt": self._images.copy(), "words": words}
 
-    def _encode_prompt(self) -> None:
-        parts = self._base.prompt.sequence()
-        images = [part.rgb["top"] for part in parts if not isinstance(part, str)]
+    def _encode_images(self, images: list[PromptImage]) -> np.ndarray:
         if len(images) > self.max_prompt_images:
             raise ConfigError(
                 f"max_prompt_images is {self.max_prompt_images}, but the prompt has {len(images)}; give more."
             )
-        self._images = np.zeros(self.observation_space["prompt"].shape, np.uint8)  # type: ignore[index]
+        encoded = np.zeros(self.observation_space["prompt"].shape, np.uint8)  # type: ignore[index]
         for index, image in enumerate(images):
-            self._images[3 * index : 3 * index + 3] = _shrunk(image)
-        self._words = _words(parts)
+            encoded[3 * index : 3 * index + 3] = _shrunk(image.rgb["top"])
+        return encoded
 
 
 class ProgressReward(gymnasium.Wrapper):
@@ -262,7 +270,7 @@ class ProgressReward(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, *, reach_weight: float = 0.0) -> None:
         super().__init__(env)
         self.reach_weight = reach_weight
-        self._base: Any = env.unwrapped  # a TabletopEnv, as in `FlatObservation`
+        self._base: Any = env.unwrapped  # a TabletopEnv, as above
         self._potential = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:

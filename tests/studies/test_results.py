@@ -20,7 +20,7 @@ from openvima.tasks.registry import task_spec
 EPISODES = 6
 
 
-def made_up(name: str, folder: Path, seeds: int = 2) -> tuple[Study, StudyInputs, Plan, list[Point]]:
+def made_up(name: str, folder: Path, seeds: int = 2) -> tuple[Study, Plan, list[Point]]:
     """A study whose evaluations have made-up outcomes, of which the first seed of training solves more."""
     scale = replace(scale_named("nano"), episodes=EPISODES)
     inputs = StudyInputs(scale, ("a=oracle", "b=random") if name == "corrupted-prompts" else ())
@@ -40,7 +40,7 @@ def made_up(name: str, folder: Path, seeds: int = 2) -> tuple[Study, StudyInputs
     for training in plan.all_trainings:
         training.config.out.mkdir(parents=True)
         (training.config.out / COST_FILE).write_text(json.dumps(costs))
-    return study, inputs, plan, study_points(study, plan)
+    return study, plan, study_points(plan)
 
 
 def _outcomes(first: int, solved: int) -> tuple[EpisodeOutcome, ...]:
@@ -60,7 +60,7 @@ def _outcomes(first: int, solved: int) -> tuple[EpisodeOutcome, ...]:
 def test_a_figure_has_the_panels_and_the_axis_of_the_study(
     name: str, panels: list[str], named: bool, tmp_path: Path
 ) -> None:
-    study, _, _, points = made_up(name, tmp_path)
+    study, _, points = made_up(name, tmp_path)
     figure = study_figure(study, points)
     assert list(figure.panels) == panels
     assert figure.named == named
@@ -69,15 +69,15 @@ def test_a_figure_has_the_panels_and_the_axis_of_the_study(
 
 @pytest.mark.parametrize("name", ["corrupted-prompts", "level-drop"])
 def test_a_page_shows_every_run_and_loads_nothing(name: str, tmp_path: Path) -> None:
-    study, inputs, plan, points = made_up(name, tmp_path)
-    page = study_page(study, inputs, points, costs=study_costs(plan), versions={}, command="openvima study")
+    study, plan, points = made_up(name, tmp_path)
+    page = study_page(plan, points, costs=study_costs(plan), versions={}, command="openvima study")
     assert all(run.label in page for run in study.runs)
     assert "src=" not in page and "@import" not in page
     assert ("Training seeds</h2>" in page) == bool(plan.trainings) == ("Costs</h2>" in page)
 
 
 def test_points_hold_seeds_and_differences_on_the_same_episodes(tmp_path: Path) -> None:
-    _, _, _, points = made_up("data-scaling", tmp_path)
+    _, _, points = made_up("data-scaling", tmp_path)
     first, second = (p for p in points if p.level == "L1" and p.run in ("0.1 %", "1 %"))
     assert [mean for mean, _ in first.score.seeds] == [0, 1 / EPISODES]
     assert first.x == 0.001 and first.difference is None
@@ -86,10 +86,10 @@ def test_points_hold_seeds_and_differences_on_the_same_episodes(tmp_path: Path) 
 
 
 def test_ablations_are_paired_with_plain_scores_unless_scenes_differ(tmp_path: Path) -> None:
-    _, _, _, points = made_up("corrupted-prompts", tmp_path / "corrupted")
+    _, _, points = made_up("corrupted-prompts", tmp_path / "corrupted")
     plain, masked = (p for p in points if (p.run, p.level) == ("a", "L1") and p.ablation in ("", "no_prompt"))
     assert plain.x == "as it is" and plain.difference is None
     assert masked.x == "no prompt" and masked.difference is not None
-    _, _, _, points = made_up("distractors", tmp_path / "distractors")
+    _, _, points = made_up("distractors", tmp_path / "distractors")
     assert {p.x for p in points} == {0, 1, 2, 4, 6}
     assert all(p.difference is None for p in points)

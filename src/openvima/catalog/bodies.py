@@ -19,7 +19,7 @@ from openvima.catalog.geometry import (
     TriangleMesh,
     Vector3,
 )
-from openvima.catalog.meshes import drape, scale_geometry
+from openvima.catalog.meshes import combine, drape, scale_geometry
 from openvima.catalog.objects import object_spec
 
 SHEET_THICKNESS_M = 0.001  # of flat marks on the table, whatever their nominal height
@@ -37,9 +37,9 @@ def box(size: Vector3, centre: Vector3 = (0.0, 0.0, 0.0)) -> CollisionBox:
 def box_mesh(boxes: Sequence[CollisionBox]) -> TriangleMesh:
     """Return the triangles of several boxes, each wrapped in the whole texture, in the given order."""
     cube = fixed_geometry("cube").visual  # with edges −1 … 1; every face gets a sixteenth of the texture
-    vertices = [cube.vertices * box.half_size + box.centre for box in boxes]
-    repeats = (len(boxes), 1, 1)
-    return TriangleMesh(np.concatenate(vertices), np.tile(cube.normals, repeats), np.tile(cube.uvs, repeats))
+    return combine(
+        [TriangleMesh(cube.vertices * box.half_size + box.centre, cube.normals, cube.uvs) for box in boxes]
+    )
 
 
 def block(size: Vector3) -> Geometry:
@@ -58,10 +58,8 @@ def container(size: Vector3) -> Geometry:
     x, y, height = size[0], size[1], size[2] / HEIGHT_DIVISOR
     boxes = [
         box((x, y, WALL_M), (0.0, 0.0, -height / 2)),
-        box((x, WALL_M, height), (0.0, -y / 2, 0.0)),
-        box((x, WALL_M, height), (0.0, y / 2, 0.0)),
-        box((WALL_M, y, height), (-x / 2, 0.0, 0.0)),
-        box((WALL_M, y, height), (x / 2, 0.0, 0.0)),
+        *(box((x, WALL_M, height), (0.0, at, 0.0)) for at in (-y / 2, y / 2)),
+        *(box((WALL_M, y, height), (at, 0.0, 0.0)) for at in (-x / 2, x / 2)),
     ]
     rest_z_m = (height + WALL_M) / 2 + FLOOR_Z_M
     return Geometry(box_mesh(boxes), tuple(boxes), rest_z_m)
@@ -74,10 +72,8 @@ def square(size: Vector3) -> Geometry:
     """
     length, width, half = size[0], size[1], size[0] / 2
     boxes = [
-        box((length, width, SHEET_THICKNESS_M), (0.0, half, 0.0)),
-        box((length, width, SHEET_THICKNESS_M), (0.0, -half, 0.0)),
-        box((width, length, SHEET_THICKNESS_M), (half, 0.0, 0.0)),
-        box((width, length, SHEET_THICKNESS_M), (-half, 0.0, 0.0)),
+        *(box((length, width, SHEET_THICKNESS_M), (0.0, at, 0.0)) for at in (half, -half)),
+        *(box((width, length, SHEET_THICKNESS_M), (at, 0.0, 0.0)) for at in (half, -half)),
     ]
     strip = CollisionBox((length / 2, width / 2, SHEET_THICKNESS_M))
     return Geometry(box_mesh(boxes), (strip,))
@@ -88,8 +84,7 @@ def three_sided_rectangle(size: Vector3) -> Geometry:
     depth, width, bar = size[0], size[1], 0.04
     boxes = [
         box((width, bar, SHEET_THICKNESS_M), (0.0, -depth / 2, 0.0)),
-        box((bar, depth, SHEET_THICKNESS_M), (width / 2, 0.0, 0.0)),
-        box((bar, depth, SHEET_THICKNESS_M), (-width / 2, 0.0, 0.0)),
+        *(box((bar, depth, SHEET_THICKNESS_M), (at, 0.0, 0.0)) for at in (width / 2, -width / 2)),
     ]
     return Geometry(box_mesh(boxes))
 
@@ -106,15 +101,10 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
     Raises:
         UnknownNameError: The catalogue has no such object.
     """
-    if has_fixed_size(object_name):
-        return scale_geometry(fixed_geometry(object_name), scale)
+    if object_name not in BOX_SHAPES:
+        return scale_geometry(fixed_geometry(object_spec(object_name).name), scale)
     geometry = BOX_SHAPES[object_name]((size[0] * scale[0], size[1] * scale[1], size[2] * scale[2]))
     return replace(geometry, visual=drape(geometry.visual))
-
-
-def has_fixed_size(object_name: str) -> bool:
-    """Whether an object's shape ignores the sampled size."""
-    return object_spec(object_name).name not in BOX_SHAPES
 
 
 @cache

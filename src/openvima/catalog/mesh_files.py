@@ -13,7 +13,7 @@ import numpy as np
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
 from openvima.catalog.meshes import TEXTURE_PER_M, scale_mesh
 from openvima.errors import AssetError, InputFileError, ShapeError
-from openvima.input_files import as_path
+from openvima.input_files import as_path, read_text
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,8 +226,6 @@ def _read(mesh: Mesh, what: str) -> ObjMesh:
 
 
 def _read_file(file: Path, what: str) -> ObjMesh:
-    from openvima.input_files import read_text  # imports a YAML parser
-
     try:
         return parse_obj(read_text(file, max_bytes=MAX_OBJ_BYTES), str(file))
     except OSError as error:

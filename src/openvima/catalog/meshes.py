@@ -31,16 +31,12 @@ def prism(
     """
     points = np.concatenate(loops)
     corners = triangulate(loops)
-    top = _at_height(points[corners], z_high)
-    bottom = _at_height(points[corners[:, ::-1]], z_low)
-    faces = [
-        TriangleMesh(top, _constant((0, 0, 1), top), _planar_uvs(points[corners], texture_per_m)),
-        TriangleMesh(
-            bottom, _constant((0, 0, -1), bottom), _planar_uvs(points[corners[:, ::-1]], texture_per_m)
-        ),
-    ]
-    faces += [_side_walls(loop, z_low, z_high, texture_per_m) for loop in loops]
-    return combine(faces)
+    faces = []
+    for z, flat, up in ((z_high, points[corners], 1.0), (z_low, points[corners[:, ::-1]], -1.0)):
+        vertices = _at_height(flat, z)
+        normals = np.broadcast_to([0.0, 0.0, up], vertices.shape)
+        faces.append(TriangleMesh(vertices, normals, 0.5 + texture_per_m * flat))
+    return combine([*faces, *(_side_walls(loop, z_low, z_high, texture_per_m) for loop in loops)])
 
 
 def revolve(
@@ -70,11 +66,8 @@ def revolve(
 
 def combine(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     """Put several meshes together, in order."""
-    return TriangleMesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.normals for mesh in meshes]),
-        np.concatenate([mesh.uvs for mesh in meshes]),
-    )
+    parts = ("vertices", "normals", "uvs")
+    return TriangleMesh(*(np.concatenate([getattr(mesh, part) for mesh in meshes]) for part in parts))
 
 
 def scale_mesh(mesh: TriangleMesh, scale: Vector3) -> TriangleMesh:
@@ -91,11 +84,7 @@ def scale_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
     """Stretch a shape along the axes: what is drawn, its hulls and the height at which it rests."""
     if scale == (1.0, 1.0, 1.0):
         return geometry
-    hulls = tuple(
-        CollisionHull(shape.points * scale)
-        for shape in geometry.collision
-        if isinstance(shape, CollisionHull)
-    )
+    hulls = tuple(CollisionHull(shape.points * scale) for shape in geometry.collision)
     return Geometry(scale_mesh(geometry.visual, scale), hulls, geometry.rest_z_m * scale[2])
 
 
@@ -117,14 +106,6 @@ def _at_height(points: np.ndarray, z: float) -> np.ndarray:
     return np.concatenate([points, np.full((*points.shape[:-1], 1), z)], axis=-1)
 
 
-def _constant(normal: tuple[float, float, float], like: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(np.array(normal, dtype=np.float64), like.shape).copy()
-
-
-def _planar_uvs(points: np.ndarray, texture_per_m: float) -> np.ndarray:
-    return 0.5 + texture_per_m * points
-
-
 def _side_walls(loop: np.ndarray, z_low: float, z_high: float, texture_per_m: float) -> TriangleMesh:
     """Two triangles for each edge; the solid is on the left of the loop."""
     start, end = loop, np.roll(loop, -1, axis=0)
@@ -138,7 +119,7 @@ def _side_walls(loop: np.ndarray, z_low: float, z_high: float, texture_per_m: fl
         for corners in (positions, [start + folded, end + folded, end, start])
     )
     normal = np.repeat(np.concatenate([outward, outward])[:, None], 3, axis=1)
-    return TriangleMesh(vertices, _at_height(normal, 0.0), _planar_uvs(flat, texture_per_m))
+    return TriangleMesh(vertices, _at_height(normal, 0.0), 0.5 + texture_per_m * flat)
 
 
 def _revolved_ring(

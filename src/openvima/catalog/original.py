@@ -16,12 +16,12 @@ import numpy as np
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.bodies import BOX_SHAPES, fixed_geometry
-from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
+from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
 from openvima.catalog.mesh_files import ObjMesh, parse_obj
 from openvima.catalog.meshes import scale_geometry
-from openvima.catalog.objects import REGISTERED_OBJECTS, ObjectSpec, object_spec
-from openvima.catalog.registration import registered_geometry, registered_texture
-from openvima.catalog.textures import REGISTERED_TEXTURES, TextureSpec, texture_spec
+from openvima.catalog.objects import ObjectSpec, object_spec
+from openvima.catalog.procedural import CataloguePack
+from openvima.catalog.textures import TextureSpec, texture_spec
 from openvima.errors import AssetError
 from openvima.input_files import cache_dir
 
@@ -110,14 +110,23 @@ def import_pack(checkout: str | Path) -> list[str]:
         OSError: The cache cannot be written to.
     """
     source = find_pack(checkout)
-    problems: list[str] = []
-    for relative_path in known_hashes():
-        try:
-            atomic_write_file(imported_folder() / relative_path, read_original(source, relative_path))
-        except AssetError as error:
-            problems.append(str(error))
+    problems = _check_files(source, copy_to=imported_folder())
     if len(problems) == len(known_hashes()):
         raise AssetError(f"none of the {len(problems)} files in {source} is sound; {problems[0]}")
+    return problems
+
+
+def _check_files(pack: Path, copy_to: Path | None = None) -> list[str]:
+    """Check every file of a pack, and copy the sound ones; return a sentence for each of the others."""
+    problems = []
+    for relative_path in known_hashes():
+        try:
+            content = read_original(pack, relative_path)
+        except AssetError as error:
+            problems.append(str(error))
+        else:
+            if copy_to is not None:
+                atomic_write_file(copy_to / relative_path, content)
     return problems
 
 
@@ -150,7 +159,7 @@ _PATTERN_FOLDERS = {
 }
 
 
-class OriginalAssets:
+class OriginalAssets(CataloguePack):
     """The shapes and textures of VIMA-Bench; implements `Assets`.
 
     Args:
@@ -168,80 +177,63 @@ class OriginalAssets:
     def __repr__(self) -> str:
         return f"OriginalAssets({str(self.folder)!r})"
 
-    def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
-        """Return the shape of a catalogue object; see `Assets.geometry`.
-
-        Raises:
-            UnknownNameError: The catalogue has no such object.
-            AssetError: A mesh is missing or damaged.
-        """
-        if object_name in REGISTERED_OBJECTS:
-            return registered_geometry(object_name, size, scale)
-        return _protected_geometry(self.folder, object_name, size, scale)
-
-    def texture(self, texture_name: str) -> np.ndarray:
-        """Return the texture's image, shape (H, W, 3), uint8; see `Assets.texture`.
-
-        Raises:
-            UnknownNameError: The catalogue has no such texture.
-            AssetError: The image is missing or damaged.
-        """
-        if texture_name in REGISTERED_TEXTURES:
-            return registered_texture(texture_name)
-        return _protected_texture(self.folder, texture_name)
-
     def problems(self) -> list[str]:
         """Check every file of the pack.
 
         Returns:
             One sentence for each file that is missing or differs from the original; empty if all is well.
         """
-        found = []
-        for relative_path in known_hashes():
-            try:
-                read_original(self.folder, relative_path)
-            except AssetError as error:
-                found.append(str(error))
-        return found
+        return _check_files(self.folder)
 
+    def build(self, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+        """Build a shape from the mesh files.
 
-@lru_cache(maxsize=256)
-def _protected_geometry(pack: Path, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
-    spec = object_spec(object_name)
-    try:
-        return protect(_geometry(pack, spec, size, scale))
-    except AssetError as error:
-        raise AssetError(f"object {object_name!r} cannot be used: {error}") from error
+        Raises:
+            UnknownNameError: The catalogue has no such object.
+            AssetError: A mesh is missing or damaged.
+        """
+        spec = object_spec(object_name)
+        if object_name in BOX_SHAPES:
+            return BOX_SHAPES[object_name](_product(size, scale))
+        if object_name == "stand":  # which has no mesh file
+            return scale_geometry(fixed_geometry("stand with long rods"), scale)
+        try:
+            return self._kit(spec, scale) if spec.kind == "kit" else self._fixed_mesh(object_name, scale)
+        except AssetError as error:
+            raise AssetError(f"object {object_name!r} cannot be used: {error}") from error
 
+    def load_image(self, texture_name: str) -> np.ndarray:
+        """Load the image of a texture.
 
-def _geometry(pack: Path, spec: ObjectSpec, size: Vector3, scale: Vector3) -> Geometry:
-    if spec.name in BOX_SHAPES:
-        return BOX_SHAPES[spec.name](_product(size, scale))
-    if spec.kind == "kit":
-        return _kit(pack, spec, scale)
-    if spec.name == "stand":  # which has no mesh file
-        return scale_geometry(fixed_geometry("stand with long rods"), scale)
-    return _fixed_mesh(pack, spec.name, scale)
+        Raises:
+            AssetError: The image is missing or damaged.
+        """
+        from PIL import Image
 
+        try:
+            content = read_original(self.folder, image_file(texture_spec(texture_name)))
+        except AssetError as error:
+            raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
+        with Image.open(io.BytesIO(content)) as image:
+            return np.array(image.convert("RGB"))
 
-def _kit(pack: Path, spec: ObjectSpec, scale: Vector3) -> Geometry:
-    kit_scale = spec.kit_scale or 1.0
-    metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
-    name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
-    visual = _scale(_mesh(pack, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
-    return Geometry(visual, (_hull(visual.vertices),))
+    def _kit(self, spec: ObjectSpec, scale: Vector3) -> Geometry:
+        kit_scale = spec.kit_scale or 1.0
+        metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
+        name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
+        visual = _scale(_mesh(self.folder, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
+        return Geometry(visual, (_hull(visual.vertices),))
 
-
-def _fixed_mesh(pack: Path, object_name: str, scale: Vector3) -> Geometry:
-    file, metres, rest_z_m = _FIXED_MESHES[object_name]
-    visual = _scale(_mesh(pack, file), _product(metres, scale))
-    collision = (_hull(visual.vertices),)
-    if object_name == "bowl":
-        parts_file, parts_metres = _BOWL_PARTS
-        parts = _mesh(pack, parts_file)
-        vertices = parts.vertices * _product(parts_metres, scale)
-        collision = tuple(_hull(vertices[parts.parts == part]) for part in np.unique(parts.parts))
-    return Geometry(visual, collision, rest_z_m * scale[2])
+    def _fixed_mesh(self, object_name: str, scale: Vector3) -> Geometry:
+        file, metres, rest_z_m = _FIXED_MESHES[object_name]
+        visual = _scale(_mesh(self.folder, file), _product(metres, scale))
+        collision = (_hull(visual.vertices),)
+        if object_name == "bowl":
+            parts_file, parts_metres = _BOWL_PARTS
+            parts = _mesh(self.folder, parts_file)
+            vertices = parts.vertices * _product(parts_metres, scale)
+            collision = tuple(_hull(vertices[parts.parts == part]) for part in np.unique(parts.parts))
+        return Geometry(visual, collision, rest_z_m * scale[2])
 
 
 def _scale(mesh: ObjMesh, metres: Vector3) -> TriangleMesh:
@@ -261,33 +253,6 @@ def _product(a: Vector3, b: Vector3) -> Vector3:
 def _mesh(pack: Path, relative_path: str) -> ObjMesh:
     content = read_original(pack, relative_path)
     return parse_obj(content.decode("utf-8", errors="replace"), relative_path)
-
-
-@lru_cache(maxsize=128)
-def _protected_texture(pack: Path, texture_name: str) -> np.ndarray:
-    spec = texture_spec(texture_name)
-    if spec.texel is not None:
-        texture = np.array(spec.texel, dtype=np.uint8).reshape(1, 1, 3)
-    else:
-        try:
-            texture = _decode(pack, image_file(spec))
-        except AssetError as error:
-            raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
-    texture.setflags(write=False)
-    return texture
-
-
-def _decode(pack: Path, relative_path: str) -> np.ndarray:
-    from PIL import Image
-
-    content = read_original(pack, relative_path)
-    try:
-        with Image.open(io.BytesIO(content)) as image:
-            return np.array(image.convert("RGB"))
-    except OSError as error:
-        raise AssetError(
-            f"{relative_path} cannot be decoded ({error}); is Pillow installed with support for it?"
-        ) from error
 
 
 def image_file(texture: TextureSpec) -> str:

@@ -27,6 +27,9 @@ from openvima.catalog.random_shapes import (
 )
 from openvima.catalog.textures import DARK_VALUE_DROP
 
+_SIDE_PX = 128
+_PLACES = (np.arange(_SIDE_PX) + 0.5) / _SIDE_PX - 0.5  # of pixels about the middle of the image
+
 
 def hash_numbers(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
     """Return a number in [0, 1) for each combination of whole numbers.
@@ -54,15 +57,14 @@ def _mix_bits(state: np.ndarray) -> np.ndarray:
     return state ^ (state >> np.uint64(31))
 
 
-def value_noise(shape: tuple[int, int], cells: tuple[int, int], seed: int) -> np.ndarray:
-    """Return smooth noise in [0, 1) that continues across opposite borders.
+def value_noise(cells: tuple[int, int], seed: int) -> np.ndarray:
+    """Return smooth noise in [0, 1) that continues across opposite borders, shape (128, 128).
 
     Args:
-        shape: Rows and columns of the image.
         cells: Number of random values down and across, between which the noise changes smoothly.
         seed: Seed of the noise.
     """
-    rows, columns = (np.arange(n) * c / n for n, c in zip(shape, cells, strict=True))
+    rows, columns = (np.arange(_SIDE_PX) * count / _SIDE_PX for count in cells)
     top, left = rows.astype(np.int64), columns.astype(np.int64)
     down, right = _smooth(rows - top)[:, None], _smooth(columns - left)[None, :]
 
@@ -75,12 +77,12 @@ def value_noise(shape: tuple[int, int], cells: tuple[int, int], seed: int) -> np
     return above * (1 - down) + below * down
 
 
-def layered_noise(shape: tuple[int, int], cells: tuple[int, int], seed: int, num_layers: int) -> np.ndarray:
+def layered_noise(cells: tuple[int, int], seed: int, num_layers: int) -> np.ndarray:
     """Return fractal noise in [0, 1): layers of doubled frequency and halved amplitude."""
-    total, weight_sum = np.zeros(shape), 0.0
+    total, weight_sum = np.zeros((_SIDE_PX, _SIDE_PX)), 0.0
     for layer in range(num_layers):
         weight = 0.5**layer
-        total += weight * value_noise(shape, (cells[0] << layer, cells[1] << layer), seed + layer)
+        total += weight * value_noise((cells[0] << layer, cells[1] << layer), seed + layer)
         weight_sum += weight
     return total / weight_sum
 
@@ -89,7 +91,6 @@ def _smooth(t: np.ndarray) -> np.ndarray:
     return t * t * (3 - 2 * t)
 
 
-_SIDE_PX = 128
 _PERIODS = (0.05, 0.35)  # shortest and longest, in widths of the image; a kit object shows a third of it
 _LEAST_CONTRAST = 60  # in the channel in which two neighbouring colours differ most
 _GREY_SHARE = 0.2
@@ -113,7 +114,7 @@ def random_texture(rng: np.random.Generator) -> np.ndarray:
     field = _FAMILIES[int(rng.integers(len(_FAMILIES)))](rng)
     image = _blend(field, colours) if rng.random() < 0.25 else colours[field.astype(np.int64) % len(colours)]
     if rng.random() < 0.3:
-        grain = value_noise((_SIDE_PX, _SIDE_PX), (64, 64), _seed(rng)) - 0.5
+        grain = value_noise((64, 64), _seed(rng)) - 0.5
         image = image + rng.uniform(5, 25) * grain[..., None]
     return np.clip(image, 0, 255).astype(np.uint8)
 
@@ -154,8 +155,7 @@ def _blend(field: _Field, colours: np.ndarray) -> np.ndarray:
 
 def _axes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates along and across a random direction, in random periods, about the middle of the image."""
-    places = (np.arange(_SIDE_PX) + 0.5) / _SIDE_PX - 0.5
-    x, y = np.meshgrid(places, places)
+    x, y = np.meshgrid(_PLACES, _PLACES)
     angle, period = rng.uniform(0, 2 * np.pi), float(np.exp(rng.uniform(*np.log(_PERIODS))))
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
     return along / period + rng.uniform(0, 8), across / (period * rng.uniform(0.6, 1.7)) + rng.uniform(0, 8)
@@ -196,20 +196,19 @@ def _bricks(rng: np.random.Generator) -> _Field:
 
 def _patches(rng: np.random.Generator) -> _Field:
     cells = (int(rng.integers(3, 20)), int(rng.integers(3, 20)))
-    noise = layered_noise((_SIDE_PX, _SIDE_PX), cells, _seed(rng), num_layers=int(rng.integers(1, 4)))
+    noise = layered_noise(cells, _seed(rng), num_layers=int(rng.integers(1, 4)))
     return rng.uniform(2, 5) * noise + rng.uniform(0, 3)
 
 
 def _veins(rng: np.random.Generator) -> _Field:
     cells = (int(rng.integers(3, 12)), int(rng.integers(3, 12)))
-    noise = layered_noise((_SIDE_PX, _SIDE_PX), cells, _seed(rng), num_layers=3)
+    noise = layered_noise(cells, _seed(rng), num_layers=3)
     return np.where(np.abs(noise - 0.5) < rng.uniform(0.02, 0.07), 1.0, 0.0)
 
 
 def _swirl(rng: np.random.Generator) -> _Field:
     """Rays about a point near the middle, bent into a spiral; without rays these are circles."""
-    places = (np.arange(_SIDE_PX) + 0.5) / _SIDE_PX - 0.5
-    x, y = np.meshgrid(places - rng.uniform(-0.15, 0.15), places - rng.uniform(-0.15, 0.15))
+    x, y = np.meshgrid(_PLACES - rng.uniform(-0.15, 0.15), _PLACES - rng.uniform(-0.15, 0.15))
     num_rays = int(rng.choice((0, 1, 2, 3, 5, 8, 12)))
     bend = rng.uniform(8, 30) if num_rays < 2 else rng.uniform(-12, 12)
     return 6 + num_rays * np.arctan2(y, x) / np.pi + bend * np.sqrt(x * x + y * y)
@@ -248,15 +247,10 @@ class RandomAppearanceAssets:
     """
 
     def __init__(self, base: Assets, num_kept: int = _KEPT) -> None:
-        self.base = base
+        self.base, self.name = base, f"{base.name} and random appearance"
         self._plain_shape = lru_cache(num_kept)(_draw_shape)
         self._shape = lru_cache(_KEPT)(self._stretch)
         self._texture = lru_cache(num_kept)(_draw_texture)
-
-    @property
-    def name(self) -> str:
-        """Name of the pack."""
-        return f"{self.base.name} and random appearance"
 
     def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
         """Return a shape; see `Assets.geometry`. Random shapes have one size and ignore `size`."""

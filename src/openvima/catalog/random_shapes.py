@@ -141,21 +141,24 @@ def has_heading(loops: tuple[np.ndarray, ...]) -> bool:
 
 def _centroid(loops: tuple[np.ndarray, ...]) -> np.ndarray:
     """Centroid of the area inside an outline, shape (2,)."""
-    start = np.concatenate(loops)
-    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    start, end = _sides(loops)
     parts = start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]  # of triangles with the origin, holes negative
     return ((start + end) * parts[:, None]).sum(axis=0) / (3 * parts.sum())
 
 
 def _inside(points: np.ndarray, loops: tuple[np.ndarray, ...]) -> np.ndarray:
     """Whether points are inside an outline and in none of its holes, shape (N,), bool; by crossings."""
-    start = np.concatenate(loops)
-    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    start, end = _sides(loops)
     x, y = points[:, :1], points[:, 1:]
     spans = (start[:, 1] > y) != (end[:, 1] > y)
     rise = np.where(start[:, 1] == end[:, 1], 1.0, end[:, 1] - start[:, 1])
     crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
     return (spans & (x < crossing)).sum(axis=1) % 2 == 1
+
+
+def _sides(loops: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """First and second end of each side of an outline, both of shape (N, 2)."""
+    return np.concatenate(loops), np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
 
 
 def _polar(radii: np.ndarray, angles: np.ndarray) -> np.ndarray:
@@ -281,8 +284,7 @@ def _borders(cells: set[Cell]) -> list[np.ndarray]:
 
 def _open_box(rng: np.random.Generator) -> Geometry:
     x, y = rng.uniform(0.12, 0.2, 2)
-    geometry = bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07))))
-    return Geometry(drape(geometry.visual), rest_z_m=geometry.rest_z_m)
+    return _draped(bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07)))))
 
 
 def _spread(length: float, part: float, count: int) -> list[float]:
@@ -291,8 +293,11 @@ def _spread(length: float, part: float, count: int) -> list[float]:
 
 
 def _flat_square(rng: np.random.Generator) -> Geometry:
-    geometry = bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001))
-    return Geometry(drape(geometry.visual), rest_z_m=geometry.rest_z_m)
+    return _draped(bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001)))
+
+
+def _draped(boxes: Geometry) -> Geometry:
+    return Geometry(drape(boxes.visual), rest_z_m=boxes.rest_z_m)
 
 
 def _frame(rng: np.random.Generator) -> Geometry:

@@ -20,7 +20,7 @@ from openvima.errors import (
     ShapeError,
     echo,
 )
-from openvima.input_files import as_path
+from openvima.input_files import as_path, read_png
 
 MAX_TEXTURE_SIDE = 1024  # pixels
 MAX_PNG_BYTES = 8 << 20
@@ -197,8 +197,6 @@ def _digest(text: str, *arrays: np.ndarray) -> str:
 
 def _read_png(file: Path, what: str) -> np.ndarray:
     """Decode a PNG file of limited size, shape (H, W, 3), uint8."""
-    from openvima.input_files import read_png  # imports a YAML parser
-
     try:
         pixels = np.asarray(read_png(file, max_bytes=MAX_PNG_BYTES, max_side=MAX_TEXTURE_SIDE))
     except InputFileError as error:

@@ -116,12 +116,8 @@ class ObjectTable:
         """Put the rows of several tables into one."""
         if not tables:
             return ObjectTable.from_views(ObjectViews.concatenate([]), ImageStack((CROP_SIZE, CROP_SIZE)))
-        return ObjectTable(
-            np.concatenate([table.ids for table in tables]),
-            np.concatenate([table.crop_index for table in tables]),
-            np.concatenate([table.boxes for table in tables]),
-            np.concatenate([table.grasps for table in tables]),
-        )
+        names = ("ids", "crop_index", "boxes", "grasps")
+        return ObjectTable(*(np.concatenate([getattr(table, name) for table in tables]) for name in names))
 
     @staticmethod
     def from_views(objects: ObjectViews, stack: ImageStack) -> "ObjectTable":

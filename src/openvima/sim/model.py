@@ -3,7 +3,7 @@
 A model depends on the shapes alone, so that models and their convex hulls are shared between scenes; poses
 are in `MjData`.
 
-Contact parameters: MuJoCo's contacts are springs. `_SOLREF` and `_SOLIMP` make them as stiff as 1/240 s
+Contact parameters: MuJoCo's contacts are springs. `_SPRING` makes them as stiff as 1/240 s
 allows, so that a body at rest sinks in by micrometres.
 
 VIMA-Bench multiplies the friction coefficients of a pair; MuJoCo takes the larger one. No coefficient exceeds
@@ -37,8 +37,14 @@ FLOOR_Z_M = -0.001  # top of the floor; the visible sheet is at 0
 HULL_MARGIN_M = 0.001  # hulls touch at this distance, as in the benchmark
 BOX_MARGIN_M = 1e-5  # at 0, a box that just touches the floor would fall freely for one tick
 
-_SOLREF = (0.0125, 1.0)  # s, damping ratio: three ticks, critically damped; at two, round bodies gain energy
-_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)
+_SPRING = {
+    "condim": 3,
+    "solref": [
+        0.0125,
+        1.0,
+    ],  # s, damping ratio: three ticks, critically damped; at two, round bodies gain energy
+    "solimp": [0.99, 0.999, 0.001, 0.5, 2.0],
+}
 _INERTIA_FACTOR = 3.0  # angular inertia of the benchmark's bodies
 _INERTIA_GROWTH_M = 0.003  # by which hull bounds are grown for that, on every side
 _TURNING_DAMPING_PER_S = 3.0  # else discs keep wobbling; its linear effect is 100 times smaller
@@ -137,9 +143,7 @@ def _contact(
     return {
         "friction": [friction, 0.0, 0.0],
         "priority": int(slippery),
-        "condim": 3,
-        "solref": list(_SOLREF),
-        "solimp": list(_SOLIMP),
+        **_SPRING,
         "margin": margin,
         "contype": _COLLIDES,
         "conaffinity": affinity,
@@ -198,10 +202,8 @@ def _add_slippery_pairs(spec: mujoco.MjSpec, slippery: list[tuple[str, float, bo
             spec.add_pair(
                 geomname1=name1,
                 geomname2=name2,
-                condim=3,
                 friction=[friction, friction, 0.0, 0.0, 0.0],
-                solref=list(_SOLREF),
-                solimp=list(_SOLIMP),
+                **_SPRING,
             )
 
 

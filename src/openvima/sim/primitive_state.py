@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +19,7 @@ STRIDE_TICKS = 5  # interval of speed checks; divides MONITOR_TICKS
 _QUIET_STRIDES = 2  # consecutive, so that a body that reverses its motion does not count as settled
 
 
+@dataclass(slots=True, eq=False)
 class Settling:
     """Physics until every free body has been slow for 10 ticks, or the limit is reached.
 
@@ -26,22 +28,15 @@ class Settling:
         apart_from: Index of a body to ignore, such as a parked one.
         max_speed: Bound of the horizontal speed in m/s, for bodies that overlap at the start.
         sleeping: See `Bodies.tick`.
+        num_ticks: Ticks so far.
     """
 
-    def __init__(
-        self,
-        bodies: Bodies,
-        *,
-        apart_from: int | None = None,
-        max_speed: float | None = None,
-        sleeping: Collection[int] = (),
-    ) -> None:
-        self._bodies = bodies
-        self._apart_from = apart_from
-        self._max_speed = max_speed
-        self._sleeping = sleeping
-        self._quiet = 0
-        self.num_ticks = 0
+    bodies: Bodies
+    apart_from: int | None = None
+    max_speed: float | None = None
+    sleeping: Collection[int] = ()
+    num_ticks: int = 0
+    _quiet: int = 0  # strides in a row in which all bodies were slow
 
     @property
     def is_over(self) -> bool:
@@ -50,17 +45,17 @@ class Settling:
 
     def run(self, num_ticks: int = STRIDE_TICKS) -> None:
         """Run one stride; where it is the last one, stop all bodies."""
-        before = self._bodies.coordinates()
-        self._bodies.tick(num_ticks, sleeping=self._sleeping)
-        if self._max_speed is not None:
-            self._bodies.limit_speed(self._max_speed)
+        before = self.bodies.coordinates()
+        self.bodies.tick(num_ticks, sleeping=self.sleeping)
+        if self.max_speed is not None:
+            self.bodies.limit_speed(self.max_speed)
         self.num_ticks += num_ticks
-        speed, turning = self._bodies.mean_speeds(before, num_ticks * TICK_S, apart_from=self._apart_from)
+        speed, turning = self.bodies.mean_speeds(before, num_ticks * TICK_S, apart_from=self.apart_from)
         is_slow = speed < SETTLED_SPEED and turning < SETTLED_TURNING
         self._quiet = self._quiet + 1 if is_slow else 0
         if self.is_over:
-            self._bodies.stop()
-            self._bodies.refresh()
+            self.bodies.stop()
+            self.bodies.refresh()
 
 
 FRAMES_PER_SECOND = 30  # of simulated time, in a video
@@ -82,31 +77,26 @@ def reachable_joints(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray
     return inverse(x, y, min(z, highest_tip_z(x, y) - REACH_RESERVE_M), yaw_rad)
 
 
+@dataclass(slots=True, eq=False)
 class ArmPath:
     """The path of the arm during one primitive.
 
     Frames are computed only with a recorder.
 
     Args:
-        joints: Joint angles at the start, shape (6,), radians.
+        waypoints: Joint angles so far, shape (6,), float64, radians.
         record: Called with scene and joints for every video frame, or None.
     """
 
-    def __init__(self, joints: np.ndarray, record: RecordFrame | None) -> None:
-        self.waypoints = [np.array(joints, dtype=np.float64)]
-        self._record = record
-        self._since_frame_s = 0.0
-        self._stored: list[Scene] = []
+    waypoints: list[np.ndarray]
+    record: RecordFrame | None
+    _since_frame_s: float = 0.0
+    _stored: list[Scene] = field(default_factory=list)
 
     @property
     def joints(self) -> np.ndarray:
         """Current joint angles, shape (6,), radians."""
         return self.waypoints[-1]
-
-    @property
-    def is_recording(self) -> bool:
-        """Whether frames are recorded."""
-        return self._record is not None
 
     def move(
         self, joints: np.ndarray, *, scene: Callable[[np.ndarray], Scene], speed: float = FREE_SPEED
@@ -120,22 +110,22 @@ class ArmPath:
         """
         start = self.joints
         self.waypoints.append(joints)
-        if self._record is None:
+        if self.record is None:
             return
         duration_s = max(math.dist(joints, start) / speed, 1e-9)
         stored, self._stored = self._stored, []
         now = start
         for time_s in self._frame_times(duration_s):
             now = start + (joints - start) * (time_s / duration_s)
-            self._record(stored.pop(0) if stored else scene(now), now)
+            self.record(stored.pop(0) if stored else scene(now), now)
         for late in stored:
-            self._record(late, joints)
+            self.record(late, joints)
 
     def stay(self, num_ticks: int, *, scene: Callable[[], Scene], joints: Callable[[], np.ndarray]) -> None:
         """Record the frames of some physics ticks, with the arm at `joints()`."""
         for _ in self._frame_times(num_ticks * TICK_S):
-            if self._record is not None:
-                self._record(scene(), joints())
+            if self.record is not None:
+                self.record(scene(), joints())
 
     def store(self, num_ticks: int, *, scene: Callable[[], Scene]) -> None:
         """Store the frames of some physics ticks for the arm's next move, which happens meanwhile."""
@@ -148,7 +138,7 @@ class ArmPath:
 
     def _frame_times(self, duration_s: float) -> Iterator[float]:
         """Times within the coming `duration_s` seconds at which a frame is due."""
-        if self._record is None:
+        if self.record is None:
             return
         due_s = FRAME_S - self._since_frame_s
         count = max(0, math.floor((duration_s - due_s) / FRAME_S + 1e-9) + 1)
@@ -163,25 +153,24 @@ STILL_M = 5e-5  # a body that moved by less than this, and rotated by less than 
 STILL_RAD = 5e-4  # … this, keeps its pose, so that nothing creeps over many steps
 
 
+@dataclass(slots=True, eq=False)
 class PrimitiveState:
     """Bodies, arm and monitor during one primitive.
 
     Args:
-        scene: The scene at the start.
+        start: The scene at the start.
         bodies: Its bodies.
         path: Path of the arm.
         monitor: Called with the scene at least every 25 ticks of physics, or None.
+        num_ticks: Ticks of physics so far.
     """
 
-    def __init__(
-        self, scene: Scene, bodies: Bodies, path: ArmPath, monitor: Callable[[Scene], None] | None
-    ) -> None:
-        self.start = scene
-        self.bodies = bodies
-        self.path = path
-        self.num_ticks = 0
-        self._monitor = monitor
-        self._unmonitored_ticks = 0
+    start: Scene
+    bodies: Bodies
+    path: ArmPath
+    monitor: Callable[[Scene], None] | None
+    num_ticks: int = 0
+    _unmonitored_ticks: int = 0
 
     def placement(self, index: int) -> Placement:
         """A placement at the start."""
@@ -199,15 +188,15 @@ class PrimitiveState:
         self.num_ticks += num_ticks
         self._unmonitored_ticks += num_ticks
         is_time = self._unmonitored_ticks + STRIDE_TICKS > MONITOR_TICKS
-        if is_time and self._monitor is not None:
+        if is_time and self.monitor is not None:
             self._unmonitored_ticks = 0
-            self._monitor(self.scene(held))
+            self.monitor(self.scene(held))
 
     def notify(self) -> None:
         """Call the monitor now: bodies move without physics."""
-        if self._monitor is not None:
+        if self.monitor is not None:
             self._unmonitored_ticks = 0
-            self._monitor(self.scene())
+            self.monitor(self.scene())
 
     def settle(
         self,
@@ -235,8 +224,8 @@ class PrimitiveState:
                 poses[self.placement(index).id] = after
         self.bodies.refresh()
         final = self.start.with_poses(poses)
-        if self._monitor is not None:
-            self._monitor(final)
+        if self.monitor is not None:
+            self.monitor(final)
         return final
 
 

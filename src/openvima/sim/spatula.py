@@ -128,7 +128,7 @@ class Spatula:
         if state.num_ticks:
             self._wake(_SLIDE_M)
             state.settle(max_speed=MAX_SPEED, sleeping=self._sleeping)
-        after = state.scene() if state.path.is_recording else state.start
+        after = state.scene() if state.path.record else state.start
         state.path.move(hover, scene=lambda _: after)
 
     def _displace(self, index: int) -> bool:
@@ -166,7 +166,8 @@ class Spatula:
         physics. Short of the target, a stride of physics follows in any case: contacts have changed.
         """
         while (left := math.dist(target, self._tip)) > 1e-9:
-            direction = _direction(self._tip, target, left)
+            x, y, z = ((end - start) / left for start, end in zip(self._tip, target, strict=True))
+            direction = (x, y, z)
             if self._is_calm():
                 left = self._move_freely(direction, left)
             elif left > _MIN_CARRY_M and (carried := self._carried_bodies()) is not None:
@@ -286,7 +287,7 @@ class Spatula:
     def _record_frames(self, direction: Vector3, length: float) -> None:
         """Record the frames of a motion without contact."""
         state = self._state
-        if not state.path.is_recording or length <= 0:
+        if state.path.record is None or length <= 0:
             return
         scene = state.scene()
         joints = self._joints_at(*_move(self._tip, direction, length))
@@ -308,16 +309,9 @@ class Spatula:
         return Pose.planar(x, y, self._yaw_rad, z=ur5.spatula_centre_z(tip_z))
 
 
-def _direction(start: Vector3, end: Vector3, distance: float) -> Vector3:
-    return ((end[0] - start[0]) / distance, (end[1] - start[1]) / distance, (end[2] - start[2]) / distance)
-
-
 def _move(point: Vector3, direction: Vector3, length: float) -> Vector3:
-    return (
-        point[0] + direction[0] * length,
-        point[1] + direction[1] * length,
-        point[2] + direction[2] * length,
-    )
+    x, y, z = (start + part * length for start, part in zip(point, direction, strict=True))
+    return (x, y, z)
 
 
 def _joint_space_path(start: np.ndarray, end: np.ndarray) -> list[Vector3]:

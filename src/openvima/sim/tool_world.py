@@ -70,8 +70,7 @@ class ToolWorld:
         """The current scene, with a held body at the tool."""
         if self._state is None:
             return self.scene_at_rest
-        held = self._held
-        return self._state.scene(None if held is None else (held.index, self._held_pose(held)))
+        return self._state.scene(self._held_at())
 
     @property
     def joints(self) -> np.ndarray:
@@ -141,7 +140,7 @@ class ToolWorld:
         return True
 
     def _new_state(self, monitor: Callable[[Scene], None] | None) -> PrimitiveState:
-        return PrimitiveState(self.scene_at_rest, self._bodies, ArmPath(self._joints, None), monitor)
+        return PrimitiveState(self.scene_at_rest, self._bodies, ArmPath([self._joints], None), monitor)
 
     def _take_hold(self, monitor: Callable[[Scene], None] | None) -> None:
         """Grasp the body below the cup, or press the spatula to the table, if it is near enough."""
@@ -274,6 +273,10 @@ class ToolWorld:
         pose = self.pose
         return held.carried(pose.x, pose.y, pose.yaw_rad).moved(dz=pose.z - held.grasp.z)
 
+    def _held_at(self) -> tuple[int, Pose] | None:
+        """Index and pose of the held body, as `PrimitiveState` takes them."""
+        return None if self._held is None else (self._held.index, self._held_pose(self._held))
+
     def _run_physics(self) -> None:
         """Run the physics of a part of a command, if anything moves."""
         pose, state = self.pose, self._state
@@ -281,7 +284,7 @@ class ToolWorld:
             self._spatula.slide(pose.x, pose.y, pose.yaw_rad, _PART_TICKS)
         if self._settling is None or state is None:
             return
-        held = None if self._held is None else (self._held.index, self._held_pose(self._held))
+        held = self._held_at()
         for done in range(0, _PART_TICKS, STRIDE_TICKS):
             num_ticks = min(STRIDE_TICKS, _PART_TICKS - done)
             self._settling.run(num_ticks)

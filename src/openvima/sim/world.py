@@ -55,7 +55,9 @@ def pick_place(state: PrimitiveState, action: Action) -> int | None:
         path.move(hover, scene=lambda _: state.start)
         return None
     held = HeldBody(caught, bodies.pose(caught), ToolPose(x, y, contact_z, action.yaw0_rad))
-    stands_alone = _lift(state, held)
+    stands_alone, carries_others = take_out(bodies, held)
+    if carries_others:
+        state.settle((held.index, held.grasped_at.moved(dz=ur5.HOVER_TIP_Z_M)))
     path.move(hover, scene=lambda joints: state.scene(held.at(joints)))
     _set_down(state, held, action, stands_alone=stands_alone)
     return caught
@@ -145,14 +147,6 @@ class HeldBody:
         return target.moved(dz=_ABOVE_ALL_M - drop), on_floor
 
 
-def _lift(state: PrimitiveState, held: HeldBody) -> bool:
-    """Take a body out of the physics and let others settle; return whether it touched no other."""
-    stands_alone, carries_others = take_out(state.bodies, held)
-    if carries_others:
-        state.settle((held.index, held.grasped_at.moved(dz=ur5.HOVER_TIP_Z_M)))
-    return stands_alone
-
-
 def take_out(bodies: Bodies, held: HeldBody) -> tuple[bool, bool]:
     """Take a grasped body out of the physics.
 
@@ -188,7 +182,7 @@ def _set_down(state: PrimitiveState, held: HeldBody, action: Action, *, stands_a
         bodies.place(held.index, set_down_at)
         bodies.refresh()
         state.settle()
-    after = state.scene() if path.is_recording else state.start
+    after = state.scene() if path.record else state.start
     path.move(hover, scene=lambda _: after)
 
 
@@ -346,19 +340,17 @@ class World:
         Returns:
             The result; `scene` and `joints` are updated.
         """
-        path = ArmPath(self._joints, record)
+        path = ArmPath([self._joints], record)
         state = PrimitiveState(self.scene, self._bodies, path, monitor)
         if not self._is_settled:
             state.settle(max_speed=SEPARATION_SPEED)
             self._is_settled = True
-        grasped = self._perform(state, action)
+        grasped = None
+        if self.scene.end_effector == "suction":
+            grasped = pick_place(state, action)
+        else:
+            sweep(state, action, compat=self._compat)
         self.scene = state.finish()
         self._joints = path.joints
         grasped_id = None if grasped is None else state.placement(grasped).id
         return Execution(grasped_id, path.array(), state.num_ticks)
-
-    def _perform(self, state: PrimitiveState, action: Action) -> int | None:
-        if self.scene.end_effector == "suction":
-            return pick_place(state, action)
-        sweep(state, action, compat=self._compat)
-        return None

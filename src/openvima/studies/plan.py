@@ -18,7 +18,7 @@ from typing import Any
 
 from openvima.data.subsets import SubsetConfig
 from openvima.errors import ConfigError
-from openvima.evaluation.config import EvaluationConfig
+from openvima.evaluation.config import DEFAULT_DEVICE, EvaluationConfig
 from openvima.studies.study import Demonstrations, Run, Settings, Study, StudyInputs
 from openvima.training.config import TrainingConfig
 from openvima.training.recipes import override, recipe_settings
@@ -65,7 +65,8 @@ class Plan:
         study: The study.
         inputs: What it was made from.
         out: Its folder.
-        options: Settings of all evaluations, such as `device` and `workers`.
+        how: `workers`, `engine` and `address` of the stages that run in parallel, as for `run_study`.
+        device: Where networks are trained and act; None trains on a GPU if there is one, and acts on a CPU.
         data: Folder of each data set.
         subsets: Fractions of data sets, by folder.
         initial: Trainings that others start from, by folder.
@@ -76,7 +77,8 @@ class Plan:
     study: Study
     inputs: StudyInputs
     out: Path
-    options: Mapping[str, Any]
+    how: Mapping[str, Any]
+    device: str | None = None
     data: dict[Demonstrations, Path] = field(default_factory=dict)
     subsets: dict[Path, Subset] = field(default_factory=dict)
     initial: dict[Path, Training] = field(default_factory=dict)
@@ -109,7 +111,8 @@ class Plan:
             out=self.out / "evaluations" / name / f"seed-{seed}",
             env_config=settings.env_config,
             ablations=settings.ablations,
-            **self.options,
+            device=self.device or DEFAULT_DEVICE,
+            **self.how,
         )
         self.evaluations.append(Evaluation(run, seed, config))
 
@@ -145,13 +148,12 @@ class Plan:
         merged: dict[str, Any] = recipe_settings(scale.recipe)
         for others in (scale.settings, self.study.settings, settings):
             merged = override(merged, others)
-        paths = {"data": data, "out": out, "seed": seed, "assets": inputs.assets}
-        device = {"runtime.device": self.options["device"]} if "device" in self.options else {}
-        return TrainingConfig.of({**merged, **paths, **device})
+        here = {"data": data, "out": out, "seed": seed, "assets": inputs.assets}
+        return TrainingConfig.of({**merged, **here, "runtime.device": self.device or "auto"})
 
 
 def plan_study(
-    study: Study, inputs: StudyInputs, out: Path, *, seeds: int, device: str | None = None, **options: Any
+    study: Study, inputs: StudyInputs, out: Path, *, seeds: int, device: str | None = None, **how: Any
 ) -> Plan:
     """Divide a study into stages; policies that exist have a single seed.
 
@@ -160,8 +162,8 @@ def plan_study(
         inputs: What it was made from.
         out: Its folder.
         seeds: Training seeds.
-        device: Where networks are trained and act; None trains on a GPU if there is one, and acts on a CPU.
-        **options: `workers`, `engine` and `address`, as for `run_study`.
+        device: As in `Plan`.
+        **how: As in `Plan`.
 
     Raises:
         ConfigError: Settings are not allowed, or two labels give the same folder.
@@ -171,7 +173,7 @@ def plan_study(
     names = {run.label: _folder_name(run.label) for run in study.runs}
     if len(set(names.values())) < len(names):
         raise ConfigError(f"labels {', '.join(names)} give the same folders; choose others.")
-    plan = Plan(study, inputs, out, options if device is None else {**options, "device": device})
+    plan = Plan(study, inputs, out, how, device)
     for run in study.runs:
         for seed in range(seeds if run.policy is None else 1):
             plan.add(run, names[run.label], seed)
@@ -188,13 +190,14 @@ def _folder_name(label: str) -> str:
     return re.sub(r"[^\w.+-]+", "-", label).strip("-.") or "run"
 
 
-def record_of(study: Study, inputs: StudyInputs, device: str | None) -> dict[str, Any]:
+def record_of(plan: Plan) -> dict[str, Any]:
     """Return what identifies the content of a study's folder, the number of seeds apart, as JSON values."""
+    study, inputs = plan.study, plan.inputs
     record = {
         "study": study.name,
         "scale": inputs.scale.name,
         "assets": inputs.assets,
-        "device": device,
+        "device": plan.device,
         "recipe": inputs.scale.recipe,
         "settings": {**inputs.scale.settings, **study.settings},
         "data": study.data,

@@ -20,7 +20,7 @@ from openvima.report.figures import RateFigure, RatePoint, rate_figure_html
 from openvima.report.published import RELIABILITY
 from openvima.report.text import ablation_name
 from openvima.studies.plan import COST_FILE, Plan
-from openvima.studies.study import PublishedPoint, Run, Study, StudyInputs
+from openvima.studies.study import PublishedPoint, Run, Study
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,20 +53,20 @@ class Point:
     difference_interval: Interval | None = None
 
 
-def study_points(study: Study, plan: Plan) -> list[Point]:
+def study_points(plan: Plan) -> list[Point]:
     """Read the evaluations of a study; points in the order of runs, ablations and levels."""
+    study = plan.study
     found: dict[str, list[Results]] = {}
     for evaluation in plan.evaluations:
         found.setdefault(evaluation.run.label, []).append(Results.read(evaluation.config.out))
     points = []
     for run in study.runs:
-        settings = run.evaluation or study.evaluation
-        results = found[run.label]
-        for ablation in (*([""] if settings.plain else []), *_ablations(results)):
+        has_plain, results = (run.evaluation or study.evaluation).plain, found[run.label]
+        ablations = dict.fromkeys(row.ablation for row in results[0].rows if row.ablation)
+        for ablation in (*([""] if has_plain else []), *ablations):
             for level in results[0].levels():
-                reference = (
-                    (results, "") if ablation and settings.plain else (found[study.runs[0].label], ablation)
-                )
+                is_own = bool(ablation) and has_plain  # compared with the same run without ablation
+                reference = (results, "") if is_own else (found[study.runs[0].label], ablation)
                 if point := _point(study, run, (results, ablation), reference, level):
                     points.append(point)
     return points
@@ -136,10 +136,6 @@ def _outcomes(scores: _Scores, level: str) -> list[dict[str, dict[int, bool]]]:
     ]
 
 
-def _ablations(results: Sequence[Results]) -> list[str]:
-    return [name for name in dict.fromkeys(row.ablation for row in results[0].rows) if name]
-
-
 def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:
     """Read the costs of the trainings, by label; those that others start from under an empty one."""
     costs: dict[str, list[dict[str, Any]]] = {}
@@ -149,8 +145,7 @@ def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:
 
 
 def study_page(
-    study: Study,
-    inputs: StudyInputs,
+    plan: Plan,
     points: Sequence[Point],
     *,
     costs: Mapping[str, Sequence[Mapping[str, Any]]],
@@ -160,19 +155,18 @@ def study_page(
     """Render the page.
 
     Args:
-        study: The study.
-        inputs: What it was made from.
+        plan: The study and its stages.
         points: Its means.
         costs: Costs of the trainings by run, one entry a seed.
         versions: Versions of the packages that results depend on.
         command: The command that repeats the study.
     """
-    levels = list(dict.fromkeys(point.level for point in points))
+    study, levels = plan.study, list(dict.fromkeys(point.level for point in points))
     figure = study_figure(study, points)
     return render_page(
         "study",
         study=study,
-        scale=inputs.scale,
+        scale=plan.inputs.scale,
         num_seeds=max(len(point.score.seeds) for point in points),
         levels=levels,
         figure=rate_figure_html(figure),
@@ -203,14 +197,12 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
                 continue
             x = float(values.index(point.x) if named else point.x)
             if isinstance(point, Point):
-                score = point.score
-                seeds = tuple(mean for mean, _ in score.seeds) if len(score.seeds) > 1 else ()
-                curve, found = (
-                    (point.series or "this study", False),
-                    RatePoint(x, score.mean, score.interval, seeds),
-                )
+                means = tuple(mean for mean, _ in point.score.seeds)
+                seeds = means if len(means) > 1 else ()
+                found = RatePoint(x, point.score.mean, point.score.interval, seeds)
+                curve = point.series or "this study", False
             else:
-                curve, found = (point.series, True), RatePoint(x, point.rate)
+                found, curve = RatePoint(x, point.rate), (point.series, True)
             curves.setdefault(curve, []).append(found)
         for of_name in curves.values():
             of_name.sort(key=lambda point: point.x)

@@ -1,7 +1,7 @@
 """Running a study: stage after stage, each of which resumes after any kill."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -74,10 +74,10 @@ def run_study(
     plan = plan_study(study, inputs, out, seeds=seeds, device=device, **how)
     check_plan(plan)
     with folder_lock(out):
-        record = record_of(study, inputs, device)
+        record = record_of(plan)
         _claim(out, record)
-        _Runner(plan, how, report or (lambda *_: None)).run()
-        points, costs = study_points(study, plan), study_costs(plan)
+        _Runner(plan, report or (lambda *_: None)).run()
+        points, costs = study_points(plan), study_costs(plan)
         versions = Results.read(plan.evaluations[0].config.out).versions
         content = {
             "schema": SCHEMA,
@@ -88,7 +88,7 @@ def run_study(
             "versions": versions,
         }
         atomic_write_file(out / RESULTS_FILE, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-        page = study_page(study, inputs, points, costs=costs, versions=versions, command=command)
+        page = study_page(plan, points, costs=costs, versions=versions, command=command)
         return atomic_write_file(out / PAGE_FILE, page)
 
 
@@ -138,29 +138,28 @@ def _claim(out: Path, record: dict[str, Any]) -> None:
 class _Runner:
     """Runs the stages that are not done."""
 
-    def __init__(self, plan: Plan, how: Mapping[str, Any], report: Report) -> None:
-        self.plan, self.how, self.report = plan, how, report
-        self.done = 0
+    def __init__(self, plan: Plan, report: Report) -> None:
+        self.plan, self.report, self.done = plan, report, 0
 
     def run(self) -> None:
         for demonstrations, out in self.plan.data.items():
             if not is_finished(out):
-                config = replace(_generate_config(demonstrations, out), **self.how)
-                generate(config, lambda done, total, _: self._say(f"generating, {done:,} of {total:,}"))
+                config = replace(_generate_config(demonstrations, out), **self.plan.how)
+                generate(config, self._counting("generating"))
             self._finish(f"demonstrations in {out.name}")
         for out, subset in self.plan.subsets.items():
             if not is_finished(out):
-                sample(*subset, report=lambda d, t, _: self._say(f"sampling, {d:,} of {t:,}"))
+                sample(*subset, report=self._counting("sampling"))
             self._finish(out.name)
         self._train(list(self.plan.initial.values()))
         self._train(self.plan.trainings)
         for evaluation in self.plan.evaluations:
             name = f"{evaluation.run.label}, seed {evaluation.seed}"
-            evaluate(
-                evaluation.config,
-                lambda d, t, _, of=name: self._say(f"evaluating {of}: {d:,} of {t:,} episodes"),
-            )
+            evaluate(evaluation.config, self._counting(f"evaluating {name}"))
             self._finish(f"evaluated {name}")
+
+    def _counting(self, what: str) -> Report:
+        return lambda done, total, _: self._say(f"{what}: {done:,} of {total:,}")
 
     def _finish(self, note: str) -> None:
         self.done += 1
@@ -170,23 +169,14 @@ class _Runner:
         self.report(self.done, self.plan.num_stages, note)
 
     def _train(self, trainings: Sequence[Training]) -> None:
-        missing = []
-        for training in trainings:
-            if (training.config.out / COST_FILE).is_file():
-                self._finish(_described(training))
-            else:
-                missing.append(training)
-        engine, workers, address = (self.how[name] for name in ("engine", "workers", "address"))
-        trained = imap_with_engine(
-            engine,
-            train_one,
-            missing,
-            workers,
-            address=address,
-            report=lambda steps: self._say(f"training, {steps:,} steps"),
-        )
-        for training, _ in trained:
-            self._finish(_described(training))
+        missing = [each for each in trainings if not (each.config.out / COST_FILE).is_file()]
+        for _ in range(len(trainings) - len(missing)):
+            self._finish("trained before")
+        how, steps = self.plan.how, lambda steps: self._say(f"training, {steps:,} steps")
+        for training, _ in imap_with_engine(
+            how["engine"], train_one, missing, how["workers"], address=how["address"], report=steps
+        ):
+            self._finish(f"training {training.run or 'initial weights'}, seed {training.config.seed}")
 
 
 def train_one(training: Training, count: Callable[[int], None]) -> None:
@@ -204,10 +194,6 @@ def train_one(training: Training, count: Callable[[int], None]) -> None:
         **read_costs(config.out),
     }
     atomic_write_file(config.out / COST_FILE, json.dumps(costs, indent=1) + "\n")
-
-
-def _described(training: Training) -> str:
-    return f"training {training.run or 'initial weights'}, seed {training.config.seed}"
 
 
 def _generate_config(demonstrations: Demonstrations, out: Path) -> GenerateConfig:

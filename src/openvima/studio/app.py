@@ -49,12 +49,9 @@ class Studio:
         self._server.stop()
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        if self._server.serves(client.client_id):
-            self._begin(client)
-        else:
+        if not self._server.serves(client.client_id):
             client.add_notification("No entry", "Open the address that openvima studio printed.", color="red")
-
-    def _begin(self, client: viser.ClientHandle) -> None:
+            return
         session = self.sessions[client.client_id] = BrowserSession(client, self.config)
         first = () if self.config.path is None else (BrowsePanel,)
         panels = [panel(session) for panel in dict.fromkeys((*first, *PANELS))]

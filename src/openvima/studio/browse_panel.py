@@ -12,7 +12,7 @@ from openvima.data.manifest import MANIFEST_NAME
 from openvima.data.reader import DemonstrationQuery, find_demonstrations
 from openvima.env.tabletop import VideoFrame
 from openvima.errors import DatasetError, PolicyError
-from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode
+from openvima.evaluation.evaluated_episode import evaluated_episode
 from openvima.evaluation.results import FILE_NAME, Results
 from openvima.input_files import as_path
 from openvima.render import channels_last
@@ -59,26 +59,22 @@ class BrowsePanel:
         self._source = gui.add_text("weights", "", hint="run folder; empty: found by the hash of its weights")
         self.session.add_buttons("play again", {"live": self._replay})
         self._reason = gui.add_markdown("")
-        for choice in (self._policy, self._ablation):
-            choice.on_update(self.session.callback(self._show_matrix))
-        self._failures.on_update(self.session.callback(self._show_cell))
-        self._outcome.on_update(self.session.callback(self._replay))
+        self.session.on_update(self._show_matrix, self._policy, self._ablation)
+        self.session.on_update(self._show_cell, self._failures)
+        self.session.on_update(self._replay, self._outcome)
 
     def _add_data_fields(self, gui: viser.GuiApi) -> None:
-        self._task = gui.add_dropdown("task", [_ALL])
-        self._level = gui.add_dropdown("level", [_ALL, *LEVELS])
-        self._object = gui.add_dropdown("object", [_ALL, *OBJECTS])
-        self._texture = gui.add_dropdown("texture", [_ALL, *TEXTURES])
+        choices = {"task": (), "level": LEVELS, "object": OBJECTS, "texture": TEXTURES}
+        self._choices = {name: gui.add_dropdown(name, [_ALL, *known]) for name, known in choices.items()}
         self._steps = gui.add_multi_slider("steps", 0, _MOST_STEPS, 1, (0, _MOST_STEPS))
         self._count = gui.add_markdown("")
         self._number = gui.add_slider("demonstration", 0, 1, 1, 0)
         self._step = gui.add_slider("after step", 0, 1, 1, 0)
         self._caption = gui.add_markdown("")
         self._views = gui.add_image(_NOTHING, label="front, top")
-        for choice in (self._task, self._level, self._object, self._texture, self._steps):
-            choice.on_update(self.session.callback(self._find))
-        self._number.on_update(self.session.callback(self._load))
-        self._step.on_update(self.session.callback(self._scrub))
+        self.session.on_update(self._find, *self._choices.values(), self._steps)
+        self.session.on_update(self._load, self._number)
+        self.session.on_update(self._scrub, self._step)
 
     def open(self) -> None:
         """Open what the path names.
@@ -105,7 +101,7 @@ class BrowsePanel:
             self._show_matrix()
         if self._dataset is not None:
             self._title.content = f"`{folder}`: {len(self._dataset):,} demonstrations"
-            self._task.options = [_ALL, *self._dataset.manifest["tasks"]]
+            self._choices["task"].options = [_ALL, *self._dataset.manifest["tasks"]]
             self._find()
 
     def _show_matrix(self) -> None:
@@ -145,8 +141,8 @@ class BrowsePanel:
     def _chosen_ablation(self) -> str:
         return "" if self._ablation.value == _NONE else self._ablation.value
 
-    def _evaluated(self) -> EvaluatedEpisode:
-        """Return the chosen episode.
+    def _replay(self) -> None:
+        """Play an episode again, with its policy or with its actions where the policy is not found.
 
         Raises:
             DatasetError: None is chosen.
@@ -154,7 +150,7 @@ class BrowsePanel:
         seed = self._outcome.value.partition(":")[0]
         if self._results is None or not seed.isdigit():
             raise DatasetError("no episode is chosen; choose a cell and an episode.")
-        return evaluated_episode(
+        found = evaluated_episode(
             self._results[0],
             self._policy.value,
             *self._cell,
@@ -163,10 +159,6 @@ class BrowsePanel:
             source=self._source.value.strip() or None,
             trust_code=self.session.config.trust_code,
         )
-
-    def _replay(self) -> None:
-        """Play an episode again, with its policy or with its actions where the policy is not found."""
-        found = self._evaluated()
         try:
             policy = found.load_policy()
         except PolicyError as error:
@@ -180,8 +172,7 @@ class BrowsePanel:
     def _find(self) -> None:
         """Find the demonstrations that the fields ask for."""
         assert self._dataset is not None  # as opened
-        chosen = {"task": self._task, "level": self._level, "object": self._object, "texture": self._texture}
-        fields = {name: field.value for name, field in chosen.items() if field.value != _ALL}
+        fields = {name: field.value for name, field in self._choices.items() if field.value != _ALL}
         fewest, most = (int(value) for value in self._steps.value)
         query = DemonstrationQuery(
             **fields, min_steps=fewest, max_steps=None if most == _MOST_STEPS else most

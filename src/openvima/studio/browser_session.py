@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any  # of coroutines
+from typing import Any  # of coroutines and fields
 
 import numpy as np
 import viser
@@ -32,8 +32,6 @@ from openvima.tasks.pushes import Push
 from openvima.video.explanation import PLACE
 from openvima.video.prompt_strip import Colour, draw_prompt_strip
 
-Point = tuple[float, float]
-
 
 def clicked_action(scene: Scene, first: Hit, second: Hit, *, turn_rad: float = 0.0) -> Action:
     """Return the action of two clicks.
@@ -48,7 +46,7 @@ def clicked_action(scene: Scene, first: Hit, second: Hit, *, turn_rad: float = 0
     Raises:
         SceneError: The first click of a pick is on no object, or on one that is fixed to the table.
     """
-    start, end = _planar(first), _planar(second)
+    start, end = first.point[:2], second.point[:2]
     if scene.end_effector == "spatula":
         if first.object_id != TABLE and not scene[first.object_id].fixed:
             pose = scene[first.object_id].pose
@@ -59,11 +57,6 @@ def clicked_action(scene: Scene, first: Hit, second: Hit, *, turn_rad: float = 0
     if scene[first.object_id].fixed:
         raise SceneError(f"{scene.describe(first.object_id)} is fixed to the table; click another object.")
     return Action.planar(start, end, turn_rad)
-
-
-def _planar(hit: Hit) -> Point:
-    x, y, _ = hit.point
-    return x, y
 
 
 SECOND_TABLE_Y_M = 1.15  # beside the first
@@ -169,7 +162,7 @@ class Table:
             nodes = [
                 self.scene_api.add_frame(f"{self.root}/arm/{link}", show_axes=False) for link in range(8)
             ]
-            for number, (link, rgb, mesh) in enumerate(arm_parts(end_effector)):
+            for number, (link, _, rgb, mesh) in enumerate(arm_parts(end_effector)):
                 name = f"{self.root}/arm/{link}/{number}"
                 self.scene_api.add_glb(name, coloured_glb(mesh, rgb), cast_shadow=False, receive_shadow=False)
             self._arm = (end_effector, nodes)
@@ -304,6 +297,11 @@ class BrowserSession:
                 self.interrupt(work)
 
         return called
+
+    def on_update(self, work: Callable[[], object], *fields: Any) -> None:  # viser has no type for all fields
+        """Do work, as `callback` does, whenever the user changes one of these fields."""
+        for field in fields:
+            field.on_update(self.callback(work))
 
     def add_buttons(
         self, label: str, actions: Mapping[str, Callable[[], object]]

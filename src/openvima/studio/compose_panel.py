@@ -35,7 +35,7 @@ class ComposePanel:
             actions = {"edit this episode": self._take_over, "new scene": self._begin, "play": self._play}
             session.add_buttons("", actions)
             self._edits = gui.add_checkbox("clicks select objects", True, hint="else they act, as in You")
-            self._edits.on_update(session.callback(self._follow))
+            session.on_update(self._follow, self._edits)
             with gui.add_folder("Object"):
                 self._add_object_fields(gui)
             with gui.add_form("Sentence") as sentence:
@@ -53,15 +53,15 @@ class ComposePanel:
     def _add_object_fields(self, gui: viser.GuiApi) -> None:
         self._object = gui.add_dropdown("shape", [*OBJECTS], initial_value="heart")
         self._texture = gui.add_dropdown("texture", [*TEXTURES], initial_value="red swirl")
-        changes = {"add": self._add, "replace": self._replace, "remove": self._remove}
+        changes = {"add": self._drop, "replace": self._replace, "remove": self._remove}
         self.session.add_buttons("", changes)
         self._selected = gui.add_dropdown("selected", [_NONE])
         self._pose = gui.add_vector3("x, y (m), turn (°)", (0.5, 0.0, 0.0), step=0.005)
         self._scale = gui.add_slider("size", 0.5, 2.0, 0.05, 1.0)
-        self._texture.on_update(self.session.callback(self._show_shelf))
-        self._selected.on_update(self.session.callback(self._show_selected))
-        self._pose.on_update(self.session.callback(lambda: self._move(self._pose.value)))
-        self._scale.on_update(self.session.callback(lambda: self._change_selected(scale=self._scale.value)))
+        self.session.on_update(self._show_shelf, self._texture)
+        self.session.on_update(self._show_selected, self._selected)
+        self.session.on_update(lambda: self._move(self._pose.value), self._pose)
+        self.session.on_update(lambda: self._change_selected(scale=self._scale.value), self._scale)
 
     def _add_sentence_fields(self, gui: viser.GuiApi) -> None:
         self._prompt = gui.add_text("prompt", "", hint="{a} shows object a; Enter applies")
@@ -118,10 +118,9 @@ class ComposePanel:
         assert self._scene is not None  # as begun
         return self._scene
 
-    def _add(self) -> None:
-        self._drop(self._object.value, self._texture.value)
-
-    def _drop(self, name: str, texture: str, position: tuple[float, float] | None = None) -> None:
+    def _drop(self, name: str = "", position: tuple[float, float] | None = None) -> None:
+        """Add an object in the chosen texture, by default of the chosen shape where there is room."""
+        name, texture = name or self._object.value, self._texture.value
         new = self._present().added(name, texture, self.session.assets, position=position)
         self._use(new, new.objects[-1].name)
 
@@ -206,7 +205,7 @@ class ComposePanel:
         is_dropped = event.phase == "end"
         move(event.target, placement.pose if is_dropped else Pose.planar(x, y, z=placement.pose.z))
         if is_dropped:
-            self.session.interrupt(lambda: self._drop(placement.object, placement.texture, (x, y)))
+            self.session.interrupt(lambda: self._drop(placement.object, (x, y)))
 
     def _object_dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
         """Move an object of the scene by dragging it."""

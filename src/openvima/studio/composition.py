@@ -32,18 +32,6 @@ from openvima.scene import (
 _DECIMALS = 6  # of positions and angles that `compose` was given, which come back exactly
 
 
-def _handles(placements: Sequence[Placement], fills: Sequence[tuple[str, PromptFill]]) -> dict[int, str]:
-    """Name each object: by the first placeholder that shows it, or by a letter."""
-    names: dict[int, str] = {}
-    for slot, fill in fills:
-        shown = _shown(fill, placements)
-        if shown is not None:
-            names.setdefault(shown, slot)
-    slots = {slot for slot, _ in fills}
-    free = (name for name in default_names() if name not in slots)
-    return {p.id: names.get(p.id) or next(free) for p in placements}
-
-
 def _shown(fill: PromptFill, placements: Sequence[Placement]) -> int | None:
     """Id of the object of the scene that an image shows."""
     if not isinstance(fill, ObjectImage):
@@ -102,7 +90,8 @@ class Composition:
     """The arguments of `compose`, to be changed one at a time.
 
     Args:
-        objects: The objects, each with its handle as `name`.
+        objects: The objects, each with its handle as `name`: the first placeholder that shows it, or
+            a letter.
         prompt: The text.
         images: Content of placeholders that are not handles, as for `compose`.
         goals: Goals by name, as for `compose`.
@@ -139,14 +128,16 @@ class Composition:
         """
         problem = episode.problem
         placements, fills = problem.scene.placements, problem.prompt.images
-        handles = _handles(placements, fills)
+        shown = {slot: _shown(fill, placements) for slot, fill in fills}
+        first = {shown[slot]: slot for slot in reversed(shown)}
+        free = (name for name in default_names() if name not in shown)
+        handles = {p.id: first.get(p.id) or next(free) for p in placements}
         images = {}
         for slot, fill in fills:
-            shown = _shown(fill, placements)
-            if shown is None:
+            if (object_id := shown[slot]) is None:
                 images[slot] = _image(fill)
-            elif handles[shown] != slot:
-                images[slot] = handles[shown]
+            elif handles[object_id] != slot:
+                images[slot] = handles[object_id]
         return Composition(
             tuple(_object(p, handles[p.id]) for p in placements),
             problem.prompt.text,

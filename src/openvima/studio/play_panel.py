@@ -1,6 +1,7 @@
 """Tabs of the episode in view. *Play*: step through it; *You*: act by clicks; *Why*: explanations."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -59,15 +60,8 @@ class PlayPanel:
         self._name = gui.add_dropdown("policy", names, initial_value=SMALL)
         hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
         self._source = gui.add_text("source", "", hint=hint, visible=False)
-        for choice, work in (
-            (self._task, self._open),
-            (self._level, self._open),
-            (self._seed, self._open),
-            (self._assets, self._open),
-            (self._name, self._choose_policy),
-            (self._source, self._choose_policy),
-        ):
-            choice.on_update(self.session.callback(work))
+        self.session.on_update(self._open, self._task, self._level, self._seed, self._assets)
+        self.session.on_update(self._choose_policy, self._name, self._source)
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
         session = self.session
@@ -76,7 +70,7 @@ class PlayPanel:
         session.next_seed = self._next_seed
         self._time = gui.add_slider("after step", 0, 1, 1, 0)
         self._speed = gui.add_slider("speed", 0.25, 8.0, 0.25, 1.0)
-        self._time.on_update(session.callback(lambda: session.back(self._time.value)))
+        session.on_update(lambda: session.back(self._time.value), self._time)
         self._speed.on_update(lambda _: setattr(session, "speed", self._speed.value))
 
     def _choose_policy(self) -> None:
@@ -139,7 +133,7 @@ class UserPanel:
             works = {"turn in place": self._turn_in_place, "cancel": self._forget}
             session.add_buttons("", {**works, "next seed": lambda: session.next_seed()})
             self._record = gui.add_markdown("")
-        self._turn.on_update(session.callback(self._preview))
+        session.on_update(self._preview, self._turn)
         gui.add_command(f"turn by {_TURN_DEG}°", hotkey="T").on_trigger(lambda _: self._turn_by(_TURN_DEG))
         back = gui.add_command(f"turn by -{_TURN_DEG}°", hotkey="T", modifier="shift")
         back.on_trigger(lambda _: self._turn_by(-_TURN_DEG))
@@ -276,8 +270,8 @@ class WhyPanel:
             self._text = gui.add_markdown("")
             blank = np.full((1, 1, 3), 255, np.uint8)
             self._images = [gui.add_image(blank, visible=False) for _ in range(2)]
-        self._shown.on_update(session.callback(session.changed))
-        self._other.on_update(session.callback(self._choose_other))
+        session.on_update(session.changed, self._shown)
+        session.on_update(self._choose_other, self._other)
         session.on_change(self._show)
 
     def _choose_other(self) -> None:
@@ -388,4 +382,4 @@ class WhyPanel:
 
 def _quoted(words: str) -> str:
     """Show what a model said as it is, without letting it write Markdown."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>()#+!|" else letter for letter in echo(words, 2000))
+    return re.sub(r"([\\`*_{}\[\]<>()#+!|])", r"\\\1", echo(words, 2000))

@@ -32,7 +32,6 @@ from openvima.atomic_io import (
     remove_stale,
     sync_file,
     sync_files,
-    sync_folder,
 )
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset
@@ -155,7 +154,7 @@ class RunFolder:
                 sync_file(self.path / METRICS_FILE)
             shutil.rmtree(final, ignore_errors=True)
             partial.rename(final)
-            sync_folder(self.checkpoints)
+            sync_file(self.checkpoints)
         self._settle(progress)
 
     def resume(self, learner: Learner) -> Progress:

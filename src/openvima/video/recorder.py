@@ -95,10 +95,9 @@ class EpisodeRecorder:
                 self._draw_explanation(env, replace(explanation, attention=nothing), is_decided=False)
                 self._start()
             self._draw_explanation(env, explanation)
-            still = self._compose(_caption(self._title, self._width))
-            self._write(still, _STILL_DECISION_S)
+            self._write(self._compose(), _STILL_DECISION_S)
         for self._last in env.frames:
-            self._write(self._compose(_caption(self._title, self._width)))
+            self._write(self._compose())
 
     def record_outcome(self, success: bool | None, steps: int) -> None:
         """Append a still of the last frame with the outcome in the caption; None: without goals."""
@@ -107,10 +106,10 @@ class EpisodeRecorder:
         colour = MUTED if success is None else _GOOD if success else _BAD
         if self._video is None:  # no step was taken that could be explained
             self._start()
-        caption = _caption(self._title, self._width, outcome, colour)
-        self._write(self._compose(caption), _STILL_END_S)
+        self._write(self._compose(outcome, colour), _STILL_END_S)
 
-    def _compose(self, caption: np.ndarray | None) -> np.ndarray:
+    def _compose(self, outcome: str = "", colour: Colour = MUTED) -> np.ndarray:
+        caption = _caption(self._title, self._width, outcome, colour)
         scene = self._renderer.draw(self._last.scene, self._last.joints)
         if self._panel is not None:
             parts = [scene] if caption is None else [scene, caption]
@@ -128,7 +127,7 @@ class EpisodeRecorder:
 
     def _start(self) -> None:
         """Open the video, and write a still of the start."""
-        first = self._compose(_caption(self._title, self._width))
+        first = self._compose()
         self._video = VideoWriter(
             self._path, first.shape[1], first.shape[0], frames_per_second=FRAMES_PER_SECOND
         )
@@ -154,7 +153,7 @@ def _beside(scene: np.ndarray, panel: np.ndarray) -> np.ndarray:
     return both
 
 
-def _caption(title: str, width: int, outcome: str = "", colour: Colour = MUTED) -> np.ndarray | None:
+def _caption(title: str, width: int, outcome: str, colour: Colour) -> np.ndarray | None:
     if not title:
         return None
     line = Image.new("RGB", (width, 32), PAPER)
