@@ -187,7 +187,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         _copy_weights(initial, network)
     elif config.t5:
         load_t5(network, config.t5)
-    processor = Processor.of(sizes.inputs, tokenizer)
+    processor = Processor(*sizes.inputs, tokenizer)
     return PolicyLearner(
         network,
         processor,
