@@ -45,7 +45,7 @@ from openvima.policies.batch import HistoryBatch
 from openvima.policies.build import outline_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.actions import ACTION_WIDTH
-from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork, StepInputs
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import Tokenizer, WordTokenizer
 from sim import circumstances
@@ -138,7 +138,7 @@ class Decision:
 
     def _decode(self, prompt: Any, history: HistoryBatch, features: torch.Tensor) -> None:
         state, has_previous = self._network.init_cache(prompt), torch.arange(HISTORY)[None] > 0
-        self._network.decode_step(prompt, state, history, features, self._actions, has_previous)
+        self._network.decode_step(StepInputs(prompt, state, history, features, self._actions, has_previous))
 
 
 class Training:
@@ -149,7 +149,7 @@ class Training:
 
     def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
         self._network, self._device = network.to(device).train(), device
-        processor = Processor.of(network.config.inputs, tokenizer_of(network))
+        processor = Processor(*network.config.inputs, tokenizer_of(network))
         episodes = number_images([preprocess(demo, processor.input_kind) for demo in demos])
         images = [episode.images for episode in episodes]
         self._batch = processor.collate(episodes).with_images(images).to(device)

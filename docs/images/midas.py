@@ -69,7 +69,7 @@ def component_tokens(action: Action) -> list[Token]:
 
 def draw_step(axes: Any, demo: Demonstration) -> None:
     """Draw prompt, first observation and first action as one sequence."""
-    processor = Processor.of(preset("midas-nano").inputs)
+    processor = Processor(*preset("midas-nano").inputs)
     text = "decoder over encoded prompt and history; autoregressive action decoding"
     draw_title(axes, 0.25, "MIDAS", text)
     draw_text(axes, LEFT, 0.62, f"“{demo.prompt.text}”", family="DejaVu Sans Mono", fontsize=8)
@@ -121,7 +121,7 @@ def draw_motion(axes: Any, demo: Demonstration) -> None:
         if t < demo.num_steps:
             draw_arrow(axes, (x + width + 0.1, 4.45), (x + width + 1.4, 4.45), colour=ACTION, width=1.6)
             draw_text(axes, x + width + 0.75, 4.3, f"action {t + 1}", ha="center", fontsize=8.5, color=ACTION)
-    processor = Processor.of(preset("midas-nano").inputs)
+    processor = Processor(*preset("midas-nano").inputs)
     frames = [demo.observation(t) for t in range(demo.num_steps + 1)]
     tokens = [_unnamed(token) for token in prompt_tokens(processor, motion_prompt(frames, demo.objects))]
     draw_text(axes, LEFT, 5.4, "prompt", fontweight="bold")

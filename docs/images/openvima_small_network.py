@@ -73,7 +73,7 @@ def draw_object(axes: Any, crops: np.ndarray, slot: int, x: float, y: float) -> 
 
 def draw_prompt(axes: Any, demo: Demonstration) -> None:
     """Draw the prompt, its encoder, and its scene image."""
-    batch, stack = Processor.of(preset("small").inputs).encode_prompts([demo.prompt])
+    batch, stack = Processor(*preset("small").inputs).encode_prompts([demo.prompt])
     crops = stack.images()[batch.crop_index_VS]
     words = {number: word for word, number in benchmark_vocabulary().ids().items()} | {END_ID: "end"}
     draw_text(axes, LEFT, 0.62, "prompt", fontweight="bold")

@@ -197,7 +197,7 @@ def draw_title(axes: Any, y: float, name: str, text: str) -> None:
 
 def draw_vima(axes: Any, story: Story) -> None:
     """Draw prompt, two steps and outputs of VIMA."""
-    processor = Processor.of(preset("vima-nano").inputs)
+    processor = Processor(*preset("vima-nano").inputs)
     draw_title(axes, 0.25, "VIMA", "one token per object and view; cross-attention to the prompt")
     draw_prompt(axes, processor, story.prompt)
     draw_text(axes, LEFT, 2.68, "history", fontweight="bold")
@@ -294,7 +294,7 @@ def draw_baselines(axes: Any, story: Story) -> None:
 def draw_baseline(axes: Any, story: Story, architecture: str, y: float) -> None:
     """Draw the tokens of one baseline below its title: all in one sequence, or prompt and history apart."""
     config = preset(f"{architecture}-nano")
-    processor = Processor.of(config.inputs)
+    processor = Processor(*config.inputs)
     images = [stacked(part.rgb) for part in story.prompt.sequence() if isinstance(part, PromptImage)]
     is_patches = architecture == "gato"
     x, y = LEFT, y + (0.32 if is_patches else 0.9)

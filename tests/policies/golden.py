@@ -34,7 +34,7 @@ from openvima.perception.preprocessing import IMAGE_SIZES, ImageStack
 from openvima.policies.build import outline_network
 from openvima.policies.nn.action_head import BinsHead, decode_bins, shift_actions
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
-from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork
+from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork, StepInputs
 from openvima.policies.processor import Processor
 from openvima.policies.published import config_from_published, from_published
 from openvima.policies.tokenizer import PADDING_ID
@@ -178,7 +178,9 @@ def decode_at_once(
     """Decode whole histories in one call; return the action queries, (B, T, D), and the actions."""
     previous = shift_actions(targets_of(history, actions_BTC))
     with watched(network) as calls:
-        decoded_BTC, _ = network.decode_step(prompt, network.init_cache(prompt), history, features, *previous)
+        decoded_BTC, _ = network.decode_step(
+            StepInputs(prompt, network.init_cache(prompt), history, features, *previous)
+        )
     return query_of(calls), decoded_BTC
 
 
@@ -190,7 +192,8 @@ def decode_step_by_step(network: PolicyNetwork, prompt: EncodedPrompt, inputs: I
             history, features = read_histories(network, [steps[t : t + 1] for steps in inputs.histories])
             previous_B1C = inputs.actions_BTC[:, max(t - 1, 0), None]
             has_previous_B1 = torch.full(previous_B1C.shape[:2], t > 0)
-            _, state = network.decode_step(prompt, state, history, features, previous_B1C, has_previous_B1)
+            step = StepInputs(prompt, state, history, features, previous_B1C, has_previous_B1)
+            _, state = network.decode_step(step)
     return query_of(calls)
 
 
@@ -283,7 +286,7 @@ def _file(name: str) -> Path:
 
 
 def _stack(network: PolicyNetwork) -> ImageStack:
-    return ImageStack(IMAGE_SIZES[Processor.of(network.config.inputs).input_kind])
+    return ImageStack(IMAGE_SIZES[Processor(*network.config.inputs).input_kind])
 
 
 def _features(network: PolicyNetwork, stack: ImageStack) -> torch.Tensor:

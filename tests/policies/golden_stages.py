@@ -32,7 +32,7 @@ from openvima.policies.nn.action_head import ObservationTokens, decode_bins, enc
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, to_unit_range
 from openvima.policies.nn.decoder import Decoder, PrefixDecoder
 from openvima.policies.nn.layers import Unpadder
-from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
+from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork, StepInputs
 from openvima.render.camera import VIEWS
 
 
@@ -88,7 +88,7 @@ def closed_loop(network: PolicyNetwork, recorded: Arrays) -> Arrays:
             has_previous_B1 = torch.tensor([[t > 0]])
             with watched(network) as calls:
                 action_B1C, state = network.decode_step(
-                    prompt, state, *batch, actions_B1C[-1], has_previous_B1
+                    StepInputs(prompt, state, *batch, actions_B1C[-1], has_previous_B1)
                 )
         actions_B1C.append(action_B1C.double())
         unit_B1C = decode_bins(encode_bins(to_unit_range(actions_B1C[-1])), torch.float64)

@@ -20,7 +20,7 @@ from openvima.policies.nn.heads import (
     AutoregressiveHead,
     ComponentTokens,
 )
-from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork, StepInputs
 from openvima.policies.processor import Processor
 from openvima.policies.variants import with_head, with_variant, with_visual_residual
 from small_networks import collate_examples, examples_of, perturbed
@@ -40,7 +40,7 @@ def network(request) -> PolicyNetwork:
 
 def read(network: PolicyNetwork, demonstrations) -> tuple[Batch, "torch.Tensor"]:
     """A batch, and the features of its images."""
-    processor = Processor.of(network.config.inputs)
+    processor = Processor(*network.config.inputs)
     examples, images = examples_of(demonstrations, processor)
     return collate_examples(processor, examples), network.encode_images(images)
 
@@ -103,9 +103,8 @@ def test_incremental_log_probabilities_sum_to_the_teacher_forced_likelihood(netw
             total += logits_B1K.log_softmax(-1).gather(-1, chosen_B1[..., None])[:, 0, 0]
             return chosen_B1
 
-        _, state = network.decode_step(
-            prompt, state, history, features, previous, has_previous, as_demonstrated
-        )
+        inputs = StepInputs(prompt, state, history, features, previous, has_previous)
+        _, state = network.decode_step(inputs, as_demonstrated)
         exists = steps_BT[:, step]
         torch.testing.assert_close(total[exists], forced[exists, step], rtol=0, atol=1e-5)
         previous = batch.targets.actions_BTC[:, step : step + 1]
@@ -153,7 +152,7 @@ def test_positions_from_objects_are_read_before_the_next_component_is_decoded(de
     none = torch.zeros_like(batch.targets.actions_BTC[:, :1])
     history = step_of(batch.history, 0)
     actions, _ = network.decode_step(
-        prompt, network.init_cache(prompt), history, features, none, torch.zeros_like(steps)
+        StepInputs(prompt, network.init_cache(prompt), history, features, none, torch.zeros_like(steps))
     )
     targets = replace(batch.targets, actions_BTC=actions, steps_BT=steps)
     metrics = network.loss(prompt, history, features, targets)[1]

@@ -98,7 +98,7 @@ def test_yaw_bins_are_centred_on_whole_steps():
 @pytest.mark.slow
 def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, demonstrations):
     network = build_network(preset(name), seed=0).eval()
-    processor = Processor.of(network.config.inputs)
+    processor = Processor(*network.config.inputs)
     examples, images = examples_of(demonstrations, processor)
     batch = collate_examples(processor, examples)
 

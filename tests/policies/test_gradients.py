@@ -67,7 +67,7 @@ def published_layout(architecture: str, prompt: PromptEncoderConfig) -> PolicyCo
 def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str]]:
     """A network after a backward pass, and the names of the parameters that have a gradient."""
     model = perturbed(sizes, 0.02, seed=0)  # layers that start at zero stop gradients on their first step
-    processor = Processor.of(sizes.inputs)
+    processor = Processor(*sizes.inputs)
     examples, images = examples_of(demonstrations, processor)
     batch = collate_examples(processor, examples)
     features = model.encode_images(images)

@@ -92,6 +92,6 @@ def test_objects_come_in_the_order_of_their_ids_where_published_policies_know_it
         in_order = PUBLISHED_ORDER.in_observation(seen)
         assert (np.diff(in_order.ids) > 0).all()
         for name, expected in (("vima-nano", compacted(in_order)), ("nano", in_order.left_to_right())):
-            batch, stack = Processor.of(preset(name).inputs).encode_observations([[seen]])
+            batch, stack = Processor(*preset(name).inputs).encode_observations([[seen]])
             crops = stack.images()[batch.crop_index_BTVN[0, 0]]
             np.testing.assert_array_equal(crops, expected.crops)

@@ -10,7 +10,7 @@ import torch
 
 from openvima.errors import ConfigError
 from openvima.policies.build import build_network
-from openvima.policies.nn.action_head import ObservationTokens, add_pointing, point_at_objects, pointing_loss
+from openvima.policies.nn.action_head import BinsHead, ObservationTokens, point_at_objects, pointing_loss
 from openvima.policies.nn.actions import PLACE_NEAR_M, ActionTargets, greedy
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
@@ -87,7 +87,9 @@ def test_a_place_is_scored_with_the_picked_object_in_all_scenes_or_at_none():
         measured = pointing_loss(pick, place, observations, targets)
         torch.testing.assert_close(measured, loss / targets.steps_BT.sum())
         action_loss = (torch.ones(()), {}, targets.actions_BTC)
-        total, metrics, done = add_pointing(action_loss, True, pick, place, observations, targets)
+        head = BinsHead(8, D, torch.nn.Identity())
+        head.points = True
+        total, metrics, done = head.add_pointing(action_loss, pick, place, observations, targets)
         torch.testing.assert_close(total, 1 + measured)
         assert metrics["loss/pointing"] == measured and torch.equal(done, found)
         measured.backward()
@@ -106,7 +108,7 @@ def test_policies_without_a_token_for_each_object_refuse_it(name):
 
 def test_what_is_measured_in_training_is_what_the_policy_does(demonstrations):
     network = build_network(replace(preset("vima-nano"), points=True), seed=0).eval()
-    processor = Processor.of(network.config.inputs)
+    processor = Processor(*network.config.inputs)
     examples, images = examples_of(demonstrations, processor)
     batch = collate_examples(processor, examples)
     with torch.no_grad():

@@ -63,7 +63,7 @@ def test_a_variant_learns_and_acts(name, switches, demonstrations, starts) -> No
     assert with_variant(config, switches) == config
 
     network = perturbed(config).double()
-    processor = Processor.of(config.inputs)
+    processor = Processor(*config.inputs)
     examples, images = examples_of(demonstrations[-2:], processor)
     batch = collate_examples(processor, examples)
     features = network.encode_images(images)
@@ -159,7 +159,7 @@ def test_masked_objects_have_no_influence_on_the_latents() -> None:
 def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name, starts) -> None:
     """Blanking the object of the last prompt image changes its latents alone, before the text encoder."""
     config = tiny(name, {"image_tokens": "object-perceiver"})
-    network, processor = perturbed(config).double(), Processor.of(config.inputs)
+    network, processor = perturbed(config).double(), Processor(*config.inputs)
     prompts = [env.prompt for env, _ in starts]
     batch, stack = processor.encode_prompts(prompts)
     features = network.encode_images(torch.from_numpy(stack.images()))

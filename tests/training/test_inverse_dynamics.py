@@ -18,7 +18,7 @@ from openvima.training.config import AugmentationConfig
 from openvima.training.learner import PolicyCollate
 from small_networks import rngs_of, source_of_episodes
 
-PROCESSORS = {name: Processor.of(preset(name).inputs) for name in ("nano", "midas-nano")}  # objects, views
+PROCESSORS = {name: Processor(*preset(name).inputs) for name in ("nano", "midas-nano")}  # objects, views
 
 
 def whole_motion(demo: Demonstration) -> list[dict]:

@@ -60,7 +60,7 @@ def demonstrations() -> list[Demonstration]:
 
 def stage_of(model: PolicyNetwork, runs: Sequence[Demonstration], folder: Path) -> BehaviourCloning:
     """Training on all demonstrations in each step, and validation on them."""
-    processor = Processor.of(model.config.inputs)
+    processor = Processor(*model.config.inputs)
     source = source_of(runs, processor)
     config = TrainingConfig(
         data=folder,

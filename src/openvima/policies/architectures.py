@@ -8,8 +8,6 @@ objects and J images in all prompts, I image tokens of all prompts, M latents.
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
-from typing import Literal
 
 import numpy as np
 import torch
@@ -41,16 +39,16 @@ from openvima.policies.nn.image_encoders import (
     ResamplerConfig,
     VisionTransformer,
     VitConfig,
-    encode_frames,
 )
-from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoder, ObjectEncoderConfig, check_widths
+from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoder, ObjectEncoderConfig
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig
-from openvima.policies.sizes import Size, size
+from openvima.policies.sizes import SIZES, Size
 from openvima.render.camera import CAMERAS, unproject
 
 _LINEAR_RANGE = 4.0
-Architecture = Literal["vima", "gato", "flamingo", "gpt", "midas"]
+# Table points of the first pixel of the top view, which looks straight down, and of its neighbours.
+_TABLE_POINTS = torch.from_numpy(unproject(np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +56,7 @@ class TokenPolicyConfig:
     """Sizes of a policy.
 
     Args:
-        architecture: Its name.
+        architecture: One of `PUBLISHED`.
         images: Image tokens: those of an object encoder; or of a transformer over whole frames, one per
             patch, or with a class token one per pair of frames.
         prompt: The prompt encoder.
@@ -73,7 +71,7 @@ class TokenPolicyConfig:
             own trains it; see `point_at_objects`.
     """
 
-    architecture: Architecture
+    architecture: str
     images: ObjectEncoderConfig | VitConfig
     prompt: PromptEncoderConfig
     decoder: AnyDecoderConfig
@@ -86,7 +84,9 @@ class TokenPolicyConfig:
         images, width = self.images, self.decoder.width
         if self.points and not self.has_object_tokens:
             raise ConfigError("policy: points needs a token for each object; set it to False.")
-        check_widths(images.output_width if isinstance(images, VitConfig) else images.width, width)
+        token_width = images.output_width if isinstance(images, VitConfig) else images.width
+        if token_width != width:
+            raise ConfigError(f"image tokens are {token_width} wide, the decoder {width}; make them equal.")
         if self.resampler is None:
             return
         if isinstance(images, VitConfig) and images.class_token:
@@ -129,8 +129,7 @@ def vima(of: Size) -> TokenPolicyConfig:
     Source: VIMA (Jiang et al. 2023), section 4.
     """
     images = ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width)
-    head = BinsConfig(of.hidden_width, of.action_width)
-    return TokenPolicyConfig("vima", images, of.prompt, of.decoder(), head)
+    return TokenPolicyConfig("vima", images, of.prompt, of.decoder(), of.bins())
 
 
 def nano_bins() -> TokenPolicyConfig:
@@ -141,7 +140,7 @@ def nano_bins() -> TokenPolicyConfig:
     )
     decoder = DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4)
     head = BinsConfig(256, action_width=64)
-    return TokenPolicyConfig("vima", images, size("nano").prompt, decoder, head, query_token=True)
+    return TokenPolicyConfig("vima", images, SIZES["nano"].prompt, decoder, head, query_token=True)
 
 
 def gato(of: Size) -> TokenPolicyConfig:
@@ -155,9 +154,8 @@ def gato(of: Size) -> TokenPolicyConfig:
 
     Source: VIMA (Jiang et al. 2023), baselines; after Gato (Reed et al. 2022).
     """
-    head = BinsConfig(of.hidden_width, of.action_width)
     return TokenPolicyConfig(
-        "gato", of.frame_encoder(class_token=False), of.prompt, of.prefix_decoder(), head
+        "gato", of.frame_encoder(class_token=False), of.prompt, of.prefix_decoder(), of.bins()
     )
 
 
@@ -173,9 +171,8 @@ def flamingo(of: Size) -> TokenPolicyConfig:
 
     Source: VIMA (Jiang et al. 2023), baselines; after Flamingo (Alayrac et al. 2022).
     """
-    head = BinsConfig(of.hidden_width, of.action_width)
     images = of.frame_encoder(class_token=False)
-    return TokenPolicyConfig("flamingo", images, of.prompt, of.decoder(), head, of.resampler())
+    return TokenPolicyConfig("flamingo", images, of.prompt, of.decoder(), of.bins(), of.resampler())
 
 
 def gpt(of: Size) -> TokenPolicyConfig:
@@ -189,8 +186,9 @@ def gpt(of: Size) -> TokenPolicyConfig:
 
     Source: VIMA (Jiang et al. 2023), baselines; after GPT (Radford et al. 2018).
     """
-    head = BinsConfig(of.hidden_width, of.action_width)
-    return TokenPolicyConfig("gpt", of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), head)
+    return TokenPolicyConfig(
+        "gpt", of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), of.bins()
+    )
 
 
 def midas(of: Size) -> TokenPolicyConfig:
@@ -242,15 +240,9 @@ class TokenPolicy(PolicyNetwork):
             self._align_attention()
         # Other heads have no bins, or decode positions twice; the other decoder does not attend to the prompt
         # alone.
-        is_autoregressive = isinstance(self.head, AutoregressiveHead)
-        has_bins = isinstance(self.head, BinsHead) or (is_autoregressive and not config.points)
+        decodes_twice = isinstance(self.head, AutoregressiveHead) and config.points
+        has_bins = isinstance(self.head, BinsHead) and not decodes_twice
         self.explains = has_bins and isinstance(self.decoder, Decoder)
-
-    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
-        """Encode crops or frames (..., 3, height, width), uint8, to features (..., F), or (..., P, F)."""
-        if isinstance(self.images, ObjectEncoder):
-            return self.images.encode_images(images)
-        return encode_frames(self.images, images)
 
     def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> EncodedPrompt:
         """Encode words and image tokens through the text encoder."""
@@ -375,20 +367,14 @@ class TokenPolicy(PolicyNetwork):
         return latents_JME[image_S].transpose(0, 1).flatten(0, 1)
 
 
-@cache
-def _table_axes() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the table point of the first pixel of the top view, which looks straight down, and its axes."""
-    origin, right, down = unproject(np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"])
-    return torch.from_numpy(origin), torch.from_numpy(np.stack([right - origin, down - origin]))
-
-
 def _points_from_above(history: HistoryBatch, num_tokens: int) -> list[torch.Tensor]:
     """Return the table points under the boxes, and under the most interior pixels, of the top view.
 
     Both are (B, T, Q, 2), of the last N of Q tokens.
     """
     boxes_BTN4, mask_BTN = history.boxes_BTVN4[:, :, TOP], history.masks_BTVN[:, :, TOP]
-    origin, axes = (each.to(boxes_BTN4.device) for each in _table_axes())
+    origin, right, down = _TABLE_POINTS.to(boxes_BTN4.device)
+    axes = torch.stack([right - origin, down - origin])
     points_BTN2 = origin + boxes_BTN4[..., :2].to(axes) @ axes
     pad = (0, 0, num_tokens - mask_BTN.shape[-1], 0)
     return [

@@ -9,7 +9,7 @@ observation.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -115,10 +115,11 @@ class Batch(TensorRecord):
         Args:
             images: Images of each demonstration, (K, 3, height, width), uint8, as they are numbered now.
         """
-        prompts, history = self.prompts, self.history
+        in_prompts = self.prompts.crop_index_VS.numpy()
+        in_view = self.history.crop_index_BTVN.numpy()
         ends = np.cumsum([0, *map(len, images)])
         is_used = np.zeros(1 + ends[-1], np.bool_)
-        is_used[0] = is_used[prompts.crop_index_VS.numpy()] = is_used[history.crop_index_BTVN.numpy()] = True
+        is_used[0] = is_used[in_prompts] = is_used[in_view] = True
         numbers = np.cumsum(is_used) - 1
         stack = _empty_stack(numbers[-1] + 1, images[0].shape[1:])
         stack[0] = 0
@@ -130,10 +131,8 @@ class Batch(TensorRecord):
             stack[first:last] = own[: last - first] if is_prefix else own[used]
         return replace(
             self,
-            prompts=replace(prompts, crop_index_VS=torch.from_numpy(numbers[prompts.crop_index_VS.numpy()])),
-            history=replace(
-                history, crop_index_BTVN=torch.from_numpy(numbers[history.crop_index_BTVN.numpy()])
-            ),
+            prompts=replace(self.prompts, crop_index_VS=torch.from_numpy(numbers[in_prompts])),
+            history=replace(self.history, crop_index_BTVN=torch.from_numpy(numbers[in_view])),
             images=torch.from_numpy(stack),
         )
 
@@ -147,14 +146,13 @@ def _empty_stack(count: int, shape: tuple[int, ...]) -> np.ndarray:
     return np.empty((-(-count // step) * step, *shape), np.uint8)[:count]
 
 
-@dataclass(frozen=True, slots=True)
-class InputLayout:
+class InputLayout(NamedTuple):
     """How images are tokenized.
 
     Args:
-        tokens: What a token encodes: an object in both views, an object in one view, or part of a frame.
-        tokens_per_image: Number of tokens of both views of a prompt image or observation; 0 if it depends on
-            their objects.
+        tokens: What a token encodes: "objects", an object in both views; "views", an object in one view (the
+            published VIMA); "frames", part of a whole frame.
+        tokens_per_image: Number of tokens of both views of an image; 0 if it depends on its objects.
     """
 
     tokens: Literal["objects", "views", "frames"]

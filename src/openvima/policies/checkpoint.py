@@ -41,7 +41,6 @@ _PRECISIONS = {
     "float16": torch.float16,
     "float64": torch.float64,
 }
-_COMPUTE_DTYPES = {torch.float16: torch.float32}  # the range of float16 is too narrow to compute in
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,15 +132,24 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     folder = as_path(folder)
     restore_folder(folder)
     info = read_info(folder)
-    network = _outline(folder, info.config)
-    tensors = _read_weights(folder / WEIGHTS_FILE)
-    _check(network, tensors, source=str(folder / WEIGHTS_FILE))
-    if info.digest and info.digest != file_digest(folder / WEIGHTS_FILE):
+    try:
+        network = outline_network(info.config)
+    except MemoryError:
+        raise
+    except Exception as error:  # sizes within their limits can contradict each other in many ways
+        raise InputFileError(f"{folder / CONFIG_FILE} describes no network: {error}") from error
+    file = folder / WEIGHTS_FILE
+    if not file.exists():
+        raise InputFileError(f"{folder} is no checkpoint: it holds no {WEIGHTS_FILE}.")
+    tensors = read_safetensors(file)
+    _check(network, tensors, source=str(file))
+    if info.digest and info.digest != file_digest(file):
         raise InputFileError(
-            f"{folder / WEIGHTS_FILE} is damaged: its digest is not the one in {CONFIG_FILE}. Take another "
-            "checkpoint, or delete the line `digest` if you changed the weights on purpose."
+            f"{file} is damaged: its digest is not the one in {CONFIG_FILE}. Take another checkpoint, or "
+            "delete the line `digest` if you changed the weights on purpose."
         )
-    dtype = _COMPUTE_DTYPES.get(info.dtype, info.dtype)
+    # The range of float16 is too narrow to compute in.
+    dtype = torch.float32 if info.dtype == torch.float16 else info.dtype
     network.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()}, assign=True)
     return network.to(dtype).eval()  # buffers, too
 
@@ -196,19 +204,3 @@ def _check(network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, sourc
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
             "Use the config that was written with the weights."
         )
-
-
-def _outline(folder: Path, config: PolicyConfig) -> PolicyNetwork:
-    """Build the network of a config without weights, to check them before they are read."""
-    try:
-        return outline_network(config)
-    except MemoryError:
-        raise
-    except Exception as error:  # sizes within their limits can contradict each other in many ways
-        raise InputFileError(f"{folder / CONFIG_FILE} describes no network: {error}") from error
-
-
-def _read_weights(file: Path) -> dict[str, torch.Tensor]:
-    if not file.exists():
-        raise InputFileError(f"{file.parent} is no checkpoint: it holds no {WEIGHTS_FILE}.")
-    return read_safetensors(file)

@@ -63,9 +63,10 @@ def explain_row(
         weights_L = weights_L / weights_L.sum()  # exactly, whatever the network computes in
         attention[kind] = np.bincount(piece_L, weights_L.numpy(), minlength=len(words))
     bins = {name: probabilities(logits) for name, logits in zip(COMPONENTS, trace.bins, strict=False)}
-    if trace.positions_BC2 is None or trace.masks_BC is None or trace.kinds_C is None:
+    if trace.places is None:
         return Explanation(action, words, attention, bins=bins)
-    picks, places, *rotation = (probabilities(logits) for logits in trace.logits)
+    positions_BC2, masks_BC, kinds_C = trace.places
+    picks, places, *rotation = map(probabilities, trace.logits)
     found = extract_observation(observation, processor.input_kind, processor.extractor)
     grasps = found.positions() if bins else found.grasp_points()
     if processor.layout == "views":
@@ -77,9 +78,9 @@ def explain_row(
         attention,
         tuple(_objects(found, grasps, picks, has_ids=processor.extractor is None)),
         tuple(
-            PlaceProbability(PLACE_KINDS[trace.kinds_C[index]], (x, y), float(places[index]))
-            for index, (x, y) in enumerate(trace.positions_BC2[row].tolist())
-            if trace.masks_BC[row, index]
+            PlaceProbability(PLACE_KINDS[kinds_C[index]], (x, y), float(places[index]))
+            for index, (x, y) in enumerate(positions_BC2[row].tolist())
+            if masks_BC[row, index]
         ),
         *((_yaws(len(rotation[0])), rotation[0]) if rotation else ()),
         bins=bins,

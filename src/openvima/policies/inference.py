@@ -15,8 +15,8 @@ from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import ImageStack
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash, usable_device
 from openvima.policies.checkpoint import save_checkpoint
-from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
-from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, greedy, sampling
+from openvima.policies.nn.policy_network import Decoded, PolicyNetwork, StepInputs
 from openvima.policies.processor import PROMPT_LIMITS, Processor
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
@@ -44,7 +44,7 @@ class _Episodes:
         prompt: Encoded prompts.
         state: Decoding state.
         actions_BC: Last actions, metres and quaternions, float32; zero before the first step.
-        has_acted: Whether each episode has made a step.
+        has_acted: Whether the episodes have made a step.
         margins_B: Smallest difference between the best and second-best logit over the components of the last
             action; None before the first step.
         features: Features of the images of the last step, or of the prompts, by digest.
@@ -56,25 +56,31 @@ class _Episodes:
     prompt: Any  # the network's own record
     state: Any  # likewise
     actions_BC: torch.Tensor
-    has_acted: tuple[bool, ...]
+    has_acted: bool
     margins_B: torch.Tensor | None
     features: Mapping[bytes, torch.Tensor]
+
+    def actions(self) -> list[dict[str, np.ndarray]]:
+        """Return the last action of each episode."""
+        return [
+            {key: action_C[part].copy() for key, part in ACTION_PARTS.items()}
+            for action_C in self.actions_BC.cpu().numpy()
+        ]
 
     def select(self, indices: Sequence[int]) -> "_Episodes":
         """Return the episodes with these indices in the batch."""
         rows = [self.indices.index(index) for index in indices]
         if len(rows) == len(self.indices):
             return self
-        return _Episodes(
-            tuple(indices),
-            tuple(self.num_slots[row] for row in rows),
-            tuple(self.generators[row] for row in rows),
-            self.prompt.select(rows),
-            self.state.select(rows),
-            self.actions_BC[rows],
-            tuple(self.has_acted[row] for row in rows),
-            None if self.margins_B is None else self.margins_B[rows],
-            self.features,
+        return replace(
+            self,
+            indices=tuple(indices),
+            num_slots=tuple(self.num_slots[row] for row in rows),
+            generators=tuple(self.generators[row] for row in rows),
+            prompt=self.prompt.select(rows),
+            state=self.state.select(rows),
+            actions_BC=self.actions_BC[rows],
+            margins_B=None if self.margins_B is None else self.margins_B[rows],
         )
 
 
@@ -83,14 +89,14 @@ class _LastStep:
     """What `explain` needs to decode the last step once more.
 
     Args:
-        episodes: The episodes that acted, as they were before.
-        observations: Their observations.
-        choices: Class indices that were decoded, (B, 1) each, in order.
+        observations: Those of the episodes that acted.
+        inputs: What was decoded from.
+        decoded: What was decoded.
     """
 
-    episodes: _Episodes
-    observations: tuple[Mapping, ...]
-    choices: tuple[torch.Tensor, ...]
+    observations: Sequence[Mapping]
+    inputs: StepInputs
+    decoded: Decoded
 
 
 class NetworkPolicy(Policy):
@@ -138,7 +144,7 @@ class NetworkPolicy(Policy):
                 "to sample with."
             )
         tokenizer = tokenizer or tokenizer_for(network.config.prompt)
-        self.processor = Processor.of(network.config.inputs, tokenizer, extractor)
+        self.processor = Processor(*network.config.inputs, tokenizer, extractor)
         self.device = usable_device(device)
         self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
         self.network = network.to(self.device, self.dtype).eval()
@@ -184,7 +190,7 @@ class NetworkPolicy(Policy):
             prompt=prompt,
             state=self.network.init_cache(prompt),
             actions_BC=torch.zeros(count, ACTION_WIDTH, device=self.device),
-            has_acted=(False,) * count,
+            has_acted=False,
             margins_B=None,
             features=features,
         )
@@ -205,17 +211,15 @@ class NetworkPolicy(Policy):
                 end of its episode; no object is visible; or a history is too long.
             ShapeError: An image has another shape or dtype.
         """
-        before = episodes = self._running_episodes(observations)
-        running = [each for each in observations if each is not None]
-        choices: list[torch.Tensor] = []
-        if running:
-            episodes = self._step(before, running, choices)
+        episodes, last = self._running_episodes(observations), None
+        if running := [each for each in observations if each is not None]:
+            episodes, last = self._step(episodes, running)
         if self.network.explains and not self._is_bounded:  # the caches before a step take memory
-            self._last_step = _LastStep(before, tuple(running), tuple(choices))
+            self._last_step = last
         self._episodes = episodes
         actions: list[dict[str, np.ndarray] | None] = [None] * len(self._prompts)
-        for index, array_C in zip(episodes.indices, episodes.actions_BC.cpu().numpy(), strict=True):
-            actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
+        for index, action in zip(episodes.indices, episodes.actions(), strict=True):
+            actions[index] = action
         return actions
 
     @torch.inference_mode()
@@ -231,24 +235,22 @@ class NetworkPolicy(Policy):
         if not self.network.explains:
             kind = self.network.config.architecture.capitalize()
             raise PolicyError(f"a policy of kind {kind} has no explain(). {POLICIES_THAT_EXPLAIN}")
-        if self._last_step is None or self._episodes is None:
+        explanations: list[Explanation | None] = [None] * len(self._prompts)
+        episodes, last = self._episodes, self._last_step
+        if episodes is not None and not episodes.indices:  # all have ended
+            return explanations
+        if last is None or episodes is None:
             raise PolicyError(
                 "there is no action to explain; call act first. Sessions of a server keep none."
             )
-        explanations: list[Explanation | None] = [None] * len(self._prompts)
-        last = self._last_step
-        if not last.observations:
-            return explanations
         from openvima.policies.explaining import explain_row
 
-        inputs, _, _ = self._step_inputs(last.episodes, last.observations)
-        trace = self.network.explain_step(*inputs, last.choices)
-        actions_BC = self._episodes.actions_BC.cpu().numpy()
-        for row, index in enumerate(last.episodes.indices):
+        trace = self.network.explain_step(last.inputs, last.decoded)
+        for row, (index, action) in enumerate(zip(episodes.indices, episodes.actions(), strict=True)):
             explanations[index] = explain_row(
                 trace,
                 row,
-                {key: actions_BC[row, part].copy() for key, part in ACTION_PARTS.items()},
+                action,
                 self._prompts[index],
                 last.observations[row],
                 self.processor,
@@ -314,41 +316,43 @@ class NetworkPolicy(Policy):
         return episodes
 
     def _step(
-        self, episodes: _Episodes, observations: Sequence[Mapping], choices: list[torch.Tensor]
-    ) -> _Episodes:
-        """Decode one action for every episode, and append the classes that were chosen."""
-        inputs, num_slots, features = self._step_inputs(episodes, observations)
-        strategy = sampling(episodes.generators, self._temperature) if self._temperature else greedy
-        margins: list[torch.Tensor] = []
-        actions_B1C, state = self.network.decode_step(*inputs, _record(strategy, margins, choices))
-        return replace(
-            episodes,
-            num_slots=num_slots,
-            state=state,
-            actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as returned
-            has_acted=(True,) * len(observations),
-            margins_B=torch.stack(margins).amin(0) if margins else None,
-            features=features,
-        )
-
-    def _step_inputs(
-        self, episodes: _Episodes, observations: Sequence[Mapping]
-    ) -> tuple[tuple[Any, Any, Any, Any, Any, Any], tuple[int, ...], dict[bytes, torch.Tensor]]:
-        """Return the arguments of `decode_step`, and slots and features as in `_Episodes`."""
+        self,
+        episodes: _Episodes,
+        observations: Sequence[Mapping],
+    ) -> tuple[_Episodes, _LastStep]:
+        """Decode one action for every episode."""
         batch, stack = self.processor.encode_observations(
-            [[observation] for observation in observations], episodes.num_slots
+            [[each] for each in observations], episodes.num_slots
         )
         features_KF, features = self._encode(stack, episodes.features)
-        has_previous_B1 = torch.tensor(episodes.has_acted, device=self.device)[:, None]
-        inputs = (
+        inputs = StepInputs(
             episodes.prompt,
             episodes.state,
             batch if self.device.type == "cpu" else batch.to(self.device),
             features_KF,
             episodes.actions_BC[:, None],
-            has_previous_B1,
+            torch.full((len(observations), 1), episodes.has_acted, device=self.device),
         )
-        return inputs, tuple(batch.num_slots_BT[:, 0].tolist()), features
+        decoded: list[tuple[torch.Tensor, torch.Tensor]] = []
+        strategy = sampling(episodes.generators, self._temperature) if self._temperature else greedy
+
+        def record(logits: torch.Tensor) -> torch.Tensor:
+            decoded.append((logits, strategy(logits)))
+            return decoded[-1][1]
+
+        actions_B1C, state = self.network.decode_step(inputs, record)
+        best = [logits.topk(2).values for logits, _ in decoded if logits.shape[-1] > 1]
+        margins = [(two[..., 0] - two[..., 1]).flatten(1).amin(1) for two in best]
+        after = replace(
+            episodes,
+            num_slots=tuple(batch.num_slots_BT[:, 0].tolist()),
+            state=state,
+            actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as returned
+            has_acted=True,
+            margins_B=torch.stack(margins).amin(0) if margins else None,
+            features=features,
+        )
+        return after, _LastStep(observations, inputs, decoded)
 
     def _encode(
         self, stack: ImageStack, cached: Mapping[bytes, torch.Tensor]
@@ -368,18 +372,3 @@ class NetworkPolicy(Policy):
         by_key = {**cached, **dict(zip((keys[number] for number in new), encoded, strict=True))}
         features = torch.stack([by_key[key] for key in keys])
         return features, dict(zip(keys, features, strict=True))
-
-
-def _record(
-    strategy: DecodingStrategy, margins: list[torch.Tensor], choices: list[torch.Tensor]
-) -> DecodingStrategy:
-    """Wrap a strategy to record the difference of the two best logits of each row, (B,), and its choices."""
-
-    def record(logits: torch.Tensor) -> torch.Tensor:
-        if logits.shape[-1] > 1:
-            best, second = logits.topk(2).values.unbind(-1)
-            margins.append((best - second).flatten(1).amin(1))
-        choices.append(strategy(logits))
-        return choices[-1]
-
-    return record

@@ -22,8 +22,6 @@ from openvima.policies.naming import (
 from openvima.policies.presets import preset
 from openvima.user_code import call_function, is_code
 
-_METHODS = ("reset", "act")
-
 
 @dataclass(frozen=True, slots=True)
 class LearnerCode:
@@ -138,7 +136,7 @@ def checked_policy(policy: Any, what: str) -> Policy:
     if isinstance(policy, type):
         name = policy.__name__
         raise PolicyError(f"{what} the class {name}, not an object of it; return {name}().")
-    missing = [name for name in _METHODS if not callable(getattr(policy, name, None))]
+    missing = [name for name in ("reset", "act") if not callable(getattr(policy, name, None))]
     if missing:
         raise PolicyError(f"{what} a {type(policy).__name__} without {' and '.join(missing)}; {form}.")
     return policy

@@ -34,22 +34,22 @@ _own: dict[str, str] = {}  # registered name -> MODULE:FUNCTION or FILE.py:FUNCT
 SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
 
 
-def _config(module: str, function: str) -> "PolicyConfig":
-    return getattr(import_module(f"openvima.policies.{module}"), function)()
+def _config(module: str, function: str, *size_names: str) -> "PolicyConfig":
+    from openvima.policies.sizes import SIZES
 
-
-def _sized(architecture: str, size_name: str) -> "PolicyConfig":
-    from openvima.policies import architectures
-    from openvima.policies.sizes import size
-
-    return getattr(architectures, architecture)(size(size_name))
+    build = getattr(import_module(f"openvima.policies.{module}"), function)
+    return build(*(SIZES[name] for name in size_names))
 
 
 PRESETS: dict[str, Callable[[], "PolicyConfig"]] = {
     "nano": partial(_config, "pointer.config", "nano"),
     "nano-bins": partial(_config, "architectures", "nano_bins"),
     "small": partial(_config, "pointer.config", "small"),
-    **{f"{name}-{size}": partial(_sized, name, size) for name in PUBLISHED for size in SIZE_NAMES},
+    **{
+        f"{name}-{size}": partial(_config, "architectures", name, size)
+        for name in PUBLISHED
+        for size in SIZE_NAMES
+    },
 }
 
 

@@ -28,7 +28,7 @@ from openvima.perception.preprocessing import (
     split_prompt,
 )
 from openvima.policies.base import PromptLimits
-from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, InputLayout, PromptBatch
+from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
 from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
@@ -50,8 +50,7 @@ class Processor:
     """Encodes prompts and observations as network inputs.
 
     Args:
-        layout: What a token encodes: "objects", an object in both views; "views", an object in one view (the
-            published VIMA); "frames", part of a whole frame.
+        layout: What a token encodes, see `InputLayout`, of which a network's config has one as `inputs`.
         tokens_per_image: Number of tokens of both views of an image; 0 if it depends on its objects.
         tokenizer: Tokenizer of prompt text; by default that of the benchmark's vocabulary.
         extractor: Object extractor for inference; None uses the segmentation.
@@ -62,15 +61,6 @@ class Processor:
     tokenizer: Tokenizer = field(default_factory=WordTokenizer)
     extractor: ObjectExtractor | None = None
     _layouts: "dict[_LayoutKey, _Layout]" = field(default_factory=dict, init=False, repr=False)
-
-    @staticmethod
-    def of(
-        inputs: InputLayout,
-        tokenizer: Tokenizer | None = None,
-        extractor: ObjectExtractor | None = None,
-    ) -> "Processor":
-        """Return a `Processor` for a network with this input layout."""
-        return Processor(inputs.tokens, inputs.tokens_per_image, tokenizer or WordTokenizer(), extractor)
 
     @property
     def input_kind(self) -> InputKind:
@@ -127,25 +117,26 @@ class Processor:
             ShapeError: An image has another shape or dtype.
         """
         stack = stack or ImageStack(IMAGE_SIZES[self.input_kind])
-        if num_slots is None or self.layout != "views":
-            num_slots = [0] * len(histories)
-        extract_ahead(
-            self.input_kind, self.extractor, observations=[each for own in histories for each in own]
-        )
-        found: list[ObjectViews] = []
-        end_effectors: list[int] = []
-        for history, slots in zip(histories, num_slots, strict=True):
-            for observation in history:
-                end_effectors.append(end_effector_of(observation))
-                objects = extract_observation(observation, self.input_kind, self.extractor)
-                self._check_count(len(objects), slots)
-                slots = max(slots, len(objects)) if self.layout == "views" else 0
-                found.append(objects)
+        observations = [each for history in histories for each in history]
+        end_effectors = np.array([end_effector_of(each) for each in observations])
+        extract_ahead(self.input_kind, self.extractor, observations=observations)
+        found = [extract_observation(each, self.input_kind, self.extractor) for each in observations]
         steps = _Steps.of([len(history) for history in histories])
         counts = np.array([len(objects) for objects in found], np.int64)
+        slots_BT = self._num_slots(steps, counts, np.array(num_slots or [0] * len(histories)))
+        if (slots_BT == 0)[steps.exist()].any():
+            raise PolicyError(
+                "the observation contains no object. Check its segmentation, or the "
+                "detector and its min_score."
+            )
+        limit = MAX_POSITIONS // (len(VIEWS) if self.layout == "views" else 1) - 1
+        if counts.max() > limit:
+            raise PolicyError(
+                f"the observation shows {counts.max()} objects; this policy takes {limit}. Raise its "
+                "min_score."
+            )
         objects = ObjectTable.from_views(ObjectViews.concatenate(found), stack)
-        slots_BT = self._num_slots(steps, counts, np.array(num_slots))
-        return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors)), stack
+        return self._batch_history(objects, counts, steps, slots_BT, end_effectors), stack
 
     def batch_prompts(self, prompts: Sequence[PreprocessedPrompt]) -> PromptBatch:
         """Pad prompts to equal length and number objects across the batch."""
@@ -275,19 +266,6 @@ class Processor:
         slots_BT = np.maximum.accumulate(np.maximum(slots_BT, before_B[:, None]), axis=1)
         return np.where(steps.exist(), slots_BT, 0)
 
-    def _check_count(self, count: int, num_slots: int) -> None:
-        """Reject an observation without objects, or with more than the decoder has positions for."""
-        if not count and not num_slots:
-            raise PolicyError(
-                "the observation contains no object. Check its segmentation, or the "
-                "detector and its min_score."
-            )
-        limit = MAX_POSITIONS // (len(VIEWS) if self.layout == "views" else 1) - 1
-        if count > limit:
-            raise PolicyError(
-                f"the observation shows {count} objects; this policy takes {limit}. Raise its min_score."
-            )
-
     def _batch_false_positives(
         self, found: "Sequence[FalsePositives]", steps: "_Steps"
     ) -> FalsePositiveBatch:
@@ -320,13 +298,12 @@ class Processor:
         # Warns once of all unknown words.
         self.tokenizer.encode(" ".join(piece for piece in pieces if isinstance(piece, str)))
         in_text = [piece for piece in pieces if isinstance(piece, int)]
-        starts = _starts(counts)
+        starts, by_view, slots = _starts(counts), self.layout == "views", [0] * len(VIEWS)
         # Rows of the table that fill the slots of each image, by view.
         rows = [[np.arange(starts[n], starts[n] + counts[n])] * len(VIEWS) for n in in_text]
-        if self.layout == "views":
+        if by_view and rows:
             rows = [[own[masks[own, v]] for v, own in enumerate(image)] for image in rows]
-        slots = [max((len(image[v]) for image in rows), default=0) for v in range(len(VIEWS))]
-        if self.layout == "views":
+            slots = [max(map(len, view)) for view in zip(*rows, strict=True)]
             rows = [
                 [np.pad(own, (0, max(slots) - len(own)), constant_values=-1) for own in image]
                 for image in rows
@@ -339,14 +316,13 @@ class Processor:
                 tokens += [(word, WORD, 0, True) for word in self.tokenizer.encode(piece)]
                 continue
             own = next(unread)
-            if self.tokens_per_image:
-                parts = self.tokens_per_image if len(own) else 0  # of the first object
-                tokens += [(PADDING_ID, count, part, True) for part in range(parts)]
-            elif self.layout == "views":
-                places = [(k, v) for v, size in enumerate(slots) for k in range(size)]
-                tokens += [(PADDING_ID, count + k, v, own[k, v] >= 0) for k, v in places]
+            if self.tokens_per_image:  # all of the first object
+                places = [(0, part, True) for part in range(self.tokens_per_image)] if len(own) else []
+            elif by_view:
+                places = [(k, v, own[k, v] >= 0) for v, size in enumerate(slots) for k in range(size)]
             else:
-                tokens += [(PADDING_ID, count + k, 0, True) for k in range(len(own))]
+                places = [(k, 0, True) for k in range(len(own))]
+            tokens += [(PADDING_ID, count + k, part, is_valid) for k, part, is_valid in places]
             count += len(own)
         tokens.append((self.tokenizer.end_id, WORD, 0, True))
         # Before the encoder, whose cost is quadratic.

@@ -5,7 +5,7 @@ stands for itself and for its `.weight` and `.bias`.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -45,129 +45,132 @@ def _table(text: str, published: str = "", ours: str = "") -> tuple[Rule, ...]:
     return tuple(Rule(published + row[0], ours + row[1], row[2:] == ["transposed"]) for row in rows)
 
 
-def _mlp_rules(published: str, ours: str, num_layers: int) -> tuple[Rule, ...]:
-    """An MLP: two layers without weights between linear ones there, one here."""
-    return tuple(Rule(f"{published}.{3 * i}", f"{ours}.{2 * i}") for i in range(num_layers))
-
-
-def _vit_rules(ours: str) -> tuple[Rule, ...]:
-    table = """
-        cls_token                       class_token
-        pos_embed                       positions
-        projection                      projection.weight    transposed
-        conv1                           patches
-        ln_pre                          norm_before
-        ln_post                         norm_after
-        blocks.*.attn.in_proj_weight    blocks.*.query_key_value.weight
-        blocks.*.attn.in_proj_bias      blocks.*.query_key_value.bias
-        blocks.*.attn.out_proj          blocks.*.attention_out
-        blocks.*.ln_1                   blocks.*.norm_attention
-        blocks.*.ln_2                   blocks.*.norm_mlp
-        blocks.*.mlp.c_fc               blocks.*.widen
-        blocks.*.mlp.c_proj             blocks.*.narrow
-    """
-    return _table(table, "obj_encoder.cropped_img_encoder.vit.", f"{ours}.")
-
-
-def _self_block_rules(published: str) -> tuple[Rule, ...]:
-    table = """
-        positions_embed         positions
-        h.*.attn.c_attn         self_blocks.*.query_key_value    transposed
-        h.*.attn.c_proj         self_blocks.*.attention_out      transposed
-        h.*.ln_1                self_blocks.*.norm_attention
-        h.*.mlp.c_fc            self_blocks.*.widen              transposed
-        h.*.mlp.c_proj          self_blocks.*.narrow             transposed
-        h.*.mlp.gated_layer     self_blocks.*.gate
-        h.*.ln_2                self_blocks.*.norm_feed_forward
-    """
-    return _table(table, f"{published}.", "decoder.")
-
-
+VIT = "obj_encoder.cropped_img_encoder.vit"
+_VIT_NAMES = """
+    cls_token                       class_token
+    pos_embed                       positions
+    projection                      projection.weight    transposed
+    conv1                           patches
+    ln_pre                          norm_before
+    ln_post                         norm_after
+    blocks.*.attn.in_proj_weight    blocks.*.query_key_value.weight
+    blocks.*.attn.in_proj_bias      blocks.*.query_key_value.bias
+    blocks.*.attn.out_proj          blocks.*.attention_out
+    blocks.*.ln_1                   blocks.*.norm_attention
+    blocks.*.ln_2                   blocks.*.norm_mlp
+    blocks.*.mlp.c_fc               blocks.*.widen
+    blocks.*.mlp.c_proj             blocks.*.narrow
+"""
+_DECODER_NAMES = """
+    positions_embed         positions
+    h.*.attn.c_attn         self_blocks.*.query_key_value    transposed
+    h.*.attn.c_proj         self_blocks.*.attention_out      transposed
+    h.*.ln_1                self_blocks.*.norm_attention
+    h.*.mlp.c_fc            self_blocks.*.widen              transposed
+    h.*.mlp.c_proj          self_blocks.*.narrow             transposed
+    h.*.mlp.gated_layer     self_blocks.*.gate
+    h.*.ln_2                self_blocks.*.norm_feed_forward
+"""
 T5 = "t5_prompt_encoder.t5.encoder"
 T5_RULES = _table(
     """
-        block.0.layer.0.SelfAttention.relative_attention_bias    position_bias
-        block.*.layer.0.layer_norm                               blocks.*.norm_attention
-        block.*.layer.0.SelfAttention.q                          blocks.*.query
-        block.*.layer.0.SelfAttention.k                          blocks.*.key
-        block.*.layer.0.SelfAttention.v                          blocks.*.value
-        block.*.layer.0.SelfAttention.o                          blocks.*.attention_out
-        block.*.layer.1.layer_norm                               blocks.*.norm_feed_forward
-        block.*.layer.1.DenseReluDense.wi                        blocks.*.widen
-        block.*.layer.1.DenseReluDense.wo                        blocks.*.narrow
-        final_layer_norm                                         norm_after
+    block.0.layer.0.SelfAttention.relative_attention_bias    position_bias
+    block.*.layer.0.layer_norm                               blocks.*.norm_attention
+    block.*.layer.0.SelfAttention.q                          blocks.*.query
+    block.*.layer.0.SelfAttention.k                          blocks.*.key
+    block.*.layer.0.SelfAttention.v                          blocks.*.value
+    block.*.layer.0.SelfAttention.o                          blocks.*.attention_out
+    block.*.layer.1.layer_norm                               blocks.*.norm_feed_forward
+    block.*.layer.1.DenseReluDense.wi                        blocks.*.widen
+    block.*.layer.1.DenseReluDense.wo                        blocks.*.narrow
+    final_layer_norm                                         norm_after
     """,
     f"{T5}.",
     "prompt.text.",
+)
+# Between the linear layers of an MLP there are two layers without weights there, one here.
+_CLASSIFIER_NAMES = "\n".join(
+    f"{name}.mlps.{i}.{3 * layer}    {part.start + i}.{2 * layer}"
+    for name, part in ACTION_PARTS.items()
+    for i in range(part.stop - part.start)
+    for layer in range(3)
 )
 _SHARED_RULES = (
     *T5_RULES,
     *_table(
         """
-        prompt_embedding._embed_layer    prompt.words
-        t5_prompt_encoder_post_layer     prompt.out
-        action_encoder._post_layer       head.actions.out
-        end_effector_encoder             end_effectors
-        obs_fusion_layer                 observation_out
+    prompt_embedding._embed_layer                          prompt.words
+    prompt_obj_post_layer.0                                prompt.images.0
+    prompt_obj_post_layer.3                                prompt.images.2
+    prompt_obj_post_layer.6                                prompt.images.4
+    t5_prompt_encoder_post_layer                           prompt.out
+    end_effector_encoder                                   end_effectors
+    obs_fusion_layer                                       observation_out
+    action_encoder._embed_dict.pose0_position._layer.0     head.actions.parts.0.0
+    action_encoder._embed_dict.pose0_position._layer.3     head.actions.parts.0.2
+    action_encoder._embed_dict.pose0_rotation._layer.0     head.actions.parts.1.0
+    action_encoder._embed_dict.pose0_rotation._layer.3     head.actions.parts.1.2
+    action_encoder._embed_dict.pose1_position._layer.0     head.actions.parts.2.0
+    action_encoder._embed_dict.pose1_position._layer.3     head.actions.parts.2.2
+    action_encoder._embed_dict.pose1_rotation._layer.0     head.actions.parts.3.0
+    action_encoder._embed_dict.pose1_rotation._layer.3     head.actions.parts.3.2
+    action_encoder._post_layer                             head.actions.out
     """
     ),
-    *_mlp_rules("prompt_obj_post_layer", "prompt.images", 3),
-    *(
-        rule
-        for part, (name, components) in enumerate(ACTION_PARTS.items())
-        for rule in (
-            *_mlp_rules(f"action_encoder._embed_dict.{name}._layer", f"head.actions.parts.{part}", 2),
-            *(
-                rule
-                for i, component in enumerate(range(components.start, components.stop))
-                for rule in _mlp_rules(
-                    f"action_decoder._decoders.{name}.mlps.{i}", f"head.classifiers.{component}", 3
-                )
-            ),
-        )
-    ),
+    *_table(_CLASSIFIER_NAMES, "action_decoder._decoders.", "head.classifiers."),
 )
 _CROSS_ATTENTION_RULES = (
-    *_self_block_rules("xattn_gpt"),
-    Rule("xattn_gpt.xattn_positions_embed", "decoder.prompt_positions"),
+    *_table(_DECODER_NAMES, "xattn_gpt.", "decoder."),
     *_table(
         """
-        layernorm        norm_attention
-        query            query
-        key_value        key_value
-        attention_out    attention_out
-        ln               norm_feed_forward
-        linear1          widen
-        linear2          narrow
-        gated_layer      gate
+    xattn_positions_embed      prompt_positions
+    xattns.*.layernorm         cross_blocks.*.norm_attention
+    xattns.*.query             cross_blocks.*.query
+    xattns.*.key_value         cross_blocks.*.key_value
+    xattns.*.attention_out     cross_blocks.*.attention_out
+    xattns.*.ln                cross_blocks.*.norm_feed_forward
+    xattns.*.linear1           cross_blocks.*.widen
+    xattns.*.linear2           cross_blocks.*.narrow
+    xattns.*.gated_layer       cross_blocks.*.gate
     """,
-        "xattn_gpt.xattns.*.",
-        "decoder.cross_blocks.*.",
+        "xattn_gpt.",
+        "decoder.",
     ),
 )
-_PREFIX_RULES = (*_self_block_rules("transformer.lm"), Rule("prompt_sep_token", "decoder.separator"))
-_OBJECT_RULES = (
-    *_mlp_rules("obj_encoder.bbox_mlp.front", "images.box_encoders.0", 3),
-    *_mlp_rules("obj_encoder.bbox_mlp.top", "images.box_encoders.1", 3),
-    Rule("obj_encoder.pre_transformer_layer.front", "images.fusion.0"),
-    Rule("obj_encoder.pre_transformer_layer.top", "images.fusion.1"),
+_PREFIX_RULES = (
+    *_table(_DECODER_NAMES, "transformer.lm.", "decoder."),
+    *_table("prompt_sep_token  decoder.separator"),
+)
+_OBJECT_RULES = _table(
+    """
+    bbox_mlp.front.0               box_encoders.0.0
+    bbox_mlp.front.3               box_encoders.0.2
+    bbox_mlp.front.6               box_encoders.0.4
+    bbox_mlp.top.0                 box_encoders.1.0
+    bbox_mlp.top.3                 box_encoders.1.2
+    bbox_mlp.top.6                 box_encoders.1.4
+    pre_transformer_layer.front    fusion.0
+    pre_transformer_layer.top      fusion.1
+    """,
+    "obj_encoder.",
+    "images.",
 )
 PERCEIVER = "obj_encoder.peceiver.model"  # spelled like this in the files
-_RESAMPLER_LAYER = """
-        attention.self.layernorm1    norm_attention
-        attention.self.layernorm2    norm_source
-        attention.self.query         query
-        attention.self.key           key
-        attention.self.value         value
-        attention.output.dense       attention_out
-        layernorm                    norm_feed_forward
-        mlp.dense1                   hidden
-        mlp.dense2                   out
+_RESAMPLER_LAYER_NAMES = """
+    attention.self.layernorm1    norm_attention
+    attention.self.layernorm2    norm_source
+    attention.self.query         query
+    attention.self.key           key
+    attention.self.value         value
+    attention.output.dense       attention_out
+    layernorm                    norm_feed_forward
+    mlp.dense1                   hidden
+    mlp.dense2                   out
 """
 _RESAMPLER_RULES = (
-    Rule(f"{PERCEIVER}.embeddings.latents", "resampler.latents"),
-    *_table(_RESAMPLER_LAYER, f"{PERCEIVER}.encoder.cross_attention.", "resampler.cross_layer."),
-    *_table(_RESAMPLER_LAYER, f"{PERCEIVER}.encoder.self_attends.*.", "resampler.self_layers.*."),
+    *_table("embeddings.latents  latents", f"{PERCEIVER}.", "resampler."),
+    *_table(_RESAMPLER_LAYER_NAMES, f"{PERCEIVER}.encoder.cross_attention.", "resampler.cross_layer."),
+    *_table(_RESAMPLER_LAYER_NAMES, f"{PERCEIVER}.encoder.self_attends.*.", "resampler.self_layers.*."),
 )
 
 
@@ -203,17 +206,23 @@ def _pattern(template: str) -> re.Pattern[str]:
 
 
 VIMA = PublishedAdapter(
-    (*_SHARED_RULES, *_vit_rules("images.crop_encoder"), *_OBJECT_RULES, *_CROSS_ATTENTION_RULES),
+    (
+        *_SHARED_RULES,
+        *_table(_VIT_NAMES, f"{VIT}.", "images.crop_encoder."),
+        *_OBJECT_RULES,
+        *_CROSS_ATTENTION_RULES,
+    ),
     cfg_names=("embed_dim", "xf_n_layers", "sattn_n_heads", "xattn_n_heads"),
     build=vima,
 )
+_FRAME_RULES = _table(_VIT_NAMES, f"{VIT}.", "images.")
 GATO = PublishedAdapter(
-    (*_SHARED_RULES, *_vit_rules("images"), *_PREFIX_RULES),
+    (*_SHARED_RULES, *_FRAME_RULES, *_PREFIX_RULES),
     cfg_names=("embed_dim", "n_layer", "n_head"),
     build=gato,
 )
 FLAMINGO = PublishedAdapter(
-    (*_SHARED_RULES, *_vit_rules("images"), *_RESAMPLER_RULES, *_CROSS_ATTENTION_RULES),
+    (*_SHARED_RULES, *_FRAME_RULES, *_RESAMPLER_RULES, *_CROSS_ATTENTION_RULES),
     cfg_names=("embed_dim", "dt_n_layers", "dt_n_heads", "xattn_n_heads"),
     build=flamingo,
 )
@@ -230,29 +239,18 @@ _UNUSED = re.compile(
 )
 
 
-def is_unused(name: str) -> bool:
-    """Whether a published name, without prefix, is an unused entry."""
-    return _UNUSED.fullmatch(name) is not None
-
-
-def without_prefix(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Remove the prefix `policy.` from the names of published weights."""
-    return {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
-
-
-def adapter_of(weights: Iterable[str]) -> PublishedAdapter:
+def adapter_of(names: Collection[str]) -> PublishedAdapter:
     """Recognise the architecture of weights by their published names.
 
     Raises:
         InputFileError: It is none of the four.
     """
-    names = {name.removeprefix(PREFIX) for name in weights}
     if any(name.startswith("obj_encoder.bbox_mlp.") for name in names):
         return VIMA
     if any(name.startswith(f"{PERCEIVER}.") for name in names):
         return FLAMINGO
     if any(name.startswith("transformer.lm.") for name in names):
-        return GPT if "obj_encoder.cropped_img_encoder.vit.cls_token" in names else GATO
+        return GPT if f"{VIT}.cls_token" in names else GATO
     raise InputFileError(
         "these are no weights of VIMA, VIMA-Gato, VIMA-Flamingo or VIMA-GPT: no name begins with "
         f"obj_encoder.bbox_mlp, {PERCEIVER} or transformer.lm."
@@ -263,7 +261,7 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     """Rename published weights to their names in this package.
 
     Args:
-        weights: Weights by published name, with or without the prefix `policy.`.
+        weights: Weights by published name, without the prefix `policy.`.
 
     Returns:
         Weights in float32, matrices as (out, in). Unused entries are dropped; unknown names are unchanged.
@@ -273,17 +271,13 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     """
     adapter = adapter_of(weights)
     result = {}
-    for name, tensor in without_prefix(weights).items():
-        if not is_unused(name):
-            ours, transposed = to_ours(adapter.rules, name) or (name, False)
-            result[ours] = _convert(tensor, transposed)
+    for name, tensor in weights.items():
+        if _UNUSED.fullmatch(name):
+            continue
+        ours, transposed = to_ours(adapter.rules, name) or (name, False)
+        tensor = tensor.detach().float() if tensor.is_floating_point() else tensor
+        result[ours] = (tensor.T if transposed and tensor.ndim == 2 else tensor).contiguous()
     return result
-
-
-def _convert(tensor: torch.Tensor, transposed: bool) -> torch.Tensor:
-    tensor = tensor.detach()
-    tensor = tensor.float() if tensor.is_floating_point() else tensor
-    return (tensor.T if transposed and tensor.ndim == 2 else tensor).contiguous()
 
 
 def load_published(file: str | Path) -> PolicyNetwork:
@@ -335,14 +329,14 @@ def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapp
     ]
     if others:
         raise InputFileError(f"{file}: {listed('state_dict holds more than weights', others)[0]}.")
-    return weights, values["cfg"]
+    return {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}, values["cfg"]
 
 
 def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str, object]) -> PolicyConfig:
     """Infer the config of a published network.
 
     Args:
-        weights: Weights by published name, with or without the prefix `policy.`.
+        weights: Weights by published name, without the prefix `policy.`.
         cfg: The `cfg` entry of the file, the only source of the number of heads.
 
     Returns:
@@ -355,14 +349,13 @@ def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str,
     """
     adapter = adapter_of(weights)
     given = _read_cfg(cfg, adapter.cfg_names)
-    shapes = {name: tensor.shape for name, tensor in without_prefix(weights).items()}
-    vit = "obj_encoder.cropped_img_encoder.vit"
+    shapes = {name: tensor.shape for name, tensor in weights.items()}
     try:
         size = Size(
             *given[:3],
             prompt=_prompt(shapes),
-            image_width=shapes[f"{vit}.conv1.weight"][0],
-            image_layers=_num_layers(shapes, f"{vit}.blocks"),
+            image_width=shapes[f"{VIT}.conv1.weight"][0],
+            image_layers=_num_layers(shapes, f"{VIT}.blocks"),
             hidden_width=shapes["action_decoder._decoders.pose0_position.mlps.0.0.weight"][0],
             action_width=shapes["action_encoder._embed_dict.pose0_position._layer.0.weight"][0],
         )

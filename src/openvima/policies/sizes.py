@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from openvima.errors import UnknownPolicyError, unknown_name
+from openvima.policies.nn.action_head import BinsConfig
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.image_encoders import ResamplerConfig, VitConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
@@ -63,6 +63,10 @@ class Size:
         return PrefixDecoderConfig(
             self.width, 2 * self.num_layers, self.num_heads, self.dropout, self.initial_std
         )
+
+    def bins(self) -> BinsConfig:
+        """Return the published action head."""
+        return BinsConfig(self.hidden_width, self.action_width)
 
     def crop_encoder(self) -> VitConfig:
         """Return the encoder of object crops: 16 × 16 patches of 32 × 32 pixels."""
@@ -142,14 +146,3 @@ SIZES: dict[str, Size] = {
     "92m": _published(640, 7),
     "200m": _published(768, 11),
 }
-
-
-def size(name: str) -> Size:
-    """Return a size by name.
-
-    Raises:
-        UnknownPolicyError: There is none of that name.
-    """
-    if name not in SIZES:
-        raise UnknownPolicyError(unknown_name("size", name, SIZES))
-    return SIZES[name]

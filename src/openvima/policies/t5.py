@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from openvima.errors import (
-    InputFileError,
-    PolicyError,
-    PromptError,
-    echo,
-)
+from openvima.errors import InputFileError, PolicyError, PromptError, echo
 from openvima.hub import HubName, fetch, hub_name
 from openvima.imports import import_extra
 from openvima.input_files import as_path, read_text
@@ -45,8 +40,7 @@ class T5Tokenizer:
 
     Every word is encoded separately with the word-start marker. A full stop after a placeholder becomes "▁"
     and ".", and no marker is left before a placeholder, as in the published policies. "<unknown>" becomes the
-    unknown token. Versions of
-    transformers differ in how they split whole texts, but not single words.
+    unknown token. Versions of transformers differ in how they split whole texts, but not single words.
 
     Args:
         path_or_hub_id: A folder with `tokenizer.json`, or a name on the Hugging Face Hub such as "t5-base".
@@ -75,12 +69,12 @@ class T5Tokenizer:
         Raises:
             PromptError: A word is not in the vocabulary of T5.
         """
-        parts = text.split(UNKNOWN)
-        if len(parts) > 1:  # words that are masked on purpose
-            encoded = [self.encode(part) for part in parts]
-            return [*encoded[0], *(token for part in encoded[1:] for token in (_UNKNOWN_ID, *part))]
-        words = text.split()
-        unknown = [word for word in words if not self._special_ids.isdisjoint(self._encode_word(word))]
+        words = text.replace(UNKNOWN, f" {UNKNOWN} ").split()
+        unknown = [
+            word
+            for word in words
+            if word != UNKNOWN and not self._special_ids.isdisjoint(self._encode_word(word))
+        ]
         if unknown:
             shown = ", ".join(repr(word) for word in dict.fromkeys(unknown))
             raise PromptError(
@@ -94,6 +88,8 @@ class T5Tokenizer:
         self._tokenizer.save_pretrained(str(folder))
 
     def _encode_word(self, word: str) -> list[int]:
+        if word == UNKNOWN:  # masked on purpose
+            return [_UNKNOWN_ID]
         if word not in self._words:
             if len(self._words) >= _MAX_WORDS:
                 self._words.clear()
@@ -183,18 +179,14 @@ def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
         tokenizer = transformers.T5TokenizerFast.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # tokenizers raises no narrower one for a damaged file
         raise InputFileError(f"{path_or_hub_id} holds no tokenizer that can be read: {error}") from error
-    _check_is_t5(tokenizer, str(path_or_hub_id))
-    return tokenizer
-
-
-def _check_is_t5(tokenizer: "PreTrainedTokenizerFast", source: str) -> None:
     ids = (tokenizer.pad_token_id, tokenizer.eos_token_id, tokenizer.unk_token_id)
     pieces = tokenizer.backend_tokenizer.encode("Put", add_special_tokens=False).tokens
     if ids != (PADDING_ID, END_ID, _UNKNOWN_ID) or not pieces[0].startswith(_WORD_START):
         raise InputFileError(
-            f"the tokenizer of {source} is not that of T5: padding, end and unknown are {ids} instead of "
-            f"{(PADDING_ID, END_ID, _UNKNOWN_ID)}, or words do not begin with {_WORD_START!r}."
+            f"the tokenizer of {path_or_hub_id} is not that of T5: padding, end and unknown are {ids} "
+            f"instead of {(PADDING_ID, END_ID, _UNKNOWN_ID)}, or words do not begin with {_WORD_START!r}."
         )
+    return tokenizer
 
 
 def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:

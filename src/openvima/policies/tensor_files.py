@@ -94,17 +94,16 @@ def check_finite(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
         for name, tensor in tensors.items()
         if tensor.is_floating_point()
         and tensor.numel()
-        and not all(bound.isfinite() for bound in torch.aminmax(_comparable(tensor)))
+        # 8-bit floats cannot be compared.
+        and not all(
+            bound.isfinite() for bound in torch.aminmax(tensor.float() if tensor.itemsize == 1 else tensor)
+        )
     ]
     if found:
         raise InputFileError(
             f"{file}: {listed('weights that are not finite', found)[0]}. The training "
             "diverged, or the file is damaged; take another checkpoint."
         )
-
-
-def _comparable(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor.float() if tensor.element_size() == 1 else tensor  # 8-bit floats cannot be compared
 
 
 def mismatches(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:

@@ -201,9 +201,8 @@ class WordTokenizer:
         """
         pieces = split_words(text)
         found = [self._id(piece) for piece in pieces]
-        if None not in found:
-            return [token for token in found if token is not None]
-        self._warn([piece for piece, token in zip(pieces, found, strict=True) if token is None])
+        if None in found:
+            self._warn([piece for piece, token in zip(pieces, found, strict=True) if token is None])
         unknown = self._ids.get(UNKNOWN)
         return [token for each in found if (token := unknown if each is None else each) is not None]
 

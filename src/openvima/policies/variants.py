@@ -12,7 +12,7 @@ from openvima.policies.nn.heads import HEADS, AutoregressiveConfig
 from openvima.policies.nn.image_encoders import ConvConfig, VitConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.pointer.config import AttributeConfig, CandidateHeadConfig, PointerConfig
-from openvima.policies.sizes import T5_SIZES, size, t5_prompt_encoder
+from openvima.policies.sizes import SIZES, T5_SIZES, t5_prompt_encoder
 
 CONDITIONINGS = ("cross-attention", "prefix")
 TEXT_ENCODERS = ("small", *T5_SIZES)
@@ -54,7 +54,7 @@ def with_text_encoder(config: PolicyConfig, name: str) -> PolicyConfig:
         raise ConfigError(unknown_name("text_encoder", name, TEXT_ENCODERS))
     old = config.prompt
     if name == "small":
-        new = size("nano").prompt if old.tokenizer == "t5" else old
+        new = SIZES["nano"].prompt if old.tokenizer == "t5" else old
     elif isinstance(config, PointerConfig):
         raise _not_of_pointers(f"text_encoder is {name!r}", "a vocabulary of words alone")
     else:
@@ -111,7 +111,7 @@ def with_image_tokens(config: PolicyConfig, name: str) -> PolicyConfig:
             f"image_tokens is {name!r}, but this network has {own!r} alone; take a preset vima-… or midas-…."
         )
     crop, decoder = images.crop, config.decoder
-    of = replace(size("nano"), width=decoder.width, dropout=decoder.dropout, initial_std=decoder.initial_std)
+    of = replace(SIZES["nano"], width=decoder.width, dropout=decoder.dropout, initial_std=decoder.initial_std)
     if isinstance(crop, VitConfig):
         of = replace(
             of,

@@ -191,7 +191,7 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         _copy_weights(initial, network)
     elif config.t5:
         load_t5(network, config.t5)
-    return PolicyLearner(network, Processor.of(sizes.inputs, tokenizer), config.augmentation)
+    return PolicyLearner(network, Processor(*sizes.inputs, tokenizer), config.augmentation)
 
 
 def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | None) -> Tokenizer:

@@ -11,6 +11,7 @@ from openvima.env import TabletopEnv
 from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.action_head import shift_actions
+from openvima.policies.nn.policy_network import StepInputs
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
 from openvima.policies.pointer.inputs import HeadInputs
 from openvima.policies.pointer.model import Pointer
@@ -51,13 +52,14 @@ def network() -> Pointer:
 def read(network: Pointer, demo: Demonstration, text: str = SAME, *, shift: float = 0.0) -> HeadInputs:
     """Inputs of the head; `shift` is added to all crop features."""
     demo = replace(demo, prompt=replace(demo.prompt, text=text))
-    processor = Processor.of(network.config.inputs, TOKENIZER)
+    processor = Processor(*network.config.inputs, TOKENIZER)
     examples, images = examples_of([demo], processor)
     batch = collate_examples(processor, examples)
     features = network.encode_images(images) + shift * torch.linspace(-1, 1, 16).double()
     prompt = network.encode_prompt(batch.prompts, features)
     previous = shift_actions(batch.targets)
-    return network._head_inputs(prompt, network.init_cache(prompt), batch.history, features, *previous)[0]
+    step = StepInputs(prompt, network.init_cache(prompt), batch.history, features, *previous)
+    return network._head_inputs(step)[0]
 
 
 def selected(inputs: HeadInputs) -> list[str]:

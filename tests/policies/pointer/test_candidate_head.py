@@ -48,7 +48,7 @@ def with_objects(inputs: HeadInputs, kind: str, name: str, value) -> HeadInputs:
 def candidates_of(inputs: HeadInputs) -> PlaceCandidates:
     """All candidates but grid points."""
     grid = ObjectSet(*(getattr(inputs.first_step, name)[:, :0] for name in ObjectSet.__slots__))
-    return PlaceCandidates(inputs, inputs.first_step, inputs.prompt.objects, grid)
+    return PlaceCandidates(inputs, grid)
 
 
 def targets_at(inputs: HeadInputs, place_BT2, *, yaw: float = 0.0, place_slot: int = -1) -> ActionTargets:

@@ -15,7 +15,6 @@ from openvima.policies.pointer.correspondence import (
     Correspondence,
     ObjectFeatures,
     in_earlier_image,
-    in_same_kind_of_image,
 )
 from openvima.policies.pointer.words import coreference
 from openvima.policies.processor import Processor
@@ -99,17 +98,11 @@ def test_an_object_without_a_similar_one_attends_to_nothing(correspondence):
 def test_of_similar_images_one_head_takes_the_latest_and_one_the_earliest(correspondence):
     same = torch.nn.functional.normalize(torch.ones(B, 4, A, dtype=torch.float64), dim=-1)
     frames = inputs(4, seed=1, appearance_NA=same, image_index_N=torch.arange(4).expand(B, 4))
-    attention = weights(correspondence, frames, frames, in_earlier_image(frames))
+    attention = weights(correspondence, frames, frames, in_earlier_image(frames, frames))
     assert (attention[:, 0, 3].argmax(-1) == 2).all()
     assert (attention[:, 1, 3].argmax(-1) == 0).all()
     assert (attention[:, :, 0] == 0).all()  # nothing is earlier than the first image
     assert (attention.diagonal(dim1=-2, dim2=-1) == 0).all()
-
-
-def test_objects_of_scenes_and_objects_alone_are_kept_apart():
-    on_table = torch.tensor([[False, True, True]]).expand(B, -1)
-    same = in_same_kind_of_image(inputs(3, seed=0, in_scene_N=on_table))
-    assert same[0].tolist() == [[True, False, False], [False, True, True], [False, True, True]]
 
 
 def test_only_the_displacement_is_returned_if_all_else_is_equal(correspondence):
@@ -246,7 +239,7 @@ def prompt():
 
 @torch.no_grad()
 def _encoded(network, prompt):
-    batch, stack = Processor.of(network.config.inputs).encode_prompts([prompt])
+    batch, stack = Processor(*network.config.inputs).encode_prompts([prompt])
     features = network.encode_images(torch.from_numpy(stack.images()))
     return network.encode_prompt(batch, features), batch
 

@@ -13,7 +13,7 @@ from openvima.env import TabletopEnv
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.action_head import shift_actions
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH
-from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork, StepInputs
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import benchmark_vocabulary
@@ -47,14 +47,15 @@ def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInput
 
     Actions are those of the demonstrations, or others that were taken.
     """
-    processor = Processor.of(network.config.inputs)
+    processor = Processor(*network.config.inputs)
     examples, images = examples_of(demos, processor)
     batch = collate_examples(processor, examples)
     features = network.encode_images(images)
     prompt = network.encode_prompt(batch.prompts, features)
     actions_BTC = batch.targets.actions_BTC if taken_BTC is None else taken_BTC
     previous = shift_actions(replace(batch.targets, actions_BTC=actions_BTC))
-    inputs, _ = network._head_inputs(prompt, network.init_cache(prompt), batch.history, features, *previous)
+    step = StepInputs(prompt, network.init_cache(prompt), batch.history, features, *previous)
+    inputs, _ = network._head_inputs(step)
     return inputs, network.head.decode(inputs)
 
 
@@ -162,7 +163,7 @@ def test_images_of_single_objects_do_not_change_the_correspondence_of_scenes(net
     )
     encoded = []
     for prompt in (frames, with_object):
-        batch, stack = Processor.of(network.config.inputs).encode_prompts([prompt])
+        batch, stack = Processor(*network.config.inputs).encode_prompts([prompt])
         with torch.no_grad():
             features = network.encode_images(torch.from_numpy(stack.images()))
             prompt = network.encode_prompt(batch, features)
@@ -175,14 +176,15 @@ def test_images_of_single_objects_do_not_change_the_correspondence_of_scenes(net
 
 def test_a_prompt_without_images_is_possible(network, demos):
     demo = demos[3]
-    processor = Processor.of(network.config.inputs)
+    processor = Processor(*network.config.inputs)
     prompt = replace(demo.prompt, text="Rotate it 30 degrees.", images={})
     batch, stack = processor.encode_prompts([prompt])
     history, stack = processor.encode_observations([[demo.observation(0)]], stack=stack)
     features = network.encode_images(torch.from_numpy(stack.images()))
     encoded = network.encode_prompt(batch, features)
     previous = torch.zeros(1, 1, ACTION_WIDTH), torch.zeros(1, 1, dtype=torch.bool)
-    actions, _ = network.decode_step(encoded, network.init_cache(encoded), history, features, *previous)
+    step = StepInputs(encoded, network.init_cache(encoded), history, features, *previous)
+    actions, _ = network.decode_step(step)
     assert actions.isfinite().all()
 
 
@@ -192,7 +194,7 @@ def test_names_of_textures_change_text_appearance_and_not_the_masked_encoding(ne
     prompts = []
     for named in (first, *(("green", "purple") if first != "green" else ("purple", "green"))):
         named_prompt = replace(prompt, text=f"Put the {named} object in {rest}")
-        batch, stack = Processor.of(network.config.inputs).encode_prompts([named_prompt])
+        batch, stack = Processor(*network.config.inputs).encode_prompts([named_prompt])
         with torch.no_grad():
             features = network.encode_images(torch.from_numpy(stack.images()))
             prompts.append(network.encode_prompt(batch, features))

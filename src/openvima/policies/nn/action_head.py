@@ -12,7 +12,7 @@ Shape suffixes: B batch, T steps, Q tokens of a step, D width, C components of a
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -21,7 +21,6 @@ from torch.nn import functional as F
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
     PLACE_NEAR_M,
-    ActionEncoder,
     ActionTargets,
     DecodingStrategy,
     at,
@@ -96,19 +95,6 @@ def shift_actions(targets: ActionTargets) -> tuple[torch.Tensor, torch.Tensor]:
     return previous_BTC, F.pad(targets.steps_BT[:, 1:], (1, 0), value=False)
 
 
-def decode_observations(
-    decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, previous: TokenSegment
-) -> tuple[torch.Tensor, KVCache]:
-    """Decode steps of a previous action and an observation each.
-
-    Returns:
-        The outputs of the observations, (B, T, Q, D), and the cache.
-    """
-    segments = [previous, observations.segment()]
-    (_, outputs_BTQD), cache = decoder.decode_segments(cache, segments)
-    return outputs_BTQD, cache
-
-
 _POSITIONS = (ACTION_PARTS["pose0_position"], ACTION_PARTS["pose1_position"])
 _SAME_M = 0.01  # objects that near have one position
 # The loss, a mean over all steps; its parts as `loss/<name>`; and the decoded actions, (B, T, C).
@@ -120,13 +106,17 @@ class ActionHead(nn.Module):
 
     A head defines `action_loss`, `action` and `fit_prior`.
 
+    Args:
+        actions: Encodes past actions as tokens.
+
     Attributes:
         points: Whether positions are read from objects, as `pointing_loss` trains it; see `point_at_objects`.
     """
 
+    actions: Any  # `ActionEncoder`, or `ComponentTokens` of the autoregressive head
     points = False
 
-    def __init__(self, actions: ActionEncoder) -> None:
+    def __init__(self, actions: nn.Module) -> None:
         super().__init__()
         self.actions = actions
 
@@ -151,11 +141,10 @@ class ActionHead(nn.Module):
     ) -> ActionLoss:
         """Return the loss of whole histories; see `action_loss`. `query_spread` is one of the metrics."""
         previous = self._segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
-        outputs_BTQD, _ = decode_observations(decoder, cache, observations, previous)
+        (_, outputs_BTQD), _ = decoder.decode_segments(cache, [previous, observations.segment()])
         query_BTD = observations.query(outputs_BTQD)
-        loss, metrics, actions_BTC = self.action_loss(query_BTD, targets)
-        found = loss, metrics, actions_BTC
-        return add_pointing(found, self.points, query_BTD, query_BTD, observations, targets)
+        found = self.action_loss(query_BTD, targets)
+        return self.add_pointing(found, query_BTD, query_BTD, observations, targets)
 
     def decode_step(
         self,
@@ -168,38 +157,37 @@ class ActionHead(nn.Module):
     ) -> tuple[torch.Tensor, KVCache]:
         """Decode the next action."""
         previous = self._segment(previous_BTC, has_previous_BT, observations.tokens_BTQD.dtype)
-        outputs_BTQD, cache = decode_observations(decoder, cache, observations, previous)
+        (_, outputs_BTQD), cache = decoder.decode_segments(cache, [previous, observations.segment()])
         query_BTD = observations.query(outputs_BTQD)
         actions_BTC = self.action(query_BTD, strategy)
         if self.points:
             actions_BTC = point_at_objects(actions_BTC, query_BTD, query_BTD, observations, strategy)
         return actions_BTC, cache
 
+    def add_pointing(
+        self,
+        found: ActionLoss,
+        pick_BTD: torch.Tensor,
+        place_BTD: torch.Tensor,
+        observations: ObservationTokens,
+        targets: ActionTargets,
+    ) -> ActionLoss:
+        """Add the spread of the queries to the metrics of an action loss.
+
+        Where positions are read from objects, add `pointing_loss`, too, and let the decoded actions point.
+        """
+        loss, metrics, actions_BTC = found
+        metrics = {**metrics, "query_spread": spread(pick_BTD, targets.steps_BT)}
+        if self.points:
+            pointing = pointing_loss(pick_BTD, place_BTD, observations, targets)
+            actions_BTC = point_at_objects(actions_BTC, pick_BTD, place_BTD, observations, greedy)
+            loss, metrics["loss/pointing"] = loss + pointing, pointing.detach()
+        return loss, metrics, actions_BTC
+
     def _segment(
         self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
     ) -> TokenSegment:
         return action_segment(self.actions(self.past_actions(actions_BTC).to(dtype))[:, :, None], exists_BT)
-
-
-def add_pointing(
-    found: ActionLoss,
-    points: bool,
-    pick_BTD: torch.Tensor,
-    place_BTD: torch.Tensor,
-    observations: ObservationTokens,
-    targets: ActionTargets,
-) -> ActionLoss:
-    """Add the spread of the queries to the metrics of an action loss.
-
-    Where positions are read from objects, add `pointing_loss`, too, and let the decoded actions point.
-    """
-    loss, metrics, actions_BTC = found
-    metrics = {**metrics, "query_spread": spread(pick_BTD, targets.steps_BT)}
-    if points:
-        pointing = pointing_loss(pick_BTD, place_BTD, observations, targets)
-        actions_BTC = point_at_objects(actions_BTC, pick_BTD, place_BTD, observations, greedy)
-        loss, metrics["loss/pointing"] = loss + pointing, pointing.detach()
-    return loss, metrics, actions_BTC
 
 
 def pointing_loss(
@@ -328,9 +316,10 @@ class BinsConfig:
 class BinsHead(ActionHead):
     """Twelve classifiers on the action query, each component independent of the others."""
 
-    def __init__(self, hidden_width: int, width: int, actions: ActionEncoder) -> None:
+    def __init__(self, hidden_width: int, width: int, actions: nn.Module) -> None:
         super().__init__(actions)
-        self.classifiers = bin_classifiers(hidden_width, width)
+        hidden = (width, hidden_width, hidden_width)
+        self.classifiers = nn.ModuleList(scale_last(mlp((*hidden, count)), gain=0.01) for count in NUM_BINS)
 
     def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
         """Return the loss, its parts and the decoded actions; see `bins_loss`."""
@@ -346,38 +335,23 @@ class BinsHead(ActionHead):
         """Map past actions to the bins that the head would have given, in unit range; float64."""
         return decode_bins(encode_bins(super().past_actions(actions_BTC)), torch.float64)
 
+    @torch.no_grad()
     def fit_prior(self, actions_NC: torch.Tensor) -> None:
-        """Start from the marginal distribution of these actions; see `fit_bins`."""
-        fit_bins(self.classifiers, actions_NC)
+        """Set the biases to the log-frequencies of the bins in these actions, smoothed by a 1% uniform part.
+
+        Uniform classifiers get the same large gradient from every example, which drives post-norm blocks to a
+        constant output within the first hundred steps, from which they hardly recover. See
+        docs/train_vima.md.
+        """
+        bins_NC = encode_bins(to_unit_range(actions_NC))
+        for component, classifier in enumerate(self.classifiers):
+            counts = torch.bincount(bins_NC[:, component], minlength=NUM_BINS[component]).to(torch.float64)
+            frequencies = 0.99 * counts / counts.sum() + 0.01 / len(counts)
+            layer_of(classifier, -1).bias.copy_(frequencies.log())
 
     def logits(self, query_BTD: torch.Tensor) -> list[torch.Tensor]:
         """Return one tensor (B, T, K) for each of the twelve components."""
         return [classifier(query_BTD) for classifier in self.classifiers]
-
-
-def bin_classifiers(hidden_width: int, width: int) -> nn.ModuleList:
-    """Build the twelve classifiers."""
-    return nn.ModuleList(
-        scale_last(mlp((width, hidden_width, hidden_width, count)), gain=0.01) for count in NUM_BINS
-    )
-
-
-@torch.no_grad()
-def fit_bins(classifiers: nn.ModuleList, actions_NC: torch.Tensor) -> None:
-    """Set the biases of fresh classifiers to the log-frequencies of the bins, smoothed by a 1% uniform part.
-
-    Uniform classifiers get the same large gradient from every example, which drives post-norm blocks to a
-    constant output within the first hundred steps, from which they hardly recover. See docs/train_vima.md.
-
-    Args:
-        classifiers: One for each component.
-        actions_NC: Demonstrated actions, metres and quaternions.
-    """
-    bins_NC = encode_bins(to_unit_range(actions_NC))
-    for component, classifier in enumerate(classifiers):
-        counts = torch.bincount(bins_NC[:, component], minlength=NUM_BINS[component]).to(torch.float64)
-        frequencies = 0.99 * counts / counts.sum() + 0.01 / len(counts)
-        layer_of(classifier, -1).bias.copy_(frequencies.log())
 
 
 def bins_loss(

@@ -68,6 +68,7 @@ DecodingStrategy = Callable[[torch.Tensor], torch.Tensor]
 
 PICK_NEAR_M, PLACE_NEAR_M, ROTATION_NEAR_RAD = 0.02, 0.04, math.radians(15)
 
+# Of position and quaternion of one pose.
 _LOW = (*WORKSPACE_LOW, -1.0, -1.0, -1.0, -1.0)
 _HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
 
@@ -212,5 +213,5 @@ def nll(logits_BTN: torch.Tensor, target_BT: torch.Tensor) -> torch.Tensor:
 @cache
 def _bounds(dtype: torch.dtype, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
     with torch.inference_mode(False):  # so that those first used in acting serve for training, too
-        low = torch.tensor(_LOW + _LOW, dtype=dtype, device=device)
-        return low, torch.tensor(_HIGH + _HIGH, dtype=dtype, device=device)
+        low, high = torch.tensor((_LOW * 2, _HIGH * 2), dtype=dtype, device=device)
+        return low, high

@@ -18,7 +18,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.errors import ConfigError, PolicyError
-from openvima.policies.nn.layers import Linear, TensorRecord, Unpadder, normal_weights
+from openvima.policies.nn.layers import Linear, TensorRecord, Unpadder, normal_weights, valid_first
 
 MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history together
 MAX_PROMPT_POSITIONS = 256
@@ -90,8 +90,7 @@ class KVCache(TensorRecord):
 
     Args:
         past: Keys and values of each self block.
-        mask_BS: Which cached positions may be attended to.
-        length_B: Number of these; the next valid token gets this position.
+        mask_BS: Which cached positions may be attended to; their number is the next valid token's position.
         prompt: Keys and values of each cross block; empty with a prefix.
         prompt_mask_BP: Which positions of the prompt may be attended to.
         first: Tokens and table points of the objects at the first step, if positions are read from objects.
@@ -99,7 +98,6 @@ class KVCache(TensorRecord):
 
     past: tuple[KeysValues, ...]
     mask_BS: torch.Tensor
-    length_B: torch.Tensor
     prompt: tuple[KeysValues, ...]
     prompt_mask_BP: torch.Tensor
     first: tuple[torch.Tensor, ...] = ()
@@ -124,29 +122,14 @@ class CausalDecoder(nn.Module):
     """What both decoders share: position embedding, self blocks, the cache."""
 
     sequence_name = "the history"  # what the position table covers
+    cross_blocks: nn.ModuleList  # only of `Decoder`
 
-    def __init__(self, width: int, num_layers: int, num_heads: int, dropout: float) -> None:
+    def __init__(self, config: AnyDecoderConfig) -> None:
         super().__init__()
-        self.width, self.num_heads = width, num_heads
-        self.positions = nn.Embedding(MAX_POSITIONS, width)
-        self.self_blocks = nn.ModuleList(SelfBlock(width, num_heads, dropout) for _ in range(num_layers))
-        self.dropout = nn.Dropout(dropout)
-
-    def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
-        """Process the prompt; once per episode.
-
-        Args:
-            prompt_BPD: Encoded prompt.
-            mask_BP: Which of its positions are valid, bool.
-
-        Raises:
-            PolicyError: The prompt is longer than the position table.
-        """
-        raise NotImplementedError
-
-    def align(self) -> None:
-        """Let fresh attention to the prompt compare queries and keys by one matrix."""
-        raise NotImplementedError
+        self.width, self.num_heads = config.width, config.num_heads
+        self.positions = nn.Embedding(MAX_POSITIONS, self.width)
+        self.self_blocks = nn.ModuleList(SelfBlock(config) for _ in range(config.num_layers))
+        self.dropout = nn.Dropout(config.dropout)
 
     def forward(
         self,
@@ -174,24 +157,25 @@ class CausalDecoder(nn.Module):
         Raises:
             PolicyError: The history is longer than the position table.
         """
-        length_B = cache.length_B + mask_BL.sum(dim=1)
-        if cache.mask_BS.shape[1] + tokens_BLD.shape[1] > MAX_POSITIONS:  # only then synchronise
-            check_length(int(length_B.max()), MAX_POSITIONS, self.sequence_name)
-        positions_BL = (cache.length_B[:, None] + mask_BL.cumsum(dim=1) - 1).clamp(min=0)
+        mask_BS, num_past = torch.cat([cache.mask_BS, mask_BL], dim=1), cache.mask_BS.shape[1]
+        positions_BS = position_ids(mask_BS)
+        if mask_BS.shape[1] > MAX_POSITIONS:  # only then synchronise
+            check_length(int(positions_BS.max()) + 1, MAX_POSITIONS, self.sequence_name)
         unpadder = Unpadder(torch.ones_like(mask_BL) if valid_BL is None else valid_BL)
-        x_ND = self.dropout(unpadder.unpad(tokens_BLD + self.positions(positions_BL)))
-        self_bias_B1LS = attention_bias(_causal_mask(cache.mask_BS, mask_BL)[:, None], x_ND.dtype)
+        x_ND = self.dropout(unpadder.unpad(tokens_BLD + self.positions(positions_BS[:, num_past:])))
+        causal_LS = torch.ones_like(mask_BS[0]).expand(mask_BL.shape[1], -1).tril(num_past)
+        self_bias_B1LS = attention_bias((causal_LS & mask_BS[:, None])[:, None], x_ND.dtype)
         prompt_bias_B11P = attention_bias(cache.prompt_mask_BP[:, None, None, :], x_ND.dtype)
         past = []
         for layer, block in enumerate(self.self_blocks):
-            x_ND = self._cross_attend(layer, x_ND, unpadder, cache, prompt_bias_B11P)
+            if cache.prompt:
+                x_ND = self.cross_blocks[layer](x_ND, unpadder, cache.prompt[layer], prompt_bias_B11P)
             if only_cache and layer == len(self.self_blocks) - 1:
                 past.append(cast(SelfBlock, block).project(x_ND, unpadder, cache.past[layer])[1:])
                 break
             x_ND, keys_values = block(x_ND, unpadder, cache.past[layer], self_bias_B1LS)
             past.append(keys_values)
-        mask_BS = torch.cat([cache.mask_BS, mask_BL], dim=1)
-        return unpadder.pad(x_ND), replace(cache, past=tuple(past), mask_BS=mask_BS, length_B=length_B)
+        return unpadder.pad(x_ND), replace(cache, past=tuple(past), mask_BS=mask_BS)
 
     def decode_segments(
         self, cache: KVCache, segments: Sequence[TokenSegment]
@@ -204,57 +188,49 @@ class CausalDecoder(nn.Module):
             The outputs of each segment, (B, T, Q, D), zero where not valid; and the cache.
         """
         sizes = [segment.tokens_BTQD.shape[2] for segment in segments]
-        sequence_BLD = torch.cat([segment.tokens_BTQD for segment in segments], dim=2).flatten(1, 2)
-        mask_BL = torch.cat([segment.mask_BTQ for segment in segments], dim=2).flatten(1)
-        valid_BTQ = torch.cat([segment.valid_BTQ for segment in segments], dim=2)
-        valid_BL = valid_BTQ.flatten(1)
+        sequence_BLD, mask_BL, valid_BL = (
+            torch.cat([getattr(segment, name) for segment in segments], dim=2).flatten(1, 2)
+            for name in ("tokens_BTQD", "mask_BTQ", "valid_BTQ")
+        )
         if valid_BL.all():  # as where a single episode acts
             outputs_BLD, cache = self(cache, sequence_BLD, mask_BL)
-            return outputs_BLD.unflatten(1, valid_BTQ.shape[1:]).split(sizes, dim=2), cache
-        # Valid tokens move to the front of each row, in their order, and their outputs back: the sequence is
-        # then as long as the longest episode, not as all slots together. Rows stay padded, hence `valid` once
-        # more.
-        order_BP = valid_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
-        order_BP = order_BP[:, : int(valid_BL.sum(dim=1).max())]
-        index_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])
-        outputs_BPD, cache = self(
-            cache,
-            sequence_BLD.gather(1, index_BPD),
-            mask_BL.gather(1, order_BP),
-            valid_BL.gather(1, order_BP),
-        )
-        outputs_BLD = outputs_BPD.new_zeros(sequence_BLD.shape).scatter(1, index_BPD, outputs_BPD)
-        return outputs_BLD.unflatten(1, valid_BTQ.shape[1:]).split(sizes, dim=2), cache
-
-    def _cross_attend(
-        self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
-    ) -> torch.Tensor:
-        """Attend to the prompt before a self block; only the decoder with cross-attention does."""
-        return x_ND
+        else:
+            # Valid tokens move to the front of each row, in their order, and their outputs back: the sequence
+            # is then as long as the longest episode, not as all slots together. Rows stay padded, hence
+            # `valid` once more.
+            order_BP = valid_first(valid_BL)
+            index_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])
+            masks = (mask_BL.gather(1, order_BP), valid_BL.gather(1, order_BP))
+            outputs_BPD, cache = self(cache, sequence_BLD.gather(1, index_BPD), *masks)
+            outputs_BLD = outputs_BPD.new_zeros(sequence_BLD.shape).scatter(1, index_BPD, outputs_BPD)
+        return outputs_BLD.unflatten(1, (-1, sum(sizes))).split(sizes, dim=2), cache
 
     def _empty_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         batch = len(prompt_BPD)
         empty = prompt_BPD.new_zeros(batch, self.num_heads, 0, self.width // self.num_heads)
-        return KVCache(
-            ((empty, empty),) * len(self.self_blocks),
-            mask_BP.new_zeros(batch, 0),
-            torch.zeros(batch, dtype=torch.int64, device=mask_BP.device),
-            (),
-            mask_BP,
-        )
+        past = ((empty, empty),) * len(self.self_blocks)
+        return KVCache(past, mask_BP.new_zeros(batch, 0), (), mask_BP)
 
 
 class Decoder(CausalDecoder):
     """Alternates cross blocks and self blocks over the history; the prompt is not transformed."""
 
     def __init__(self, config: DecoderConfig) -> None:
-        super().__init__(config.width, config.num_layers, config.num_self_heads, config.dropout)
+        super().__init__(config)
         self.prompt_positions = nn.Embedding(MAX_PROMPT_POSITIONS, config.width)
         self.cross_blocks = nn.ModuleList(CrossBlock(config) for _ in range(config.num_layers))
         normal_weights(self, config.initial_std)
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
-        """Compute the keys and values of the prompt for every cross block."""
+        """Compute the keys and values of the prompt for every cross block; once per episode.
+
+        Args:
+            prompt_BPD: Encoded prompt.
+            mask_BP: Which of its positions are valid, bool.
+
+        Raises:
+            PolicyError: The prompt is longer than the position table.
+        """
         check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
         prompt_BPD = prompt_BPD + self.prompt_positions(position_ids(mask_BP))
         blocks = (cast(CrossBlock, block) for block in self.cross_blocks)
@@ -262,16 +238,14 @@ class Decoder(CausalDecoder):
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
 
     def align(self) -> None:
-        """Do so in every cross block. Positions start as in `PrefixDecoder.align`."""
+        """Let fresh attention to the prompt compare queries and keys by one matrix, in every cross block.
+
+        Positions start as in `PrefixDecoder.align`.
+        """
         self.positions.weight.mul_(_POSITION_GAIN)
         self.prompt_positions.weight.mul_(_POSITION_GAIN)
         for block in (cast(CrossBlock, each) for each in self.cross_blocks):
             _align(block.query.weight, block.key_value.weight[: self.width])
-
-    def _cross_attend(
-        self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
-    ) -> torch.Tensor:
-        return self.cross_blocks[layer](x_ND, unpadder, cache.prompt[layer], bias_B11P)
 
 
 class PrefixDecoder(CausalDecoder):
@@ -280,12 +254,12 @@ class PrefixDecoder(CausalDecoder):
     sequence_name = "the sequence of prompt and history"
 
     def __init__(self, config: PrefixDecoderConfig) -> None:
-        super().__init__(config.width, config.num_layers, config.num_heads, config.dropout)
+        super().__init__(config)
         self.separator = nn.Parameter(torch.zeros(config.width))
         normal_weights(self, config.initial_std)
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
-        """Decode prompt and separator; the prompt is causal as well."""
+        """Decode prompt and separator; the prompt is causal as well. See `Decoder.init_cache`."""
         check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
         separator_B1D = self.separator.expand(len(prompt_BPD), 1, -1)
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
@@ -294,10 +268,11 @@ class PrefixDecoder(CausalDecoder):
         return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP, mask_BP, only_cache=True)[1]
 
     def align(self) -> None:
-        """Do so in half of the heads of the first block, whose attention reaches the history as well.
+        """Do as `Decoder.align` in half of the heads of the first block.
 
-        There objects are most like themselves, and training forgets the prompt within 300 steps. So the first
-        channel of these heads lowers the score of tokens with `OBSERVATION_MARK` in their own first channel.
+        Their attention reaches the history as well, where objects are most like themselves, and training
+        forgets the prompt within 300 steps. So the first channel of these heads lowers the score of tokens
+        with `OBSERVATION_MARK` in their own first channel.
 
         Positions start as strong as the tokens that they are added to: small ones are inaudible beside image
         tokens, which grow in training. See results/2026-11-29_positions.md.
@@ -372,10 +347,9 @@ class CrossBlock(nn.Module):
 class SelfBlock(nn.Module):
     """Post-norm causal self-attention and a gated feed-forward, as in the first GPT."""
 
-    def __init__(self, width: int, num_heads: int, dropout: float) -> None:
+    def __init__(self, config: AnyDecoderConfig) -> None:
         super().__init__()
-        self.num_heads = num_heads
-        self.attention_dropout = dropout
+        width, self.num_heads = config.width, config.num_heads
         self.query_key_value = Linear(width, 3 * width)
         self.attention_out = Linear(width, width)
         self.norm_attention = nn.LayerNorm(width)
@@ -383,7 +357,7 @@ class SelfBlock(nn.Module):
         self.gate = Linear(width, 4 * width, bias=False)
         self.narrow = Linear(4 * width, width)
         self.norm_feed_forward = nn.LayerNorm(width)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = nn.Dropout(config.dropout)
 
     def forward(
         self, x_ND: torch.Tensor, unpadder: Unpadder, past: KeysValues, bias_B1LS: torch.Tensor
@@ -400,7 +374,7 @@ class SelfBlock(nn.Module):
             Outputs, and the keys and values of all positions.
         """
         query, key, value = self.project(x_ND, unpadder, past)
-        dropout = self.attention_dropout if self.training else 0.0
+        dropout = self.dropout.p if self.training else 0.0
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias_B1LS, dropout_p=dropout)
         attended = self.dropout(self.attention_out(unpadder.unpad(mixed.transpose(1, 2).flatten(2))))
         attended = self.norm_attention(x_ND + attended)
@@ -435,13 +409,6 @@ def attention_bias(visible: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
     return torch.zeros(visible.shape, dtype=dtype, device=visible.device).masked_fill(
         ~visible, torch.finfo(dtype).min
     )
-
-
-def _causal_mask(past_BS: torch.Tensor, new_BL: torch.Tensor) -> torch.Tensor:
-    """Which positions each new token attends to, shape (B, L, S + L)."""
-    length = new_BL.shape[1]
-    causal_LL = torch.ones(length, length, dtype=torch.bool, device=new_BL.device).tril()
-    return torch.cat([past_BS[:, None, :].expand(-1, length, -1), causal_LL & new_BL[:, None, :]], dim=2)
 
 
 def check_length(length: int, limit: int, what: str) -> None:

@@ -27,12 +27,8 @@ from openvima.policies.nn.action_head import (
     ObservationTokens,
     action_segment,
     actions_from_bins,
-    add_pointing,
-    bin_classifiers,
     bins_loss,
-    decode_observations,
     encode_bins,
-    fit_bins,
     point_at_object,
 )
 from openvima.policies.nn.actions import (
@@ -67,24 +63,13 @@ class AutoregressiveConfig:
     action_width: int = 256
 
 
-class AutoregressiveHead(nn.Module):
+class AutoregressiveHead(BinsHead):
     """Twelve classifiers, each on the output of the token before its component.
 
     [..., query,  x0,  y0, a0, b0, c0, d0,  x1,  y1, a1, b1, c1, d1, next step ...]
             |     |    |   |   |   |   |    |    |   |   |   |
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
-
-    points = False  # see `ActionHead`
-
-    def __init__(self, hidden_width: int, width: int, actions: "ComponentTokens") -> None:
-        super().__init__()
-        self.actions = actions
-        self.classifiers = bin_classifiers(hidden_width, width)
-
-    def fit_prior(self, actions_NC: torch.Tensor) -> None:
-        """Start from the marginal distribution of these actions; see `fit_bins`."""
-        fit_bins(self.classifiers, actions_NC)
 
     def loss(
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
@@ -93,17 +78,17 @@ class AutoregressiveHead(nn.Module):
 
         So the actions returned are more accurate than those of `decode_step`.
         """
-        segments = [observations.segment(), self._segment(targets.actions_BTC, targets.steps_BT)]
+        actions = self._segment(targets.actions_BTC, targets.steps_BT, observations.tokens_BTQD.dtype)
+        segments = [observations.segment(), actions]
         (outputs_BTQD, actions_BTCD), _ = decoder.decode_segments(cache, segments)
         query_BT1D = observations.query(outputs_BTQD)[:, :, None]
         outputs_BTCD = torch.cat([query_BT1D, actions_BTCD[:, :, :-1]], dim=2)
         pairs = zip(self.classifiers, outputs_BTCD.unbind(2), strict=True)
         logits = [classifier(output) for classifier, output in pairs]
         loss, metrics, bins_BTC = bins_loss(logits, targets)
-        actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        found = loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
         pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
-        found = loss, metrics, actions_BTC
-        return add_pointing(found, self.points, pick_BTD, place_BTD, observations, targets)
+        return self.add_pointing(found, pick_BTD, place_BTD, observations, targets)
 
     def decode_step(
         self,
@@ -119,8 +104,8 @@ class AutoregressiveHead(nn.Module):
         A position that is read from an object replaces the decoded one before the next component is decoded.
         The returned cache ends with the observation: the action joins it with the next one, as it was sent.
         """
-        previous = self._segment(previous_BTC, has_previous_BT)
-        outputs_BTQD, cache = decode_observations(decoder, cache, observations, previous)
+        previous = self._segment(previous_BTC, has_previous_BT, observations.tokens_BTQD.dtype)
+        (_, outputs_BTQD), cache = decoder.decode_segments(cache, [previous, observations.segment()])
         output_BTD, ahead = observations.query(outputs_BTQD), cache
         bins_BTC = torch.zeros(
             *output_BTD.shape[:2], ACTION_WIDTH, dtype=torch.int64, device=output_BTD.device
@@ -153,7 +138,9 @@ class AutoregressiveHead(nn.Module):
             actions_BTC[..., part] = position_BT2
         return actions_BTC, cache
 
-    def _segment(self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor) -> TokenSegment:
+    def _segment(
+        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
+    ) -> TokenSegment:
         # Bins need all digits, whatever the network computes in.
         return action_segment(self.actions(to_unit_range(actions_BTC.to(torch.float64))), exists_BT)
 
@@ -242,7 +229,7 @@ class MixtureHead(ActionHead):
     Source: mixture density networks, Bishop 1994. The von Mises distribution is the Gaussian of a circle.
     """
 
-    def __init__(self, config: MixtureConfig, width: int, actions: ActionEncoder) -> None:
+    def __init__(self, config: MixtureConfig, width: int, actions: nn.Module) -> None:
         super().__init__(actions)
         self.num_components, self.min_std = config.num_components, config.min_std
         hidden = (width, config.hidden_width, config.hidden_width)
@@ -310,7 +297,7 @@ class MixtureHead(ActionHead):
 class RegressionHead(ActionHead):
     """Regresses positions, cosine and sine with the Huber loss."""
 
-    def __init__(self, config: RegressionConfig, width: int, actions: ActionEncoder) -> None:
+    def __init__(self, config: RegressionConfig, width: int, actions: nn.Module) -> None:
         super().__init__(actions)
         self.huber_delta = config.huber_delta
         hidden = config.hidden_width
@@ -384,14 +371,11 @@ def build_action_tokens(config: HeadConfig, width: int) -> ActionEncoder | Compo
     return ActionEncoder(config.action_width, width)
 
 
-def build_head(
-    config: HeadConfig, width: int, actions: ActionEncoder | ComponentTokens
-) -> ActionHead | AutoregressiveHead:
+def build_head(config: HeadConfig, width: int, actions: nn.Module) -> ActionHead:
     """Build the head that goes with the tokens of past actions."""
-    if isinstance(actions, ComponentTokens):
-        return AutoregressiveHead(config.hidden_width, width, actions)
     if isinstance(config, MixtureConfig):
         return MixtureHead(config, width, actions)
     if isinstance(config, RegressionConfig):
         return RegressionHead(config, width, actions)
-    return BinsHead(config.hidden_width, width, actions)
+    kind = AutoregressiveHead if isinstance(config, AutoregressiveConfig) else BinsHead
+    return kind(config.hidden_width, width, actions)

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from openvima.errors import ConfigError
 from openvima.policies.nn.decoder import attention_bias
-from openvima.policies.nn.layers import Linear, normal_weights
+from openvima.policies.nn.layers import Linear, normal_weights, valid_first
 
 # Mean and standard deviation of R, G, B over training frames, as the published policies use them.
 PIXEL_MEAN = (0.3471, 0.3429, 0.3383)
@@ -26,7 +26,7 @@ PIXEL_STD = (0.3011, 0.2961, 0.2956)
 
 
 class PixelEncoder(nn.Module):
-    """Has the constants by which pixels are standardised."""
+    """Encodes images after it has standardised their pixels."""
 
     pixel_mean: torch.Tensor
     pixel_std: torch.Tensor
@@ -37,6 +37,15 @@ class PixelEncoder(nn.Module):
             # Created on the CPU, so that they exist under `MetaInit`, too.
             constant = torch.tensor(values, device="cpu").view(3, 1, 1)
             self.register_buffer(name, constant, persistent=False)
+
+    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
+        """Encode images (..., 3, height, width), uint8, to (..., F), or (..., P, F) without class token."""
+        return self(images.flatten(0, -4)).unflatten(0, images.shape[:-3])
+
+    def standardize(self, images_NCYX: torch.Tensor) -> torch.Tensor:
+        """Return pixels in the precision of the weights."""
+        pixels = images_NCYX.to(self.pixel_mean.dtype) / 255  # a copy, so the next operations can be in place
+        return pixels.sub_(self.pixel_mean).div_(self.pixel_std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +106,7 @@ class VisionTransformer(PixelEncoder):
             Shape (N, output_width), or (N, P, output_width) without a class token, in the precision of the
             weights.
         """
-        pixels = images_NCYX.to(self.positions.dtype) / 255  # a copy, so the next operations can be in place
-        x_NPW = self.patches(pixels.sub_(self.pixel_mean).div_(self.pixel_std)).flatten(2).transpose(1, 2)
+        x_NPW = self.patches(self.standardize(images_NCYX)).flatten(2).transpose(1, 2)
         if self.class_token is not None:
             x_NPW = torch.cat([self.class_token.expand(len(x_NPW), 1, -1), x_NPW], dim=1)
         x_NPW = self.norm_before(x_NPW + self.positions)
@@ -132,11 +140,6 @@ class VitBlock(nn.Module):
         x_NPW = x_NPW[:, :num_queries] + self.attention_out(mixed.transpose(1, 2).flatten(2))
         hidden = self.widen(self.norm_mlp(x_NPW))
         return x_NPW + self.narrow(hidden * torch.sigmoid(1.702 * hidden))  # QuickGELU
-
-
-def encode_frames(encoder: VisionTransformer, frames: torch.Tensor) -> torch.Tensor:
-    """Encode frames (..., 3, height, width), uint8, to (..., F), or (..., P, F) without class token."""
-    return encoder(frames.flatten(0, -4)).unflatten(0, frames.shape[:-3])
 
 
 _GROUPS = 4
@@ -194,9 +197,8 @@ class ConvEncoder(PixelEncoder):
         Returns:
             Shape (N, F), in the precision of the weights.
         """
-        pixels = crops_NCYX.to(self.projection.weight.dtype) / 255
-        pixels = ((pixels - self.pixel_mean) / self.pixel_std).contiguous(memory_format=torch.channels_last)
-        maps_NCYX = self.layers(pixels)
+        pixels_NCYX = self.standardize(crops_NCYX).contiguous(memory_format=torch.channels_last)
+        maps_NCYX = self.layers(pixels_NCYX)
         pooled = torch.cat([maps_NCYX.mean(dim=(2, 3)), maps_NCYX.amax(dim=(2, 3))], dim=1)
         if self.places is not None:
             pooled = torch.cat([pooled, self.places(maps_NCYX).relu().flatten(1)], dim=1)
@@ -255,8 +257,7 @@ class Resampler(nn.Module):
         mask_NP = None
         if mask is not None:
             mask_NP = mask.flatten(0, -2)
-            order_NP = mask_NP.to(torch.int8).argsort(dim=1, descending=True, stable=True)
-            order_NP = order_NP[:, : max(1, int(mask_NP.sum(dim=1).max()))]
+            order_NP = valid_first(mask_NP, min_count=1)
             mask_NP = mask_NP.gather(1, order_NP)
             tokens_NPD = tokens_NPD.gather(1, order_NP[..., None].expand(-1, -1, tokens.shape[-1]))
         x_NMD = self.cross_layer(self.latents.expand(len(tokens_NPD), -1, -1), tokens_NPD, mask_NP)

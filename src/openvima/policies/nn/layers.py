@@ -117,6 +117,12 @@ def layer_of(stack: nn.Module, index: int) -> nn.Linear:
     return layer
 
 
+def valid_first(mask_BL: torch.Tensor, min_count: int = 0) -> torch.Tensor:
+    """Positions of each row where a mask is true, in order, then some others: as many as any row has."""
+    order_BL = mask_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+    return order_BL[:, : max(min_count, int(mask_BL.sum(dim=1).max()))]
+
+
 class Unpadder:
     """Packs the valid positions of a padded batch and scatters them back.
 

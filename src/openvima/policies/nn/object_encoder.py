@@ -18,7 +18,6 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.errors import ConfigError
 from openvima.policies.nn.image_encoders import ConvConfig, ConvEncoder, VisionTransformer, VitConfig
 from openvima.policies.nn.layers import layer_of, mlp
 
@@ -163,7 +162,7 @@ class ObjectEncoder(nn.Module):
 
     def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
         """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""
-        return self.crop_encoder(crops.flatten(0, -4)).unflatten(0, crops.shape[:-3])
+        return self.crop_encoder.encode_images(crops)
 
     def forward(
         self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
@@ -224,9 +223,3 @@ class ObjectEncoder(nn.Module):
             from above. Symmetric shapes have several peaks.
         """
         return self.rotation(features_a, features_b, masks_a, masks_b).exp()
-
-
-def check_widths(image_width: int, width: int) -> None:
-    """Raise a ConfigError unless image tokens are as wide as the decoder."""
-    if image_width != width:
-        raise ConfigError(f"image tokens are {image_width} wide, the decoder {width}; make them equal.")

@@ -22,7 +22,7 @@ from openvima.policies.nn.actions import (
     action_metrics,
     greedy,
 )
-from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder, KVCache
+from openvima.policies.nn.decoder import CrossBlock, Decoder, KVCache, PrefixDecoder
 from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -38,45 +38,30 @@ class StepTrace:
         logits: Of the object in view, the place candidate and the rotation, (B, classes) each; without the
             rotation where bins give it, and none where they give the whole action.
         attention: Kind of attention to weights of the prompt's positions, (B, L), which sum to 1.
-        positions_BC2: Positions of the place candidates, metres; None without any.
-        masks_BC: Which of them exist.
-        kinds_C: Kind of each, an index of `PLACE_KINDS`.
+        places: The place candidates: positions in metres, (B, C, 2), which exist, (B, C), and the kind of
+            each, an index of `PLACE_KINDS`, (C,). None without any.
         bins: Logits of each component of the action, of policies over bins.
     """
 
     logits: Sequence[torch.Tensor]
     attention: Mapping[str, torch.Tensor]
-    positions_BC2: torch.Tensor | None = None
-    masks_BC: torch.Tensor | None = None
-    kinds_C: torch.Tensor | None = None
+    places: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
     bins: Sequence[torch.Tensor] = ()
 
 
-class Replay:
-    """Decoding strategy that repeats choices, and keeps the logits they were made from.
-
-    Args:
-        choices: Class indices in the order of decoding, (B, 1) each.
-    """
-
-    def __init__(self, choices: Sequence[torch.Tensor]) -> None:
-        self._choices = choices
-        self.logits: list[torch.Tensor] = []
-
-    def __call__(self, logits: torch.Tensor) -> torch.Tensor:
-        """Return the next choice."""
-        self.logits.append(logits[:, 0])
-        return self._choices[len(self.logits) - 1]
+# Logits of each class that was decoded in a step, (B, 1, classes), and its index, (B, 1); in order.
+Decoded = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 
-def normalize_weights(weights_BL: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
-    """Scale weights to a sum of 1; equal ones where nothing has any."""
-    weights_BL = weights_BL * mask_BL
-    total_B1 = weights_BL.sum(dim=-1, keepdim=True)
-    equal_BL = mask_BL / mask_BL.sum(dim=-1, keepdim=True)
-    return torch.where(
-        total_B1 > 0, weights_BL / total_B1.clamp(min=torch.finfo(total_B1.dtype).tiny), equal_BL
-    )
+def normalized(weights: Mapping[str, torch.Tensor], mask_BL: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Scale weights (B, L) of each kind to a sum of 1; equal ones where nothing has any."""
+    equal_BL, result = mask_BL / mask_BL.sum(dim=-1, keepdim=True), {}
+    for kind, weights_BL in weights.items():
+        weights_BL = weights_BL * mask_BL
+        total_B1 = weights_BL.sum(dim=-1, keepdim=True)
+        scaled_BL = weights_BL / total_B1.clamp(min=torch.finfo(total_B1.dtype).tiny)
+        result[kind] = torch.where(total_B1 > 0, scaled_BL, equal_BL)
+    return result
 
 
 NUM_END_EFFECTORS = len(END_EFFECTORS)
@@ -98,19 +83,41 @@ class EncodedPrompt(TensorRecord):
     points_BL2: torch.Tensor | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StepInputs:
+    """What the actions of the next steps are decoded from.
+
+    Args:
+        prompt: Encoded prompts.
+        state: What `init_cache` or the last `decode_step` returned.
+        history: Observations of these steps; one when acting.
+        features_KF: Encoded images, by image index.
+        previous_BTC: The action taken before each observation, metres and quaternions.
+        has_previous_BT: Whether there was one.
+    """
+
+    prompt: Any  # the network's own record
+    state: Any  # likewise
+    history: HistoryBatch
+    features_KF: torch.Tensor
+    previous_BTC: torch.Tensor
+    has_previous_BT: torch.Tensor
+
+
 class PolicyNetwork(nn.Module):
     """Multimodal prompt and history to actions.
 
-    A model defines its parts, `encode_images`, `encode_prompt` and `observe`. Decoding, the loss and acting
-    are those of its action head; the pointer models replace them.
+    A model defines its parts, `encode_prompt` and `observe`. Decoding, the loss and acting are those of its
+    action head; the pointer models replace them.
 
     Attributes:
         config: All sizes.
     """
 
     config: Any  # the config of the model
+    images: Any  # `ObjectEncoder`, or `VisionTransformer` for whole frames
     prompt: PromptEncoder
-    decoder: CausalDecoder
+    decoder: Decoder | PrefixDecoder
     head: Any  # one of `nn/heads.py`; the pointer models have their own
     end_effectors: nn.Embedding
     observation_out: nn.Linear
@@ -121,12 +128,11 @@ class PolicyNetwork(nn.Module):
     @property
     def object_encoder(self) -> ObjectEncoder | None:
         """The encoder of object crops; None for models of whole frames."""
-        images = getattr(self, "images", None)
-        return images if isinstance(images, ObjectEncoder) else None
+        return self.images if isinstance(self.images, ObjectEncoder) else None
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
-        """Encode crops or frames of shape (..., 3, height, width), uint8, once each; features (..., F)."""
-        raise NotImplementedError
+        """Encode crops or frames (..., 3, height, width), uint8, to features (..., F), or (..., P, F)."""
+        return self.images.encode_images(images)
 
     def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> Any:
         """Encode prompts; once per episode.
@@ -175,25 +181,11 @@ class PolicyNetwork(nn.Module):
         in_view_BTN = history.masks_BTVN.any(dim=2) & (self.object_encoder is not None)
         return loss, {**metrics, **action_metrics(actions_BTC, targets, history.grasps_BTN2, in_view_BTN)}
 
-    def decode_step(
-        self,
-        prompt: Any,
-        state: Any,
-        history: HistoryBatch,
-        features_KF: torch.Tensor,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        strategy: DecodingStrategy = greedy,
-    ) -> tuple[torch.Tensor, Any]:
+    def decode_step(self, step: StepInputs, strategy: DecodingStrategy = greedy) -> tuple[torch.Tensor, Any]:
         """Decode the actions of the next steps, of which the earlier ones are in the state.
 
         Args:
-            prompt: Encoded prompts.
-            state: What `init_cache` or the last call returned.
-            history: Observations of these steps; one when acting.
-            features_KF: Encoded images, by image index.
-            previous_BTC: The action taken before each observation, metres and quaternions.
-            has_previous_BT: Whether there was one.
+            step: The inputs.
             strategy: How a class is decoded from logits.
 
         Returns:
@@ -202,9 +194,9 @@ class PolicyNetwork(nn.Module):
         Raises:
             PolicyError: Prompt or history is longer than the decoder takes.
         """
-        observations, state = self._observe(prompt, state, history, features_KF)
+        observations, state = self._observe(step.prompt, step.state, step.history, step.features_KF)
         return self.head.decode_step(
-            self.decoder, state, observations, previous_BTC, has_previous_BT, strategy
+            self.decoder, state, observations, step.previous_BTC, step.has_previous_BT, strategy
         )
 
     def _observe(
@@ -222,48 +214,42 @@ class PolicyNetwork(nn.Module):
         points_BL2 = torch.cat([prompt.points_BL2.to(points_BQ2), points_BQ2], dim=1)
         return replace(observations, scene_tokens_BLD=tokens_BLD, scene_points_BL2=points_BL2), cache
 
-    def explain_step(
-        self,
-        prompt: Any,
-        state: Any,
-        history: HistoryBatch,
-        features_KF: torch.Tensor,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        choices: Sequence[torch.Tensor],
-    ) -> StepTrace:
-        """Decode one step as `decode_step` does, with given choices, and return what it computed.
+    def explain_step(self, step: StepInputs, decoded: Decoded) -> StepTrace:
+        """Explain one step: what `decode_step` has decoded, and attention, for which it decodes once more.
 
         Here for decoders with cross-attention, whose last layer gives the attention.
         """
-        replay, weights = Replay(choices), []
+        mask_BL, weights = step.prompt.mask_BL, []
         block = cast(CrossBlock, cast(Decoder, self.decoder).cross_blocks[-1])
         hook = block.register_forward_pre_hook(
             lambda _, inputs: weights.append(block.last_attention(*inputs))
         )
         try:
-            self.decode_step(prompt, state, history, features_KF, previous_BTC, has_previous_BT, replay)
+            self.decode_step(step)
         finally:
             hook.remove()
         # An autoregressive head goes on with the components of the action.
-        attention = {"decoder": normalize_weights(weights[0].mean(dim=1), prompt.mask_BL)}
-        bins, logits = replay.logits[:ACTION_WIDTH], replay.logits[ACTION_WIDTH:]
+        attention = normalized({"decoder": weights[0].mean(dim=1)}, mask_BL)
+        logits = [logits[:, 0] for logits, _ in decoded]
+        bins, logits = logits[:ACTION_WIDTH], logits[ACTION_WIDTH:]
         if not logits:
             return StepTrace((), attention, bins=bins)
-        observations, _ = self._observe(prompt, state, history, features_KF)
+        observations, _ = self._observe(step.prompt, step.state, step.history, step.features_KF)
         points_BC2, num_own = observations.candidates(1)[1][:, 0], observations.tokens_BTQD.shape[2]
         picks_BQ, places_BC = logits
         end = num_own - self.config.query_token  # before it are the tokens of the top view
-        num_first = points_BC2.shape[1] - num_own - prompt.mask_BL.shape[1]
         classes_BK = torch.stack([each.argmax(-1) for each in bins], dim=-1)
         at_no_object_B2 = actions_from_bins(classes_BK, points_BC2.dtype)[:, ACTION_PARTS["pose1_position"]]
-        kinds = ("in view",) * num_own + ("prompt",) * prompt.mask_BL.shape[1] + ("first step",) * num_first
+        num_kept = mask_BL.shape[1], points_BC2.shape[1] - num_own - mask_BL.shape[1], 1
+        kinds = [PLACE_KINDS.index(kind) for kind in ("in view", "prompt", "first step", "grid")]
         return StepTrace(
-            (picks_BQ[:, end - history.masks_BTVN.shape[-1] : end], places_BC),
+            (picks_BQ[:, end - step.history.masks_BTVN.shape[-1] : end], places_BC),
             attention,
-            torch.cat([points_BC2, at_no_object_B2[:, None]], dim=1),
-            F.pad(points_BC2[..., 0].isfinite(), (0, 1), value=True),
-            torch.tensor([PLACE_KINDS.index(kind) for kind in (*kinds, "grid")]),
+            (
+                torch.cat([points_BC2, at_no_object_B2[:, None]], dim=1),
+                F.pad(points_BC2[..., 0].isfinite(), (0, 1), value=True),
+                torch.tensor(kinds).repeat_interleave(torch.tensor([num_own, *num_kept])),
+            ),
             bins,
         )
 

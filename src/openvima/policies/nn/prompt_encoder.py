@@ -191,7 +191,12 @@ class PromptEncoder(nn.Module):
         self.visual_residual = config.visual_residual
         # The published 768-wide policies have no layer here, since both widths are equal.
         self.out = nn.Identity() if words == width else nn.Linear(words, width, bias=False)
-        self._freeze(config)
+        self.words.requires_grad_(config.train_words)
+        if config.trained_layers is not None:
+            self.text.requires_grad_(False)
+            if config.trained_layers:
+                self.text.blocks[-config.trained_layers :].requires_grad_(True)
+                self.text.norm_after.requires_grad_(True)
 
     def forward(self, prompts: PromptBatch, image_tokens_IE: torch.Tensor) -> torch.Tensor:
         """Encode prompts.
@@ -221,12 +226,3 @@ class PromptEncoder(nn.Module):
         """Run the text encoder on the output of `embed`, (B, L, D)."""
         encoded_BLW = self.text(tokens_BLW, mask_BL)
         return self.out(encoded_BLW + images_BLW if self.visual_residual else encoded_BLW)
-
-    def _freeze(self, config: PromptEncoderConfig) -> None:
-        self.words.requires_grad_(config.train_words)
-        if config.trained_layers is None:
-            return
-        self.text.requires_grad_(False)
-        if config.trained_layers:
-            self.text.blocks[-config.trained_layers :].requires_grad_(True)
-            self.text.norm_after.requires_grad_(True)

@@ -6,8 +6,6 @@ prompt shows the object, the other one where it was at the first step.
 Shape suffixes as in `inputs.py`; C candidates, E kinds of them, G geometric features, H prompt queries.
 """
 
-from collections.abc import Sequence
-
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -16,7 +14,6 @@ from openvima.policies.nn.actions import (
     ActionTargets,
     DecodingStrategy,
     at,
-    carry,
     greedy,
     mask_scores,
     masked_mean,
@@ -25,7 +22,7 @@ from openvima.policies.nn.actions import (
     yaw_between,
 )
 from openvima.policies.nn.layers import mlp
-from openvima.policies.nn.policy_network import Replay, StepTrace, normalize_weights
+from openvima.policies.nn.policy_network import Decoded, StepTrace, normalized
 from openvima.policies.pointer.candidates import (
     NUM_GEOMETRY,
     GridCandidates,
@@ -41,6 +38,7 @@ from openvima.policies.pointer.inputs import (
     PointerPrompt,
     accuracy,
     bin_to_yaw,
+    demonstrated_place,
     offset_loss,
     pick_and_place,
     pointing_metrics,
@@ -81,9 +79,8 @@ class CandidatePointerHead(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
-        self.rotation_copy: RotationCopy | None = None
-        if rotation_bins == config.num_yaw_bins:
-            self.rotation_copy = RotationCopy(width, config.hidden_width)
+        copies_rotations = rotation_bins == config.num_yaw_bins
+        self.rotation_copy = RotationCopy(width, config.hidden_width) if copies_rotations else None
         self.pick = PickPointer(config, width, attributes)
         self.place = PlacePointer(config, width)
         self.grid = GridCandidates(width)
@@ -108,7 +105,7 @@ class CandidatePointerHead(nn.Module):
         # -1 are clamped, so that they can be gathered, and masked in the losses.
         has_pick, pick = targets.steps_BT & (targets.pick_BT >= 0), targets.pick_BT.clamp(min=0)
         pick_logits, place_logits = self.pick(inputs), self.place(inputs, candidates, pick)
-        goal = self._goal(inputs, targets, pick)
+        goal = demonstrated_place(inputs, targets, inputs.positions_BTN2, pick)
         right_BTC, has_place_BT = candidates.right(targets, goal)
         right_BTC = right_BTC | ~has_pick[..., None]  # else no logit would be left, and the loss infinite
         right_logits = mask_scores(place_logits, right_BTC)
@@ -157,25 +154,22 @@ class CandidatePointerHead(nn.Module):
         held = rotate(grasp - start, yaw)
         return pick_and_place(grasp, torch.where(inputs.has_suction_BT[..., None], goal + held, goal), yaw)
 
-    def trace(self, inputs: HeadInputs, choices: Sequence[torch.Tensor]) -> StepTrace:
-        """Decode with given choices, and return what was computed; one step."""
-        replay, candidates, mask_BL = Replay(choices), self.candidates(inputs), inputs.prompt.mask_BL
-        self.decode(inputs, replay)
+    def trace(self, inputs: HeadInputs, decoded: Decoded) -> StepTrace:
+        """Explain what was decoded in one step."""
+        candidates, (_, pick) = self.candidates(inputs), decoded[0]
         weights = {
-            "pick": self.pick.prompt_weights(inputs),
-            "place": self.place.prompt_weights(inputs, choices[0]),
+            "pick": self.pick.prompt_weights(inputs)[:, 0],
+            "place": self.place.prompt_weights(inputs, pick)[:, 0],
         }
         return StepTrace(
-            replay.logits,
-            {name: normalize_weights(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
-            candidates.positions_BTC2[:, 0],
-            candidates.masks_BTC[:, 0],
-            candidates.kinds_C,
+            [logits[:, 0] for logits, _ in decoded],
+            normalized(weights, inputs.prompt.mask_BL),
+            (candidates.positions_BTC2[:, 0], candidates.masks_BTC[:, 0], candidates.kinds_C),
         )
 
     def candidates(self, inputs: HeadInputs) -> PlaceCandidates:
         """Return all place candidates."""
-        return PlaceCandidates(inputs, inputs.first_step, inputs.prompt.objects, self.grid(inputs.first_step))
+        return PlaceCandidates(inputs, self.grid(inputs.first_step))
 
     def relate(
         self,
@@ -202,12 +196,6 @@ class CandidatePointerHead(nn.Module):
             yaw_logits = yaw_logits + self.rotation_copy(inputs, pick_BT, hidden)
         return self.offset(hidden) * OFFSET_UNIT_M, yaw_logits
 
-    def _goal(self, inputs: HeadInputs, targets: ActionTargets, pick_BT: torch.Tensor) -> torch.Tensor:
-        """Where the centre of the picked object goes, or the tool that pushes it, (B, T, 2), metres."""
-        actions = targets.actions_BTC
-        centre = carry(actions, at(inputs.positions_BTN2, pick_BT))
-        return torch.where(inputs.has_suction_BT[..., None], centre, actions[..., 6:8])
-
 
 class PickPointer(ObjectPointer):
     """A pointer whose keys know geometry: relative to the last pick and place, and to other objects.
@@ -226,7 +214,8 @@ class PickPointer(ObjectPointer):
         super().__init__(width, config.num_prompt_queries)
         self._is_exclusive = attributes is not None and attributes.exclusive
         weight = torch.tensor(-1.0 if self._is_exclusive else 0.0)
-        self.appearance_weight = None if attributes is None else nn.Parameter(weight)
+        if attributes is not None:
+            self.appearance_weight = nn.Parameter(weight)
         self.grounding = TextGrounding(width)
         self.geometry = mlp((10, config.hidden_width, width))
 
@@ -238,7 +227,7 @@ class PickPointer(ObjectPointer):
             super().similarity(inputs, scale_BTH) + scale_BTH.sum(dim=-1, keepdim=True) * described_BTN
         )
         selected_BP, attributes_BLX = inputs.prompt.selected_BP, inputs.prompt.attributes_BLX
-        if self.appearance_weight is None or inputs.attributes_BTNX is None:
+        if inputs.attributes_BTNX is None:
             return similarity_BTN
         assert selected_BP is not None and attributes_BLX is not None
         attended_BTHX = torch.softmax(self._attention_scores(inputs), dim=-1) @ attributes_BLX[:, None]

@@ -57,9 +57,7 @@ class PlaceCandidates:
     """All candidates of a batch.
 
     Args:
-        inputs: Knows the objects in view.
-        first_step: Objects in view at the first step.
-        prompt: Objects of prompt images.
+        inputs: Knows the objects in view, at the first step and in prompt images.
         grid: Grid points.
 
     Attributes:
@@ -69,17 +67,17 @@ class PlaceCandidates:
         tokens_BKD, appearance_BKA, image_index_BK: Of those that are the same at every step.
     """
 
-    def __init__(self, inputs: HeadInputs, first_step: ObjectSet, prompt: ObjectSet, grid: ObjectSet) -> None:
-        self.inputs, self.prompt, self.sets = inputs, prompt, (first_step, prompt, grid)
-        self.tokens_BKD = torch.cat([part.tokens_BKD for part in self.sets], dim=1)
-        self.appearance_BKA = torch.cat([part.appearance_BKA for part in self.sets], dim=1)
-        self.image_index_BK = torch.cat([part.image_index_BK for part in self.sets], dim=1)
+    def __init__(self, inputs: HeadInputs, grid: ObjectSet) -> None:
+        self.inputs, self.sets = inputs, (inputs.first_step, inputs.prompt.objects, grid)
+        self.tokens_BKD, self.appearance_BKA, self.image_index_BK, masks_BK, positions_BK2 = (
+            torch.cat([getattr(part, name) for part in self.sets], dim=1)
+            for name in ("tokens_BKD", "appearance_BKA", "image_index_BK", "masks_BK", "positions_BK2")
+        )
         masks_BTN, num_steps = inputs.masks_BTN, inputs.masks_BTN.shape[1]
-        masks_BTK = torch.cat([part.masks_BK for part in self.sets], dim=1)[:, None]
-        self.masks_BTC = torch.cat([masks_BTN, masks_BTK.expand(-1, num_steps, -1)], dim=2)
-        kept_BTK2 = torch.cat([part.positions_BK2 for part in self.sets], dim=1)[:, None]
-        kept_BTK2 = kept_BTK2.expand(-1, num_steps, -1, -1)
-        self.positions_BTC2 = torch.cat([inputs.positions_BTN2, kept_BTK2], dim=2)
+        masks_BTK = masks_BK[:, None].expand(-1, num_steps, -1)
+        self.masks_BTC = torch.cat([masks_BTN, masks_BTK], dim=2)
+        positions_BTK2 = positions_BK2[:, None].expand(-1, num_steps, -1, -1)
+        self.positions_BTC2 = torch.cat([inputs.positions_BTN2, positions_BTK2], dim=2)
         counts = (masks_BTN.shape[2], *(part.masks_BK.shape[1] for part in self.sets))
         kinds = [kind for kind, count in enumerate(counts) for _ in range(count)]
         self.kinds_C = torch.tensor(kinds, device=masks_BTN.device)
@@ -107,7 +105,7 @@ class PlaceCandidates:
         x, y and distance relative to the picked object, and whether it is there; whether another object in
         view is near, and whether an object of the prompt is.
         """
-        inputs, positions_BTC2 = self.inputs, self.positions_BTC2
+        inputs, prompt, positions_BTC2 = self.inputs, self.inputs.prompt.objects, self.positions_BTC2
         relative_BTC2 = positions_BTC2 - at(inputs.positions_BTN2, pick_BT)[:, :, None]
         distance_BTC1 = relative_BTC2.norm(dim=-1, keepdim=True)
         same_BTC1 = torch.exp(-(distance_BTC1 / _SAME_PLACE_M).square())
@@ -115,8 +113,7 @@ class PlaceCandidates:
         near = [
             proximity(distances(positions_BTC2, inputs.positions_BTN2), others_BTN[:, :, None]),
             proximity(
-                distances(positions_BTC2, self.prompt.positions_BK2[:, None]),
-                self.prompt.masks_BK[:, None, None],
+                distances(positions_BTC2, prompt.positions_BK2[:, None]), prompt.masks_BK[:, None, None]
             ),
         ]
         scaled = (relative_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M)

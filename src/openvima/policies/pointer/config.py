@@ -8,7 +8,7 @@ from openvima.policies.nn.decoder import AnyDecoderConfig, DecoderConfig
 from openvima.policies.nn.image_encoders import ConvConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig, TextEncoderConfig
-from openvima.policies.sizes import VOCABULARY_SIZE, size
+from openvima.policies.sizes import SIZES, VOCABULARY_SIZE
 
 ATTRIBUTES = ("texture", "colour", "shape", "profile", "height", "size")
 """In what two objects may be alike, in the order of the projections."""
@@ -128,7 +128,7 @@ def nano() -> PointerConfig:
         crop_dropout=0.5,
     )
     decoder = DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4)
-    return PointerConfig(images, size("nano").prompt, decoder, ObjectHeadConfig())
+    return PointerConfig(images, SIZES["nano"].prompt, decoder, ObjectHeadConfig())
 
 
 def small() -> PointerConfig:

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.nn.layers import TensorRecord, map_tensors, mlp, scale_last
+from openvima.policies.nn.layers import TensorRecord, mlp, scale_last
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
 from openvima.policies.pointer.config import CorrespondenceConfig
 
@@ -51,14 +51,6 @@ class ObjectFeatures(TensorRecord):
     positions_N2: torch.Tensor
     in_scene_N: torch.Tensor
     image_index_N: torch.Tensor
-
-    def at_each_step(self) -> "ObjectFeatures":
-        """Insert an axis of length 1 after the batch, which broadcasts with steps."""
-        return map_tensors(self, lambda tensor: tensor.unsqueeze(1))
-
-    def at_step(self, step: int) -> "ObjectFeatures":
-        """Return those of one step, the second axis."""
-        return map_tensors(self, lambda tensor: tensor[:, step])
 
     @property
     def exists_N(self) -> torch.Tensor:
@@ -103,7 +95,7 @@ class Correspondence(nn.Module):
         own: ObjectFeatures,
         other: ObjectFeatures,
         allowed_NM: torch.Tensor,
-        rotation_between: RotationBetween | None = None,
+        rotation_between: RotationBetween,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Compare objects.
 
@@ -111,7 +103,7 @@ class Correspondence(nn.Module):
             own: The objects.
             other: What they attend to; its axes before the objects may have length 1.
             allowed_NM: Which of them each object may attend to, shape (..., N, M).
-            rotation_between: Estimates rotations, if the object encoder does.
+            rotation_between: Estimates rotations; unused if the object encoder has no bins of them.
 
         Returns:
             The change of the objects' tokens, shape (..., N, D); and the probabilities of the rotation from
@@ -150,7 +142,7 @@ class Correspondence(nn.Module):
         parts = []
         for head, attended_NX in enumerate(attended_HNX.unbind(-3)):
             parts += [attended_NX, *views[NUM_VIEWS * head : NUM_VIEWS * (head + 1)]]
-        if rotation_between is None:
+        if not self.rotation_bins:
             return self.difference(torch.cat(parts, dim=-1)), attended_HNX[..., 0, :, :0]
         rotations_NR = self._rotations(own, target_VNF, found_HVN1[..., 0, :, :, 0], rotation_between)
         return self.difference(torch.cat([*parts, rotations_NR], dim=-1)), rotations_NR
@@ -236,18 +228,6 @@ def _in_both(own: ObjectFeatures, other: ObjectFeatures, weights_HNM: torch.Tens
     return weights_HNM.unsqueeze(-3) * shown_VNM.unsqueeze(-4)
 
 
-def in_earlier_image(objects: ObjectFeatures, other: ObjectFeatures | None = None) -> torch.Tensor:
-    """Which objects of the same or another set are in an earlier image, (..., N, M)."""
-    other = other or objects
+def in_earlier_image(objects: ObjectFeatures, other: ObjectFeatures) -> torch.Tensor:
+    """Which objects of another set are in an earlier image, (..., N, M)."""
     return other.image_index_N[..., None, :] < objects.image_index_N[..., :, None]
-
-
-def in_same_kind_of_image(objects: ObjectFeatures) -> torch.Tensor:
-    """Which objects are in the same kind of image, a scene or an object alone, shape (..., N, N)."""
-    return objects.in_scene_N[..., None, :] == objects.in_scene_N[..., :, None]
-
-
-def is_another(objects: ObjectFeatures) -> torch.Tensor:
-    """Which objects differ from each one: all but itself, shape (N, N)."""
-    count = objects.image_index_N.shape[-1]
-    return ~torch.eye(count, dtype=torch.bool, device=objects.image_index_N.device)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch.nn import functional as F
 
-from openvima.policies.nn.actions import from_unit_range, masked_mean, to_unit_range
+from openvima.policies.nn.actions import ActionTargets, at, carry, from_unit_range, masked_mean, to_unit_range
 from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.pointer.correspondence import ObjectFeatures
 
@@ -143,6 +143,14 @@ def yaw_to_bin(yaw: torch.Tensor, num_bins: int) -> torch.Tensor:
 def bin_to_yaw(bins: torch.Tensor, num_bins: int, dtype: torch.dtype) -> torch.Tensor:
     """Angle of a bin in radians."""
     return bins.to(dtype) * (2 * math.pi / num_bins)
+
+
+def demonstrated_place(
+    inputs: HeadInputs, targets: ActionTargets, points_BTN2: torch.Tensor, pick_BT: torch.Tensor
+) -> torch.Tensor:
+    """Where a point of the picked object goes, or the tool that pushes it, (B, T, 2), metres."""
+    carried_BT2 = carry(targets.actions_BTC, at(points_BTN2, pick_BT))
+    return torch.where(inputs.has_suction_BT[..., None], carried_BT2, targets.actions_BTC[..., 6:8])
 
 
 def offset_loss(offset_BT2: torch.Tensor, true_offset_BT2: torch.Tensor) -> torch.Tensor:

@@ -5,7 +5,6 @@ prompts, M objects in one prompt, V views, N objects in view, Q tokens of a step
 features, A width of appearance, D width of the decoder, C components of an action, R bins of rotations.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,24 +15,26 @@ from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_head import (
     ObservationTokens,
     action_segment,
-    decode_observations,
     shift_actions,
 )
 from openvima.policies.nn.actions import ActionEncoder, ActionTargets, DecodingStrategy, greedy, to_unit_range
-from openvima.policies.nn.decoder import KVCache, TokenSegment, build_decoder
-from openvima.policies.nn.layers import TensorRecord
+from openvima.policies.nn.decoder import KVCache, build_decoder
+from openvima.policies.nn.layers import TensorRecord, map_tensors, valid_first
 from openvima.policies.nn.object_encoder import ObjectEncoder
-from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork, StepTrace
+from openvima.policies.nn.policy_network import (
+    NUM_END_EFFECTORS,
+    Decoded,
+    PolicyNetwork,
+    StepInputs,
+    StepTrace,
+)
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
 from openvima.policies.pointer.correspondence import (
     Correspondence,
     ObjectFeatures,
-    RotationBetween,
     in_earlier_image,
-    in_same_kind_of_image,
-    is_another,
 )
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt
 from openvima.policies.pointer.object_head import ObjectPointerHead
@@ -96,18 +97,12 @@ class Pointer(PolicyNetwork):
             nn.init.zeros_(self.text_appearance.weight)
         else:
             self.head = ObjectPointerHead(config.head, width)
-        self.correspondence: Correspondence | None = None  # within the prompt, or within the view
-        self.prompt_correspondence: Correspondence | None = None  # from the view to the prompt
         if config.correspondence:
-            self.correspondence = Correspondence(config.correspondence, images)
-            self.prompt_correspondence = Correspondence(config.correspondence, images)
+            self.correspondence = Correspondence(config.correspondence, images)  # within prompt, or view
+            self.prompt_correspondence = Correspondence(config.correspondence, images)  # from view to prompt
         self.attributes: Attributes | None = None
         if config.attributes:
             self.attributes = Attributes(config.attributes, images, config.prompt.vocabulary_size)
-
-    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
-        """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""
-        return self.images.encode_images(images)
 
     def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> PointerPrompt:
         """Encode prompts with and without appearance, and gather their objects.
@@ -121,7 +116,7 @@ class Pointer(PolicyNetwork):
         features_VSF = features_KF[prompts.crop_index_VS]
         is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
         appearance_SA = self.embed_appearance(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
-        order_BM = _images_first(is_image_BL)
+        order_BM = valid_first(is_image_BL)
         exists_BM = is_image_BL.gather(1, order_BM)
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
         objects = _prompt_objects(prompts, row_BM, exists_BM, features_VSF, appearance_SA)
@@ -158,6 +153,11 @@ class Pointer(PolicyNetwork):
             object_mask_BL = is_image_BL | (weights_BLL > 0).any(dim=-1)
             if attributes_BLX is not None:
                 attributes_BLX = attributes_BLX + weights_BLL @ attributes_BLX
+        described_BLA = torch.zeros_like(appearance_BLA)
+        if self.text_appearance is not None:
+            # Other words describe none: it would be that of the objects they occurred with in training.
+            words_BLW = self.prompt.words(prompts.word_ids_BL)
+            described_BLA = self.text_appearance(words_BLW) * describes_BL[..., None]
         index_BMD = order_BM[..., None].expand(-1, -1, tokens_BLD.shape[-1])
         object_set = ObjectSet.of(tokens_BLD.gather(1, index_BMD), objects, rotations_BMR)
         return PointerPrompt(
@@ -166,7 +166,7 @@ class Pointer(PolicyNetwork):
             prompts.mask_BL,
             object_mask_BL,
             appearance_BLA,
-            self._described_appearance(prompts.word_ids_BL, describes_BL, appearance_BLA),
+            described_BLA,
             compared,
             replace(object_set, image_index_BK=_scene_index(objects)),
             selected_BP,
@@ -185,48 +185,23 @@ class Pointer(PolicyNetwork):
         self, prompt: PointerPrompt, history: HistoryBatch, features_KF: torch.Tensor, targets: ActionTargets
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Decode whole histories and compare with what was demonstrated."""
-        previous = shift_actions(targets)
-        inputs, _ = self._head_inputs(prompt, self.init_cache(prompt), history, features_KF, *previous)
-        return self.head.loss(inputs, targets)
+        step = StepInputs(prompt, self.init_cache(prompt), history, features_KF, *shift_actions(targets))
+        return self.head.loss(self._head_inputs(step)[0], targets)
 
     def decode_step(
-        self,
-        prompt: PointerPrompt,
-        state: DecodingState,
-        history: HistoryBatch,
-        features_KF: torch.Tensor,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        strategy: DecodingStrategy = greedy,
+        self, step: StepInputs, strategy: DecodingStrategy = greedy
     ) -> tuple[torch.Tensor, DecodingState]:
         """Decode the actions of the next steps, of which the earlier ones are in the state."""
-        inputs, state = self._head_inputs(prompt, state, history, features_KF, previous_BTC, has_previous_BT)
+        inputs, state = self._head_inputs(step)
         return self.head.decode(inputs, strategy), state
 
-    def explain_step(
-        self,
-        prompt: PointerPrompt,
-        state: DecodingState,
-        history: HistoryBatch,
-        features_KF: torch.Tensor,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        choices: Sequence[torch.Tensor],
-    ) -> StepTrace:
-        """Decode one step with given choices, and return what was computed."""
-        inputs, _ = self._head_inputs(prompt, state, history, features_KF, previous_BTC, has_previous_BT)
-        return self.head.trace(inputs, choices)
+    def explain_step(self, step: StepInputs, decoded: Decoded) -> StepTrace:
+        """Explain what was decoded in one step."""
+        return self.head.trace(self._head_inputs(step)[0], decoded)
 
-    def _head_inputs(
-        self,
-        prompt: PointerPrompt,
-        state: DecodingState,
-        history: HistoryBatch,
-        features_KF: torch.Tensor,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-    ) -> tuple[HeadInputs, DecodingState]:
+    def _head_inputs(self, step: StepInputs) -> tuple[HeadInputs, DecodingState]:
         """Decode steps of a previous action and an observation each."""
+        prompt, state, history, features_KF = step.prompt, step.state, step.history, step.features_KF
         features_BTVNF = features_KF[history.crop_index_BTVN]
         appearance_BTNA = self.embed_appearance(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
         objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
@@ -238,12 +213,13 @@ class Pointer(PolicyNetwork):
             compared = self.attributes.hide_others(objects, selected_BP, attributes_BTNX)
         changes_BTND, rotations_BTNR = self._changes_in_view(compared, prompt)
         tokens = self._observation_tokens(history, compared, changes_BTND)
-        previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
-        outputs_BTQD, cache = decode_observations(self.decoder, state.cache, tokens, previous)
+        actions_BTC = to_unit_range(step.previous_BTC.to(torch.float64)).to(features_KF.dtype)
+        previous = action_segment(self.actions(actions_BTC)[:, :, None], step.has_previous_BT)
+        (_, outputs_BTQD), cache = self.decoder.decode_segments(state.cache, [previous, tokens.segment()])
         objects_BTND = outputs_BTQD[:, :, :-1]  # the last token of a step is its query
         num_steps, first_step = history.steps_BT.shape[1], state.first_step
         if first_step is None:
-            now = objects.at_step(0)
+            now = map_tensors(objects, lambda tensor: tensor[:, 0])
             first_step = ObjectSet.of(objects_BTND[:, 0], now, now.appearance_NA[..., :0])
         steps_BT = state.num_steps + torch.arange(num_steps, device=prompt.mask_BL.device)[None]
         inputs = HeadInputs(
@@ -254,7 +230,7 @@ class Pointer(PolicyNetwork):
             positions_BTN2=objects.positions_N2,
             grasps_BTN2=history.grasps_BTN2.to(objects.positions_N2.dtype),
             has_suction_BT=history.end_effector_BT == SUCTION,
-            previous_BTC=previous_BTC * has_previous_BT[..., None],
+            previous_BTC=step.previous_BTC * step.has_previous_BT[..., None],
             steps_BT=steps_BT,
             first_step=first_step,
             prompt=prompt,
@@ -283,12 +259,6 @@ class Pointer(PolicyNetwork):
         return ObservationTokens(
             torch.cat([tokens_BTND, query_BT1D], dim=2), mask_BTQ, query_BT, history.steps_BT
         )
-
-    def _action_segment(
-        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
-    ) -> TokenSegment:
-        unit_BTC = to_unit_range(actions_BTC.to(torch.float64)).to(dtype)
-        return action_segment(self.actions(unit_BTC)[:, :, None], exists_BT)
 
     def _encode(
         self,
@@ -321,11 +291,13 @@ class Pointer(PolicyNetwork):
 
     def _changes_in_prompt(self, objects: ObjectFeatures) -> tuple[torch.Tensor, torch.Tensor]:
         """Compare objects with those of earlier images: changes of tokens, (B, M, D), and rotations."""
-        if self.correspondence is None:
+        if not self.config.correspondence:
             none_BM = objects.appearance_NA.new_zeros(*objects.image_index_N.shape, self.config.images.width)
             return none_BM, none_BM[..., :0]
-        allowed = in_earlier_image(objects) & in_same_kind_of_image(objects)
-        return self.correspondence(objects, objects, allowed, self._rotation_between)
+        # Scenes and objects alone are kept apart.
+        same_kind = objects.in_scene_N[..., None, :] == objects.in_scene_N[..., :, None]
+        allowed = in_earlier_image(objects, objects) & same_kind
+        return self.correspondence(objects, objects, allowed, self.images.rotation_between)
 
     def _changes_in_view(
         self, objects: ObjectFeatures, prompt: PointerPrompt
@@ -335,40 +307,21 @@ class Pointer(PolicyNetwork):
         Returns:
             Changes of tokens, (B, T, N, D), and `HeadInputs.rotations_BTNR`.
         """
-        if self.correspondence is None or self.prompt_correspondence is None:
+        if not (sizes := self.config.correspondence):
             return objects.appearance_NA.new_zeros(()), objects.appearance_NA[..., :0]
-        shown, rotation_between = prompt.features.at_each_step(), self._rotation_between
+        shown, rotation_between = prompt.features, self.images.rotation_between
+        shown = map_tensors(shown, lambda tensor: tensor.unsqueeze(1))  # the same at each step
         # Further columns are zero where no prompt selects attributes.
         width = objects.appearance_NA.shape[-1]
         shown = replace(shown, appearance_NA=shown.appearance_NA[..., :width])
         allowed = in_earlier_image(objects, shown)
         changes_BTND, since_BTNR = self.prompt_correspondence(objects, shown, allowed, rotation_between)
-        if self.config.correspondence and self.config.correspondence.within_view:
-            others = is_another(objects)
+        if sizes.within_view:
+            count = objects.image_index_N.shape[-1]
+            others = ~torch.eye(count, dtype=torch.bool, device=changes_BTND.device)
             changes_BTND = self.correspondence(objects, objects, others, rotation_between)[0] + changes_BTND
         # Bin k of the inverse rotation is bin R - k.
         return changes_BTND, since_BTNR.flip(-1).roll(1, dims=-1)
-
-    @property
-    def _rotation_between(self) -> RotationBetween | None:
-        return self.images.rotation_between if self.config.images.rotation_bins else None
-
-    def _described_appearance(
-        self, word_ids_BL: torch.Tensor, describes_BL: torch.Tensor, like_BLA: torch.Tensor
-    ) -> torch.Tensor:
-        """Appearance that names of textures describe, (B, L, A).
-
-        Other words have none: it would be that of the objects they occurred with in training.
-        """
-        if self.text_appearance is None:
-            return torch.zeros_like(like_BLA)
-        return self.text_appearance(self.prompt.words(word_ids_BL)) * describes_BL[..., None]
-
-
-def _images_first(is_image_BL: torch.Tensor) -> torch.Tensor:
-    """Positions of the images of each prompt, in reading order, then some others, (B, M)."""
-    order_BL = is_image_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
-    return order_BL[:, : int(is_image_BL.sum(dim=1).max())]
 
 
 def _prompt_objects(
@@ -396,9 +349,7 @@ def _objects_in_view(
 ) -> ObjectFeatures:
     """Gather the objects in view; their image index comes after the prompt's last."""
     exists_BTN = history.masks_BTVN.any(dim=2)
-    now_BTN = torch.zeros_like(exists_BTN, dtype=torch.int64)
-    if prompt.image_index_N.shape[1]:
-        now_BTN = now_BTN + (prompt.image_index_N.amax(dim=1) + 1)[:, None, None]
+    last_B = F.pad(prompt.image_index_N, (1, 0), value=-1).amax(dim=1)
     metric = torch.promote_types(features_BTVNF.dtype, torch.float32)
     return ObjectFeatures(
         features_BTVNF,
@@ -407,7 +358,7 @@ def _objects_in_view(
         appearance_BTNA,
         history.positions_BTN2.to(metric),
         exists_BTN,
-        now_BTN,
+        (last_B + 1)[:, None, None].expand_as(exists_BTN),
     )
 
 

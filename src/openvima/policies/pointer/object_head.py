@@ -3,8 +3,6 @@
 Shape suffixes as in `inputs.py`; H prompt queries.
 """
 
-from collections.abc import Sequence
-
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -13,7 +11,6 @@ from openvima.policies.nn.actions import (
     ActionTargets,
     DecodingStrategy,
     at,
-    carry,
     greedy,
     mask_scores,
     masked_mean,
@@ -21,12 +18,13 @@ from openvima.policies.nn.actions import (
     yaw_between,
 )
 from openvima.policies.nn.layers import mlp
-from openvima.policies.nn.policy_network import Replay, StepTrace, normalize_weights
+from openvima.policies.nn.policy_network import Decoded, StepTrace, normalized
 from openvima.policies.pointer.config import ObjectHeadConfig
 from openvima.policies.pointer.inputs import (
     OFFSET_UNIT_M,
     HeadInputs,
     bin_to_yaw,
+    demonstrated_place,
     offset_loss,
     pick_and_place,
     pointing_metrics,
@@ -61,11 +59,9 @@ class ObjectPointerHead(nn.Module):
         pick, place = targets.pick_BT.clamp(min=0), targets.place_BT.clamp(min=0)
         pick_logits, place_logits = self.pick(inputs), self.place_logits(inputs, pick)
         offset, yaw_logits = self.relate(inputs, pick, place)
-        actions = targets.actions_BTC
-        carried = carry(actions, at(inputs.grasps_BTN2, pick))
-        true_place = torch.where(inputs.has_suction_BT[..., None], carried, actions[..., 6:8])
+        true_place = demonstrated_place(inputs, targets, inputs.grasps_BTN2, pick)
         true_offset = true_place - at(inputs.positions_BTN2, place)
-        yaw = yaw_to_bin(yaw_between(actions), self.config.num_yaw_bins)
+        yaw = yaw_to_bin(yaw_between(targets.actions_BTC), self.config.num_yaw_bins)
         losses = {
             "pick": masked_mean(nll(pick_logits, pick), has_pick),
             "place": masked_mean(nll(place_logits, place), has_place),
@@ -90,17 +86,15 @@ class ObjectPointerHead(nn.Module):
         yaw = bin_to_yaw(strategy(yaw_logits), self.config.num_yaw_bins, offset.dtype)
         return pick_and_place(at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, place) + offset, yaw)
 
-    def trace(self, inputs: HeadInputs, choices: Sequence[torch.Tensor]) -> StepTrace:
-        """Decode with given choices, and return what was computed; one step."""
-        replay, mask_BL = Replay(choices), inputs.prompt.mask_BL
-        self.decode(inputs, replay)
-        weights = {"pick": self.pick.prompt_weights(inputs), "place": self.place.prompt_weights(inputs)}
+    def trace(self, inputs: HeadInputs, decoded: Decoded) -> StepTrace:
+        """Explain what was decoded in one step."""
+        pointers = {"pick": self.pick, "place": self.place}
+        weights = {name: pointer.prompt_weights(inputs)[:, 0] for name, pointer in pointers.items()}
+        in_view_N = torch.zeros(inputs.masks_BTN.shape[-1], dtype=torch.int64)
         return StepTrace(
-            replay.logits,
-            {name: normalize_weights(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
-            inputs.positions_BTN2[:, 0],
-            inputs.masks_BTN[:, 0],
-            torch.zeros(inputs.masks_BTN.shape[-1], dtype=torch.int64),
+            [logits[:, 0] for logits, _ in decoded],
+            normalized(weights, inputs.prompt.mask_BL),
+            (inputs.positions_BTN2[:, 0], inputs.masks_BTN[:, 0], in_view_N),
         )
 
     def place_logits(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
