@@ -8,6 +8,7 @@ objects and J images in all prompts, I image tokens of all prompts, M latents.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -47,6 +48,7 @@ from openvima.policies.sizes import SIZES, Size
 from openvima.render.camera import CAMERAS, unproject
 
 _LINEAR_RANGE = 4.0
+Architecture = Literal["vima", "gato", "flamingo", "gpt", "midas"]
 # Table points of the first pixel of the top view, which looks straight down, and of its neighbours.
 _TABLE_POINTS = torch.from_numpy(unproject(np.array([(0, 0), (1, 0), (0, 1)]), CAMERAS["top"]))
 
@@ -56,7 +58,7 @@ class TokenPolicyConfig:
     """Sizes of a policy.
 
     Args:
-        architecture: One of `PUBLISHED`.
+        architecture: Name of the architecture.
         images: Image tokens: those of an object encoder; or of a transformer over whole frames, one per
             patch, or with a class token one per pair of frames.
         prompt: The prompt encoder.
@@ -71,7 +73,7 @@ class TokenPolicyConfig:
             own trains it; see `point_at_objects`.
     """
 
-    architecture: str
+    architecture: Architecture
     images: ObjectEncoderConfig | VitConfig
     prompt: PromptEncoderConfig
     decoder: AnyDecoderConfig

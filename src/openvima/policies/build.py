@@ -3,19 +3,18 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from reprlib import repr as short
-from typing import Any
+from typing import Any, get_args
 
 import torch
 
 from openvima.errors import ConfigError, unknown_name
-from openvima.policies.architectures import TokenPolicy, TokenPolicyConfig
+from openvima.policies.architectures import Architecture, TokenPolicy, TokenPolicyConfig
 from openvima.policies.config_fields import build_config, check_limits
 from openvima.policies.nn.layers import MetaInit
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.pointer.model import Pointer
-from openvima.policies.presets import PUBLISHED
 
 PolicyConfig = TokenPolicyConfig | PointerConfig
 
@@ -33,10 +32,10 @@ def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"policy is {short(values)}; it must be a mapping of architecture and sizes.")
-    architecture = values.get("architecture")
-    if architecture not in (known := (*PUBLISHED, PointerConfig.architecture)):
+    architecture, of_tokens = values.get("architecture"), get_args(Architecture)
+    if architecture not in (known := (*of_tokens, PointerConfig.architecture)):
         raise ConfigError(unknown_name("architecture", short(architecture).strip("'"), known))
-    if architecture in PUBLISHED:
+    if architecture in of_tokens:
         return build_config(TokenPolicyConfig, values, "policy")
     sizes = {name: value for name, value in values.items() if name != "architecture"}
     return build_config(PointerConfig, sizes, "policy")

@@ -144,7 +144,7 @@ class NetworkPolicy(Policy):
                 "to sample with."
             )
         tokenizer = tokenizer or tokenizer_for(network.config.prompt)
-        self.processor = Processor(*network.config.inputs, tokenizer, extractor)
+        self.processor = Processor(*network.config.inputs, tokenizer=tokenizer, extractor=extractor)
         self.device = usable_device(device)
         self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
         self.network = network.to(self.device, self.dtype).eval()
