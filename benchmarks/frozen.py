@@ -104,10 +104,8 @@ def batches(_: argparse.Namespace) -> dict[str, dict[str, str]]:
 def losses(_: argparse.Namespace) -> dict[str, list[dict[str, float]]]:
     """Return the lines of `metrics.jsonl` by preset: means over up to 20 steps."""
     found = {}
+    short = ("--pretraining.steps=20", "--pretraining.num-scenes=60", "--pretraining.batch-size=32")
     for preset in RECIPES:
-        short = ()
-        if preset in ("nano", "small"):
-            short = ("--pretraining.steps=20", "--pretraining.num-scenes=60", "--pretraining.batch-size=32")
         with tempfile.TemporaryDirectory() as folder:
             run = train(preset, "--schedule.steps=50", *short, out=Path(folder) / "run")
             lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
