@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,15 @@ def test_a_killed_process_leaves_whole_files_and_resumes(config, settings, whole
     assert_same(train(config), whole)
 
 
+@pytest.fixture
+def default_sigterm() -> Iterator[None]:
+    """The handler that processes begin with: Ray, used by another test, may have set its own."""
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+@pytest.mark.usefixtures("default_sigterm")
 @pytest.mark.parametrize("stage", ["1-pretraining", "2-cloning"])
 def test_sigterm_writes_a_checkpoint_and_the_run_resumes(settings, tmp_path, stage: str, monkeypatch) -> None:
     """The weights are those of a run that was never ended, whatever step the signal comes at."""
