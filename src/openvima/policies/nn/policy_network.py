@@ -53,7 +53,7 @@ class StepTrace:
 Decoded = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 
-def normalized(weights: Mapping[str, torch.Tensor], mask_BL: torch.Tensor) -> dict[str, torch.Tensor]:
+def normalize_weights(weights: Mapping[str, torch.Tensor], mask_BL: torch.Tensor) -> dict[str, torch.Tensor]:
     """Scale weights (B, L) of each kind to a sum of 1; equal ones where nothing has any."""
     equal_BL, result = mask_BL / mask_BL.sum(dim=-1, keepdim=True), {}
     for kind, weights_BL in weights.items():
@@ -229,7 +229,7 @@ class PolicyNetwork(nn.Module):
         finally:
             hook.remove()
         # An autoregressive head goes on with the components of the action.
-        attention = normalized({"decoder": weights[0].mean(dim=1)}, mask_BL)
+        attention = normalize_weights({"decoder": weights[0].mean(dim=1)}, mask_BL)
         logits = [logits[:, 0] for logits, _ in decoded]
         bins, logits = logits[:ACTION_WIDTH], logits[ACTION_WIDTH:]
         if not logits:

@@ -22,7 +22,7 @@ from openvima.policies.nn.actions import (
     yaw_between,
 )
 from openvima.policies.nn.layers import mlp
-from openvima.policies.nn.policy_network import Decoded, StepTrace, normalized
+from openvima.policies.nn.policy_network import Decoded, StepTrace, normalize_weights
 from openvima.policies.pointer.candidates import (
     NUM_GEOMETRY,
     GridCandidates,
@@ -163,7 +163,7 @@ class CandidatePointerHead(nn.Module):
         }
         return StepTrace(
             [logits[:, 0] for logits, _ in decoded],
-            normalized(weights, inputs.prompt.mask_BL),
+            normalize_weights(weights, inputs.prompt.mask_BL),
             (candidates.positions_BTC2[:, 0], candidates.masks_BTC[:, 0], candidates.kinds_C),
         )
 

@@ -18,7 +18,7 @@ from openvima.policies.nn.actions import (
     yaw_between,
 )
 from openvima.policies.nn.layers import mlp
-from openvima.policies.nn.policy_network import Decoded, StepTrace, normalized
+from openvima.policies.nn.policy_network import Decoded, StepTrace, normalize_weights
 from openvima.policies.pointer.config import ObjectHeadConfig
 from openvima.policies.pointer.inputs import (
     OFFSET_UNIT_M,
@@ -93,7 +93,7 @@ class ObjectPointerHead(nn.Module):
         in_view_N = torch.zeros(inputs.masks_BTN.shape[-1], dtype=torch.int64)
         return StepTrace(
             [logits[:, 0] for logits, _ in decoded],
-            normalized(weights, inputs.prompt.mask_BL),
+            normalize_weights(weights, inputs.prompt.mask_BL),
             (inputs.positions_BTN2[:, 0], inputs.masks_BTN[:, 0], in_view_N),
         )
 
