@@ -284,7 +284,7 @@ def _borders(cells: set[Cell]) -> list[np.ndarray]:
 
 def _open_box(rng: np.random.Generator) -> Geometry:
     x, y = rng.uniform(0.12, 0.2, 2)
-    return _draped(bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07)))))
+    return _drape(bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07)))))
 
 
 def _spread(length: float, part: float, count: int) -> list[float]:
@@ -293,10 +293,10 @@ def _spread(length: float, part: float, count: int) -> list[float]:
 
 
 def _flat_square(rng: np.random.Generator) -> Geometry:
-    return _draped(bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001)))
+    return _drape(bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001)))
 
 
-def _draped(boxes: Geometry) -> Geometry:
+def _drape(boxes: Geometry) -> Geometry:
     return Geometry(drape(boxes.visual), rest_z_m=boxes.rest_z_m)
 
 
