@@ -1,15 +1,17 @@
 """How much faster this commit is than another: both do the same work in turns, each in a process of its own.
 
-    python benchmarks/turns.py --base CHECKOUT [--base-python PYTHON] [--seeds N] [--repeats N] [--json FILE]
+    python benchmarks/turns.py --base CHECKOUT [--seeds N] [--repeats N] [--json FILE]
     python benchmarks/turns.py --base CHECKOUT --data DIR [--presets NAME,…] [--repeats N] [--json FILE]
+    python benchmarks/turns.py --base CHECKOUT --command "evaluate --episodes 5" [--repeats N] [--json FILE]
 
-CHECKOUT is another work tree of the repository, PYTHON an interpreter with its dependencies.
+CHECKOUT is another work tree of the repository.
 `sim`: an oracle episode of a task with all images; `decisions`: prompt and observations of such an episode,
 given to `openvima-small`.
 With a folder of demonstrations: `batches`, all of its object cache as padded batches of 128 with images, and
 `batches_without_images`; `writing`, a shard of its first 100 demonstrations; `opening`, the first episodes of
 up to 100 shards, the index read before; `reading`, the next ones of the same shards.
 With `--presets`: training steps of 64 of these demonstrations, forward, backward and AdamW.
+With `--command`: a whole command from its start to its end.
 After every piece of work of one process comes the same piece in the other, so that the load of the machine
 hits both. Times are CPU time, the shortest of all repeats of a piece; ratios are time before over time now,
 above 1 if this commit is faster.
@@ -21,7 +23,8 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from openvima.atomic_io import atomic_write_file
@@ -126,12 +129,11 @@ TRAINING_WORKER = """
 import json, sys, tempfile
 from pathlib import Path
 from openvima.training import TrainingConfig, train
-data, preset = sys.argv[1:]
-settings = {"data": Path(data), "preset": preset, "schedule.steps": 60, "pretraining.steps": 0,
+settings = {"data": Path(sys.argv[1]), "schedule.steps": 60, "pretraining.steps": 0,
             "optimizer.learning_rate": 3e-4, "loader.batch_size": 64, "runtime.threads": 1}
 for line in sys.stdin:
     with tempfile.TemporaryDirectory() as folder:
-        train(TrainingConfig.of({**settings, "out": Path(folder) / "run"}))
+        train(TrainingConfig.of({**settings, "preset": line.strip(), "out": Path(folder) / "run"}))
         lines = Path(folder, "run", "timings_log.jsonl").read_text().splitlines()
     seconds = {each["step"]: each["cpu_seconds_since_start"] for each in map(json.loads, lines)}
     print((seconds[60] - seconds[20]) / 40, flush=True)
@@ -139,17 +141,21 @@ for line in sys.stdin:
 DATA_KINDS = ("batches", "batches_without_images", "writing", "opening", "reading")
 
 
+def environment(root: Path) -> dict[str, str]:
+    """Return the variables with which Python imports the package of a checkout."""
+    return os.environ | {"PYTHONPATH": str(root / "src"), "OMP_NUM_THREADS": "1"}
+
+
 class Checkout:
     """A process that does pieces of work with the code of a checkout."""
 
-    def __init__(self, python: str, root: Path, worker: str, *arguments: str) -> None:
-        environment = os.environ | {"PYTHONPATH": str(root / "src"), "OMP_NUM_THREADS": "1"}
+    def __init__(self, root: Path, worker: str, *arguments: str) -> None:
         self._process = subprocess.Popen(
-            [python, "-c", worker, *arguments],
+            [sys.executable, "-c", worker, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env=environment,
+            env=environment(root),
         )
 
     def seconds(self, piece: str) -> float:
@@ -172,47 +178,32 @@ def ratio(pair: tuple[Checkout, Checkout], pieces: Sequence[str], repeats: int) 
     return sum(base for base, _ in best) / sum(own for _, own in best)
 
 
-def data_ratios(pythons: tuple[str, str], roots: tuple[Path, Path], folder: Path, repeats: int) -> Ratios:
-    """Compare what is done with a folder of demonstrations."""
-    first, second = (
-        Checkout(python, root, DATA_WORKER, str(folder)) for python, root in zip(pythons, roots, strict=True)
-    )
-    ratios = {}
-    for kind in DATA_KINDS:
-        ratios[kind] = round(ratio((first, second), [kind], repeats), 3)
-        print(f"{kind:28}{ratios[kind]:.2f}", flush=True)
-    return {"data": ratios}
-
-
-def training_ratios(
-    pythons: tuple[str, str], roots: tuple[Path, Path], folder: Path, presets: Sequence[str], repeats: int
-) -> Ratios:
-    """Compare training steps, preset by preset."""
-    ratios = {}
-    for preset in presets:
-        first, second = (
-            Checkout(python, root, TRAINING_WORKER, str(folder), preset)
-            for python, root in zip(pythons, roots, strict=True)
-        )
-        ratios[preset] = round(ratio((first, second), ["go"], repeats), 3)
-        print(f"{preset:28}{ratios[preset]:.2f}", flush=True)
-    return {"training": ratios}
-
-
-def task_ratios(
-    pythons: tuple[str, str], roots: tuple[Path, Path], tasks: Sequence[str], seeds: range, repeats: int
-) -> Ratios:
-    """Compare simulation and decisions, task by task."""
-    first, second = (Checkout(python, root, WORKER) for python, root in zip(pythons, roots, strict=True))
-    found: Ratios = {"sim": {}, "decisions": {}}
-    for task in tasks:
-        for kind, ratios in found.items():
-            pieces = [f"{kind} {task} {seed}" for seed in seeds]
-            ratios[task] = round(ratio((first, second), pieces, repeats), 3)
-        print(
-            f"{task:28}  sim {found['sim'][task]:.2f}  decisions {found['decisions'][task]:.2f}", flush=True
-        )
+def ratios(
+    roots: Sequence[Path], worker: str, pieces: Mapping[str, Sequence[str]], repeats: int, folder: str = ""
+) -> dict[str, float]:
+    """Compare pieces of work of one kind, name by name."""
+    first, second = (Checkout(root, worker, folder) for root in roots)
+    found = {}
+    for name, each in pieces.items():
+        found[name] = round(ratio((first, second), each, repeats), 3)
+        print(f"{name:28}{found[name]:.2f}", flush=True)
     return found
+
+
+def command_ratio(roots: Sequence[Path], command: str, repeats: int) -> Ratios:
+    """Compare a whole command, which gets a new folder `--out` each time."""
+    best = [math.inf, math.inf]
+    for _ in range(repeats):
+        for side, root in enumerate(roots):
+            with tempfile.TemporaryDirectory() as folder:
+                words = [sys.executable, "-m", "openvima", *command.split(), "--out", f"{folder}/out"]
+                before = os.times()
+                subprocess.run(words, env=environment(root), check=True, stdout=subprocess.DEVNULL)
+                after = os.times()
+            seconds = after.children_user + after.children_system
+            best[side] = min(best[side], seconds - before.children_user - before.children_system)
+    print(f"{command}: {best[0]:.1f} s before, {best[1]:.1f} s now")
+    return {"commands": {command: round(best[0] / best[1], 3)}}
 
 
 def main() -> None:
@@ -221,24 +212,31 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--base", type=Path, required=True, help="work tree of the commit before")
-    parser.add_argument("--base-python", default=sys.executable, help="interpreter for it")
     parser.add_argument("--tasks", default="all", help="names with commas between them, or 'all'")
     parser.add_argument("--seeds", type=int, default=6, help="episodes of a task")
     parser.add_argument("--repeats", type=int, default=5, help="of each piece of work")
     parser.add_argument("--data", type=Path, help="folder of demonstrations: compare data, not tasks")
     parser.add_argument("--presets", help="names with commas between them: compare training steps on --data")
+    parser.add_argument("--command", help="a command of openvima, without --out, that is compared whole")
     parser.add_argument("--json", type=Path, help="file to write")
     given = parser.parse_args()
     tasks = list_tasks() if given.tasks == "all" else given.tasks.split(",")
     seeds = range(FIRST_SEED, FIRST_SEED + given.seeds)
-    pythons, roots = (given.base_python, sys.executable), (given.base.resolve(), ROOT)
-    if given.presets:
-        presets = given.presets.split(",")
-        found = training_ratios(pythons, roots, given.data.resolve(), presets, given.repeats)
+    roots = given.base.resolve(), ROOT
+    repeats, data = given.repeats, str(given.data and given.data.resolve())
+    if given.command:
+        found = command_ratio(roots, given.command, repeats)
+    elif given.presets:
+        pieces = {preset: [preset] for preset in given.presets.split(",")}
+        found = {"training": ratios(roots, TRAINING_WORKER, pieces, repeats, data)}
     elif given.data:
-        found = data_ratios(pythons, roots, given.data.resolve(), given.repeats)
+        found = {"data": ratios(roots, DATA_WORKER, {kind: [kind] for kind in DATA_KINDS}, repeats, data)}
     else:
-        found = task_ratios(pythons, roots, tasks, seeds, given.repeats)
+        found = {}
+        for kind in ("sim", "decisions"):
+            print(kind)
+            pieces = {task: [f"{kind} {task} {seed}" for seed in seeds] for task in tasks}
+            found[kind] = ratios(roots, WORKER, pieces, repeats)
     means = {
         kind: round(math.prod(r.values()) ** (1 / len(r)), 3) for kind, r in found.items() if kind != "data"
     }
