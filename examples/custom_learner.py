@@ -2,6 +2,8 @@
 
     openvima generate --tasks visual_manipulation --episodes 200 --out demos
     openvima train --data demos --preset examples/custom_learner.py:make --out run
+    # or by the name that it registers:
+    OPENVIMA_POLICY_FILES=examples/custom_learner.py openvima train --data demos --preset matcher --out run
     openvima evaluate --policy run --trust-code --tasks visual_manipulation --levels L1,L3 --episodes 20
 
 The training loop provides recipes, exact resuming, validation, multi-process training and mixed precision. A
@@ -15,6 +17,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.perception.objects import observe, observe_prompt_image
+from openvima.policies import register_policy
 from openvima.policies.processor import Processor
 from openvima.scene import Action
 from openvima.training.learner import Learner, PolicyCollate
@@ -92,6 +95,7 @@ class MatcherPolicy:
         return self.network.embed_objects(images, crop_index)
 
 
+@register_policy("matcher")
 def make():
-    """Entry point of `--preset examples/custom_learner.py:make`."""
+    """Return the learner that `--preset` names."""
     return Matcher()

@@ -30,7 +30,7 @@ DECLARED = "who acted (policies) and what they observed (ablation, boxes, device
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOutcome:
-    """How one episode ended.
+    """How one episode ended. A new field needs a default, since files from before are read, too.
 
     Args:
         seed: The episode's seed, of domain "eval".

@@ -84,12 +84,13 @@ def measure(problem: Problem, progress: Progress, scene: Scene) -> dict[str, flo
     Args:
         problem: The episode's problem.
         progress: The open goals.
-        scene: The scene at rest.
+        scene: The scene now.
 
     Returns:
-        `goals_met`: fraction of the required goals that are met, 0 … 1; 0 without goals. `distance_m` and
-        `angle_rad`: how far the nearest of the goals that can be met next is from its target. Both are 0 once
-        `goals_met` is 1, and infinite if no goal states a distance (unlike NaN equal in equal episodes).
+        `goals_met`: fraction of the required goals that are met, 0 … 1, also where more are met than may be;
+        0 without goals. `distance_m` and `angle_rad`: how far the nearest of the goals that can be met next
+        is from its target. Both are 0 once `goals_met` is 1, and infinite if no goal states a distance
+        (unlike NaN equal in equal episodes).
     """
     num_goals = len(problem.goals)
     num_required = num_goals if problem.num_required is None else problem.num_required

@@ -3,7 +3,8 @@
 "Rearrange to this {scene} and then restore." asks for places where nothing is now. One of them is where the
 prompt shows the object, the other one where it was at the first step.
 
-Shape suffixes as in `inputs.py`; C candidates, E kinds of them, G geometric features, H prompt queries.
+Shape suffixes as in `inputs.py`; C candidates, E kinds of them, G geometric features, H prompt queries
+(in `hidden_BTH` the hidden width).
 """
 
 import torch
@@ -325,7 +326,7 @@ class PlacePointer(nn.Module):
         )
         self.geometry = nn.Linear(width, NUM_GEOMETRY)
         self.same = nn.Linear(width, 1)  # logit of the place of the picked object itself
-        for layer, bias in (
+        for layer, bias in (  # in the order of `PLACE_KINDS`
             (self.picked_scale, (0.0, 5.0, 5.0, 0.0)),
             (self.prompt_scale, (10.0, 0.0, 0.0, 0.0)),
         ):

@@ -25,7 +25,7 @@ class ObjectSet(TensorRecord):
         masks_BK: Which of them exist and have a position on the table.
         appearance_BKA: Their appearance.
         positions_BK2: Table points under their boxes, metres; in float32 at least.
-        image_index_BK: Index of the image of the table that shows each, from 0 in reading order.
+        image_index_BK: For objects of a prompt: which of its scenes shows each, from 0 in reading order.
         rotations_BKR: Probabilities of the rotation of each since an earlier image, counter-clockwise; R is 0
             if they are not estimated.
     """
