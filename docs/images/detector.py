@@ -36,7 +36,8 @@ def frame() -> Frame:
 def draw_anchors(axes: Any, annotated: Frame) -> None:
     """Draw the foreground anchors, coloured by level."""
     sizes = SMALL
-    shapes = [(FRONT.height // (4 * 2**k), FRONT.width // (4 * 2**k)) for k in range(len(sizes.anchor_sizes))]
+    strides = [FIRST_STRIDE * 2**k for k in range(len(sizes.anchor_sizes))]
+    shapes = tuple((FRONT.height // stride, FRONT.width // stride) for stride in strides)
     levels = pyramid_anchors(sizes.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
     _, labels = match(
         torch.cat(levels),
@@ -57,9 +58,7 @@ def draw_grids(axes: Any, annotated: Frame) -> None:
     """Draw the RoIAlign grids of the box head, coloured by level."""
     sizes = SMALL
     boxes = torch.from_numpy(annotated.boxes)
-    levels = box_levels(
-        boxes, 3, canonical_size=sizes.canonical_size, canonical_level=sizes.canonical_level
-    ).tolist()
+    levels = box_levels(boxes, sizes).tolist()
     for (left, upper, right, lower), level in zip(annotated.boxes.tolist(), levels, strict=True):
         columns = np.linspace(left, right, sizes.box_pool_size + 1)
         rows = np.linspace(upper, lower, sizes.box_pool_size + 1)

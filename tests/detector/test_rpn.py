@@ -11,11 +11,12 @@ from openvima.detector.boxes import (
     box_iou,
     decode_boxes,
     encode_boxes,
-    level_anchors,
     match,
     nms,
+    pyramid_anchors,
     subsample,
 )
+from openvima.detector.config import SMALL
 from openvima.detector.layers import PROPOSAL_WEIGHTS, AnchorPredictions, RegionProposalNetwork
 from openvima.detector.roi_align import (
     box_levels,
@@ -102,7 +103,7 @@ def test_nms_agrees_with_the_naive_twin(limit, seed):
     rng = np.random.default_rng(seed)
     boxes = random_boxes(80, seed)
     scores = rng.integers(0, 20, 80) / 20  # with ties
-    kept = nms(boxes, torch.from_numpy(scores), limit)
+    kept = nms(boxes, torch.from_numpy(scores), limit, torch.zeros(80, dtype=torch.int64))
     assert kept.tolist() == naive.nms(boxes.tolist(), scores.tolist(), limit, [0] * 80)
 
 
@@ -113,7 +114,7 @@ def test_nms_acts_in_each_group_alone_and_drops_boxes_without_area():
 
 
 def test_the_anchors_of_a_level_agree_with_the_naive_twin():
-    made = level_anchors(20.0, stride=8, height=3, width=5)
+    _, made = pyramid_anchors((10.0, 20.0), ((6, 10), (3, 5)), first_stride=4)
     assert np.allclose(made, naive.anchors(20.0, stride=8, height=3, width=5), atol=1e-5)
 
 
@@ -159,7 +160,7 @@ def test_boxes_are_sampled_with_a_fraction_of_foreground():
 def test_the_pyramid_level_follows_from_the_size_of_a_box():
     sides = torch.tensor([5.0, 23.9, 24, 47.9, 48, 96, 500])
     boxes = torch.stack([sides * 0, sides * 0, sides, sides], dim=1)
-    levels = box_levels(boxes, 3, canonical_size=48, canonical_level=1)
+    levels = box_levels(boxes, SMALL)
     assert levels.tolist() == [0, 0, 0, 0, 1, 2, 2]
 
 
@@ -184,22 +185,17 @@ def test_cropping_and_pasting_keeps_a_mask():
     assert (again & mask).sum() / (again | mask).sum() > 0.95
 
 
-LEVELS = {"canonical_size": 48, "canonical_level": 1}
-
-
 @pytest.mark.parametrize("sampling_ratio", [0, 1, 2, 3])
 def test_aligned_features_agree_with_the_naive_twin(sampling_ratio):
     rng = np.random.default_rng(sampling_ratio)
     levels = [torch.from_numpy(rng.normal(size=(2, 3, 16 // 2**k, 24 // 2**k))) for k in range(3)]
     low = rng.uniform(-20, 80, (20, 2))
     boxes = torch.from_numpy(np.concatenate([low, low + rng.uniform(0.1, 120, (20, 2))], axis=1))
-    sizes = {"canonical_size": 30, "canonical_level": 1}
-    images, indices = torch.arange(20) % 2, box_levels(boxes, 3, **sizes)
+    config = replace(SMALL, canonical_size=30.0, roi_sampling_ratio=sampling_ratio)
+    images, indices = torch.arange(20) % 2, box_levels(boxes, config)
     assert len(indices.unique()) == 3
     with torch.no_grad():
-        cells = pyramid_align(
-            levels, boxes, images, size=3, sampling_ratio=sampling_ratio, first_stride=4, **sizes
-        )
+        cells = pyramid_align(levels, boxes, images, config, size=3)
     trained = torch.empty_like(cells)
     for level, features in enumerate(levels):
         rows, grid = indices == level, {"size": 3, "stride": 4 * 2**level}
@@ -222,10 +218,8 @@ def test_aligned_features_are_those_of_training():
     levels = [torch.randn(2, 4, 32 // 2**k, 64 // 2**k, generator=generator) for k in range(3)]
     low = 100 * torch.rand(9, 2, generator=generator)
     boxes = torch.cat([low, low + 100 * torch.rand(9, 2, generator=generator)], dim=1)
-    sizes = {"size": 7, "sampling_ratio": 2, "first_stride": 4}
-    trained = pyramid_align(levels, boxes, torch.arange(9) % 2, **sizes, **LEVELS)
+    trained = pyramid_align(levels, boxes, torch.arange(9) % 2, SMALL, size=7)
     with torch.no_grad():
-        assert torch.allclose(
-            pyramid_align(levels, boxes, torch.arange(9) % 2, **sizes, **LEVELS), trained, atol=1e-5
-        )
-        assert pyramid_align(levels, boxes[:0], torch.arange(0), **sizes, **LEVELS).shape == (0, 4, 7, 7)
+        found = pyramid_align(levels, boxes, torch.arange(9) % 2, SMALL, size=7)
+        assert torch.allclose(found, trained, atol=1e-5)
+        assert pyramid_align(levels, boxes[:0], torch.arange(0), SMALL, size=7).shape == (0, 4, 7, 7)

@@ -12,13 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.catalog.geometry import (
-    CollisionBox,
-    CollisionHull,
-    Geometry,
-    TriangleMesh,
-    Vector3,
-)
+from openvima.catalog.geometry import CollisionBox, CollisionHull, Geometry, TriangleMesh, Vector3, product
 from openvima.catalog.meshes import combine, drape, scale_geometry
 from openvima.catalog.objects import object_spec
 
@@ -103,7 +97,7 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
     """
     if object_name not in BOX_SHAPES:
         return scale_geometry(fixed_geometry(object_spec(object_name).name), scale)
-    geometry = BOX_SHAPES[object_name]((size[0] * scale[0], size[1] * scale[1], size[2] * scale[2]))
+    geometry = BOX_SHAPES[object_name](product(size, scale))
     return replace(geometry, visual=drape(geometry.visual))
 
 

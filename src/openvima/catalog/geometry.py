@@ -9,6 +9,11 @@ import numpy as np
 Vector3 = tuple[float, float, float]
 
 
+def product(size: Vector3, scale: Vector3) -> Vector3:
+    """Multiply sizes by factors, axis by axis."""
+    return (size[0] * scale[0], size[1] * scale[1], size[2] * scale[2])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleMesh:
     """Triangles in the link frame.

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
-from openvima.catalog.meshes import TEXTURE_PER_M, scale_mesh
+from openvima.catalog.meshes import TEXTURE_PER_M, combine, scale_mesh
 from openvima.errors import AssetError, InputFileError, ShapeError
 from openvima.input_files import as_path, read_text
 
@@ -28,6 +28,10 @@ class ObjMesh(TriangleMesh):
     """
 
     parts: np.ndarray
+
+    def pieces(self) -> list[np.ndarray]:
+        """Return the points of each part, shape (N, 3)."""
+        return [self.vertices[self.parts == part].reshape(-1, 3) for part in np.unique(self.parts)]
 
 
 def parse_obj(text: str, name: str) -> ObjMesh:
@@ -85,15 +89,17 @@ def _corner(word: str, counts: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 def _assemble(numbers: dict[str, list[list[float]]], faces: np.ndarray, parts: np.ndarray) -> ObjMesh:
-    vertices = np.array(numbers["v"], dtype=np.float64)[faces[..., 0]]
-    uvs = np.zeros((*faces.shape[:2], 2))
-    if numbers["vt"]:
-        uvs = np.where(faces[..., 1:2] >= 0, np.array(numbers["vt"], dtype=np.float64)[faces[..., 1]], 0.0)
-    normals = face_normals(vertices)
-    if numbers["vn"]:
-        given = np.array(numbers["vn"], dtype=np.float64)[faces[..., 2]]
-        normals = np.where(faces[..., 2:3] >= 0, given, normals)
-    return ObjMesh(vertices, normals, uvs, parts)
+    v, vt, vn = np.moveaxis(faces, -1, 0)
+    vertices = np.array(numbers["v"], dtype=np.float64)[v]
+    normals = _look_up(numbers["vn"], vn, otherwise=face_normals(vertices))
+    return ObjMesh(vertices, normals, _look_up(numbers["vt"], vt, otherwise=np.zeros((*vt.shape, 2))), parts)
+
+
+def _look_up(numbers: list[list[float]], indices: np.ndarray, *, otherwise: np.ndarray) -> np.ndarray:
+    """Take what the file gives at the corners whose index is not negative."""
+    if not numbers:
+        return otherwise
+    return np.where(indices[..., None] >= 0, np.array(numbers, dtype=np.float64)[indices], otherwise)
 
 
 def face_normals(vertices: np.ndarray) -> np.ndarray:
@@ -160,17 +166,16 @@ def read_mesh(
         AssetError: The mesh cannot be read, or is empty, too large, not finite, flat or open.
     """
     drawn = _read(mesh, what)
-    vertices = _orient(drawn.vertices, double_sided=double_sided, what=what)
-    normals, uvs = drawn.normals, drawn.uvs
-    if vertices is not drawn.vertices:  # turned inside out
-        normals, uvs = -normals[:, ::-1], uvs[:, ::-1]
+    inside_out = TriangleMesh(drawn.vertices[:, ::-1], -drawn.normals[:, ::-1], drawn.uvs[:, ::-1])
     if double_sided:
-        vertices = np.concatenate([vertices, vertices[:, ::-1]])
-        normals, uvs = np.concatenate([normals, -normals[:, ::-1]]), np.concatenate([uvs, uvs[:, ::-1]])
+        drawn = combine([drawn, inside_out])
+    elif _faces_inwards(drawn.vertices, what):
+        drawn = inside_out
+    vertices = drawn.vertices
     corners = vertices.reshape(-1, 3)
     low, high = corners.min(axis=0), corners.max(axis=0)
     _check_thickness(corners, what)
-    parts = [corners] if collision is None else _parts(_read(collision, f"collision of {what}"))
+    parts = [corners] if collision is None else _read(collision, f"collision of {what}").pieces()
     if len(parts) > MAX_PARTS:
         raise AssetError(f"collision of {what} has {len(parts)} parts; at most {MAX_PARTS} are allowed.")
     middle = (low + high) / 2
@@ -181,9 +186,8 @@ def read_mesh(
                 f"part {number} of the collision of {what} is outside twice the mesh's bounds; "
                 "use the same coordinates for both."
             )
-    area = np.linalg.norm(np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]), axis=1)
-    seen = area > 0
-    visual = TriangleMesh(vertices[seen] - middle, normals[seen], uvs[seen])
+    seen = face_normals(vertices).any(axis=(1, 2))  # those with an area
+    visual = TriangleMesh(vertices[seen] - middle, drawn.normals[seen], drawn.uvs[seen])
     x, y, z = (high - low).tolist()
     return UserMesh(visual, (x, y, z), tuple(_extreme_points(part - middle) for part in parts))
 
@@ -218,11 +222,9 @@ def _read(mesh: Mesh, what: str) -> ObjMesh:
         raise AssetError(
             f"mesh of {what} has a coordinate that is not finite or beyond ±{_MAX_COORDINATE:g}."
         )
-    lengths = np.linalg.norm(found.normals, axis=2, keepdims=True)
-    flat = face_normals(found.vertices)
+    lengths, flat = np.linalg.norm(found.normals, axis=2, keepdims=True), face_normals(found.vertices)
     is_usable = np.isfinite(lengths) & (lengths > 0)
-    normals = np.where(is_usable, found.normals / np.where(is_usable, lengths, 1.0), flat)
-    return replace(found, normals=normals)
+    return replace(found, normals=np.divide(found.normals, lengths, out=flat, where=is_usable))
 
 
 def _read_file(file: Path, what: str) -> ObjMesh:
@@ -239,10 +241,9 @@ def _from_arrays(mesh: object, what: str) -> ObjMesh:
     if not isinstance(mesh, tuple | list) or len(mesh) != 2:
         raise ShapeError(f"mesh of {what} is a {type(mesh).__name__}; {form}.")
     vertices, triangles = np.asarray(mesh[0]), np.asarray(mesh[1])
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
-        raise ShapeError(f"vertices of {what} are {vertices.dtype} of shape {vertices.shape}; {form}.")
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
-        raise ShapeError(f"triangles of {what} are {triangles.dtype} of shape {triangles.shape}; {form}.")
+    for name, array, kinds in (("vertices", vertices, "fiu"), ("triangles", triangles, "iu")):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
+            raise ShapeError(f"{name} of {what} are {array.dtype} of shape {array.shape}; {form}.")
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
         raise AssetError(
             f"triangles of {what} name vertices {triangles.min()} … {triangles.max()}; it has 0 … "
@@ -271,13 +272,8 @@ def _pieces(triangles: np.ndarray, num_vertices: int) -> np.ndarray:
         label = lower
 
 
-def _parts(mesh: ObjMesh) -> list[np.ndarray]:
-    """Points of each separate piece, shape (N, 3)."""
-    return [mesh.vertices[mesh.parts == part].reshape(-1, 3) for part in np.unique(mesh.parts)]
-
-
-def _orient(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarray:
-    """Return the triangles facing outwards; the array itself where they do already.
+def _faces_inwards(vertices: np.ndarray, what: str) -> bool:
+    """Whether the triangles of a closed mesh face inwards.
 
     In a closed mesh each edge, from start to end, has its reverse in a neighbour. Six times its volume is a
     sum over the triangles, negative where they face inwards.
@@ -285,8 +281,6 @@ def _orient(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarra
     Raises:
         AssetError: The mesh is open, or its triangles are wound inconsistently.
     """
-    if double_sided:
-        return vertices
     _, corner = np.unique(np.round(vertices.reshape(-1, 3), 9), axis=0, return_inverse=True)
     corner = corner.reshape(-1, 3).astype(np.int64)
     start, end = corner.reshape(-1), np.roll(corner, -1, axis=1).reshape(-1)
@@ -300,7 +294,7 @@ def _orient(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarra
         )
     middle = vertices.reshape(-1, 3).mean(axis=0)
     a, b, c = np.moveaxis(vertices - middle, 1, 0)
-    return vertices if (a * np.cross(b, c)).sum() >= 0 else vertices[:, ::-1]
+    return bool((a * np.cross(b, c)).sum() < 0)
 
 
 def _check_thickness(points: np.ndarray, what: str) -> None:
@@ -317,12 +311,8 @@ def _extreme_points(points: np.ndarray) -> np.ndarray:
     step = np.arange(_NUM_DIRECTIONS) + 0.5
     z, turn = 1 - 2 * step / _NUM_DIRECTIONS, step * np.pi * (1 + 5**0.5)  # Fibonacci sphere
     radius = np.sqrt(1 - z * z)
-    x, y = radius * np.cos(turn), radius * np.sin(turn)
-    farthest = {
-        int(np.argmax(points[:, 0] * i + points[:, 1] * j + points[:, 2] * k))
-        for i, j, k in zip(x.tolist(), y.tolist(), z.tolist(), strict=True)
-    }
-    return points[sorted(farthest)]
+    directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
+    return points[np.unique([(points * each).sum(axis=1).argmax() for each in directions])]
 
 
 def _drape(mesh: TriangleMesh) -> TriangleMesh:

@@ -112,14 +112,14 @@ def _side_walls(loop: np.ndarray, z_low: float, z_high: float, texture_per_m: fl
     outward = np.stack([end[:, 1] - start[:, 1], start[:, 0] - end[:, 0]], axis=1)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     folded = outward * (z_high - z_low)  # where the lower edge would be if the wall were folded up flat
-    positions = [_at_height(point, z_low) for point in (start, end)]
-    positions += [_at_height(point, z_high) for point in (end, start)]
+    corners = ((start, z_low), (end, z_low), (end, z_high), (start, z_high))
+    positions = [_at_height(point, z) for point, z in corners]
     vertices, flat = (
         np.concatenate([np.stack([corners[i] for i in each], axis=1) for each in ((0, 1, 2), (0, 2, 3))])
         for corners in (positions, [start + folded, end + folded, end, start])
     )
-    normal = np.repeat(np.concatenate([outward, outward])[:, None], 3, axis=1)
-    return TriangleMesh(vertices, _at_height(normal, 0.0), 0.5 + texture_per_m * flat)
+    normals = np.tile(_at_height(outward, 0.0)[:, None], (2, 3, 1))
+    return TriangleMesh(vertices, normals, 0.5 + texture_per_m * flat)
 
 
 def _revolved_ring(
@@ -136,15 +136,11 @@ def _revolved_ring(
     angles = 2 * np.pi * np.arange(num_sides + 1) / num_sides
     around = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 9)  # equal bits on any machine
     around[-1] = around[0]
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit = normals / lengths
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def corner(level: int, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         direction = around[side : side + num_sides]
-        position = np.concatenate(
-            [direction * ring[level, 0], np.full((num_sides, 1), ring[level, 1])], axis=1
-        )
-        normal = np.concatenate([direction * unit[level, 0], np.full((num_sides, 1), unit[level, 1])], axis=1)
+        position, normal = (_at_height(direction * part[level, 0], part[level, 1]) for part in (ring, unit))
         return position, normal, 0.5 + texture_radii[level] * direction
 
     faces = []
@@ -181,7 +177,7 @@ def triangulate(loops: Sequence[np.ndarray]) -> np.ndarray:
     Raises:
         ShapeError: A loop crosses itself or another one.
     """
-    points = [(float(x), float(y)) for loop in loops for x, y in loop]
+    points = [(x, y) for x, y in np.concatenate(loops).tolist()]
     starts = np.cumsum([0, *(len(loop) for loop in loops)])
     rings = [list(range(starts[i], starts[i + 1])) for i in range(len(loops))]
     polygon = _without_holes(points, rings)
@@ -200,28 +196,21 @@ def _without_holes(points: list[Point], rings: list[list[int]]) -> list[int]:
     for done, hole in enumerate(holes):
         start = max(range(len(hole)), key=lambda k: points[hole[k]])
         turned = hole[start:] + hole[: start + 1]
-        edges = [edge for ring in (polygon, *holes[done:]) for edge in _edges(ring)]
+        loops = (polygon, *holes[done:])
+        edges = [edge for ring in loops for edge in zip(ring, ring[1:] + ring[:1], strict=True)]
         place = _visible_corner(points, polygon, turned[0], edges)
         polygon = polygon[: place + 1] + turned + polygon[place:]
     return polygon
-
-
-def _edges(ring: list[int]) -> list[tuple[int, int]]:
-    return list(zip(ring, ring[1:] + ring[:1], strict=True))
 
 
 def _visible_corner(
     points: list[Point], polygon: list[int], hole_corner: int, edges: list[tuple[int, int]]
 ) -> int:
     """Place in `polygon` of the nearest corner that no edge hides from a corner of a hole."""
-    origin = points[hole_corner]
-
-    def distance(place: int) -> float:
-        x, y = points[polygon[place]]
-        return (x - origin[0]) ** 2 + (y - origin[1]) ** 2
-
-    for place in sorted(range(len(polygon)), key=distance):
-        target = points[polygon[place]]
+    origin, corners = points[hole_corner], [points[index] for index in polygon]
+    squared = [(x - origin[0]) ** 2 + (y - origin[1]) ** 2 for x, y in corners]
+    for place in sorted(range(len(polygon)), key=squared.__getitem__):
+        target = corners[place]
         if not any(_crosses(origin, target, points[a], points[b]) for a, b in edges):
             return place
     raise ShapeError("a hole lies outside its outline.")
@@ -235,7 +224,6 @@ def _crosses(a: Point, b: Point, c: Point, d: Point) -> bool:
 
 
 def _clip_ears(points: list[Point], polygon: list[int]) -> list[tuple[int, int, int]]:
-    polygon = list(polygon)
     triangles = []
     while len(polygon) > 3:
         for place in range(len(polygon)):
@@ -252,18 +240,7 @@ def _clip_ears(points: list[Point], polygon: list[int]) -> list[tuple[int, int, 
 
 def _is_ear(points: list[Point], polygon: list[int], corners: tuple[int, int, int]) -> bool:
     a, b, c = (points[i] for i in corners)
-    if _turn(a, b, c) <= 0:
-        return False
-    for index in polygon:
-        p = points[index]
-        if p in (a, b, c):
-            continue
-        if _turn(a, b, p) >= 0 and _turn(b, c, p) >= 0 and _turn(c, a, p) >= 0:
-            return False
-    return True
-
-
-def rectangle(centre: tuple[float, float], half_size: tuple[float, float]) -> list[Point]:
-    """Return the corners of an upright rectangle, counter-clockwise."""
-    (x, y), (dx, dy) = centre, half_size
-    return [(x - dx, y - dy), (x + dx, y - dy), (x + dx, y + dy), (x - dx, y + dy)]
+    others = (p for p in (points[i] for i in polygon) if p not in (a, b, c))
+    return _turn(a, b, c) > 0 and not any(
+        _turn(a, b, p) >= 0 and _turn(b, c, p) >= 0 and _turn(c, a, p) >= 0 for p in others
+    )

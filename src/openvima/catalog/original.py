@@ -6,24 +6,22 @@ incomplete or different pack is reported.
 
 import hashlib
 import io
-import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.bodies import BOX_SHAPES, fixed_geometry
-from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
+from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, product
 from openvima.catalog.mesh_files import ObjMesh, parse_obj
 from openvima.catalog.meshes import scale_geometry
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.catalog.procedural import CataloguePack
 from openvima.catalog.textures import TextureSpec, texture_spec
 from openvima.errors import AssetError
-from openvima.input_files import cache_dir
+from openvima.input_files import cache_dir, read_json
 
 PACK_FOLDER = Path("vima_bench/tasks/assets")  # inside a checkout
 
@@ -92,8 +90,7 @@ def read_original(pack: Path, relative_path: str) -> bytes:
 @lru_cache(maxsize=1)
 def known_hashes() -> Mapping[str, str]:
     """Return the SHA-256 of every file that is imported, by path in the pack."""
-    text = Path(__file__).with_name("original_files.json").read_text(encoding="utf-8")
-    return MappingProxyType(json.loads(text))
+    return read_json(Path(__file__).with_name("original_files.json"))
 
 
 def import_pack(checkout: str | Path) -> list[str]:
@@ -194,7 +191,7 @@ class OriginalAssets(CataloguePack):
         """
         spec = object_spec(object_name)
         if object_name in BOX_SHAPES:
-            return BOX_SHAPES[object_name](_product(size, scale))
+            return BOX_SHAPES[object_name](product(size, scale))
         if object_name == "stand":  # which has no mesh file
             return scale_geometry(fixed_geometry("stand with long rods"), scale)
         try:
@@ -219,20 +216,19 @@ class OriginalAssets(CataloguePack):
 
     def _kit(self, spec: ObjectSpec, scale: Vector3) -> Geometry:
         kit_scale = spec.kit_scale or 1.0
-        metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
+        metres = product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
         name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
         visual = _scale(_mesh(self.folder, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
         return Geometry(visual, (_hull(visual.vertices),))
 
     def _fixed_mesh(self, object_name: str, scale: Vector3) -> Geometry:
         file, metres, rest_z_m = _FIXED_MESHES[object_name]
-        visual = _scale(_mesh(self.folder, file), _product(metres, scale))
+        visual = _scale(_mesh(self.folder, file), product(metres, scale))
         collision = (_hull(visual.vertices),)
         if object_name == "bowl":
             parts_file, parts_metres = _BOWL_PARTS
-            parts = _mesh(self.folder, parts_file)
-            vertices = parts.vertices * _product(parts_metres, scale)
-            collision = tuple(_hull(vertices[parts.parts == part]) for part in np.unique(parts.parts))
+            factors = product(parts_metres, scale)
+            collision = tuple(_hull(part * factors) for part in _mesh(self.folder, parts_file).pieces())
         return Geometry(visual, collision, rest_z_m * scale[2])
 
 
@@ -243,10 +239,6 @@ def _scale(mesh: ObjMesh, metres: Vector3) -> TriangleMesh:
 
 def _hull(vertices: np.ndarray) -> CollisionHull:
     return CollisionHull(np.unique(vertices.reshape(-1, 3), axis=0))
-
-
-def _product(a: Vector3, b: Vector3) -> Vector3:
-    return (a[0] * b[0], a[1] * b[1], a[2] * b[2])
 
 
 @lru_cache(maxsize=64)

@@ -7,12 +7,12 @@ compositions of instructions, L7, referring expressions, and L8, tasks of six to
 Source: the partition files of VIMA-Bench, with its constructor defaults filled in where they pass nothing.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 from openvima.errors import ConfigError, UnknownTaskError, unknown_name
+from openvima.input_files import read_json
 
 Level = Literal["train", "L1", "L2", "L3", "L4", "L5", "L6", "L7", "L8"]
 
@@ -30,7 +30,7 @@ LEVEL_TITLES: dict[str, str] = {
 
 _TABLES: dict[str, dict[str, tuple[str, ...]]] = {
     part: {name: tuple(names) for name, names in table.items()}
-    for part, table in json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8")).items()
+    for part, table in read_json(Path(__file__).with_suffix(".json")).items()
 }
 
 OBJECT_SETS = _TABLES.pop("objects")
@@ -56,15 +56,14 @@ class Pool:
     base_textures: tuple[str, ...]
 
 
-def _pools(level: str) -> dict[str, Pool]:
-    """Look up the sets that `partitions.json` names: dragged objects, base objects, and textures of both."""
-    return {
+# Of each task, `partitions.json` names sets of dragged objects and base objects, and of the textures of both.
+_POOLS: dict[str, dict[str, Pool]] = {
+    level: {
         task: Pool(*(OBJECT_SETS[name] for name in names[:2]), *(TEXTURE_SETS[name] for name in names[2:]))
         for task, names in _TABLES["train" if level == "L1" else level].items()
     }
-
-
-_POOLS = {level: _pools(level) for level in LEVELS}
+    for level in LEVELS
+}
 PUBLISHED_TASKS = (*_TABLES["train"], *_TABLES["L4"])
 """The 17 tasks of the benchmark."""
 PACKAGE_TASKS = tuple(dict.fromkeys(task for pools in _POOLS.values() for task in pools))

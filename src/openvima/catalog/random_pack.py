@@ -13,18 +13,7 @@ import numpy as np
 from openvima.catalog.geometry import Assets, Geometry, Vector3, protect
 from openvima.catalog.meshes import scale_geometry
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
-from openvima.catalog.random_shapes import (
-    has_heading,
-    random_block,
-    random_container,
-    random_eared_container,
-    random_grating,
-    random_outline,
-    random_ring,
-    random_round_container,
-    random_shape,
-    random_square_container,
-)
+from openvima.catalog.random_shapes import RANDOM_SHAPES, has_heading, random_outline
 from openvima.catalog.textures import DARK_VALUE_DROP
 
 _SIDE_PX = 128
@@ -67,24 +56,18 @@ def value_noise(cells: tuple[int, int], seed: int) -> np.ndarray:
     rows, columns = (np.arange(_SIDE_PX) * count / _SIDE_PX for count in cells)
     top, left = rows.astype(np.int64), columns.astype(np.int64)
     down, right = _smooth(rows - top)[:, None], _smooth(columns - left)[None, :]
+    lattice = hash_numbers(*np.ogrid[: cells[0], : cells[1]], seed=seed)
 
-    def lattice(row_shift: int, column_shift: int) -> np.ndarray:
-        row, column = (top + row_shift) % cells[0], (left + column_shift) % cells[1]
-        return hash_numbers(row[:, None], column[None, :], seed=seed)
+    def across(row: np.ndarray) -> np.ndarray:
+        return lattice[row][:, left] * (1 - right) + lattice[row][:, (left + 1) % cells[1]] * right
 
-    above = lattice(0, 0) * (1 - right) + lattice(0, 1) * right
-    below = lattice(1, 0) * (1 - right) + lattice(1, 1) * right
-    return above * (1 - down) + below * down
+    return across(top) * (1 - down) + across((top + 1) % cells[0]) * down
 
 
 def layered_noise(cells: tuple[int, int], seed: int, num_layers: int) -> np.ndarray:
     """Return fractal noise in [0, 1): layers of doubled frequency and halved amplitude."""
-    total, weight_sum = np.zeros((_SIDE_PX, _SIDE_PX)), 0.0
-    for layer in range(num_layers):
-        weight = 0.5**layer
-        total += weight * value_noise((cells[0] << layer, cells[1] << layer), seed + layer)
-        weight_sum += weight
-    return total / weight_sum
+    layers = (0.5**k * value_noise((cells[0] << k, cells[1] << k), seed + k) for k in range(num_layers))
+    return sum(layers, np.zeros((_SIDE_PX, _SIDE_PX))) / (2 - 0.5 ** (num_layers - 1))  # the sum of weights
 
 
 def _smooth(t: np.ndarray) -> np.ndarray:
@@ -221,17 +204,7 @@ def _seed(rng: np.random.Generator) -> int:
 _FAMILIES = (_stripes, _waves, _checks, _dots, _bricks, _patches, _veins, _swirl)
 
 
-_SHAPES = {
-    "shape": random_shape,
-    "ring": random_ring,
-    "block": random_block,
-    "container": random_container,
-    "grating": random_grating,
-    "eared container": random_eared_container,
-    "square container": random_square_container,
-    "round container": random_round_container,
-}
-_NAME = re.compile(rf"(dark )?random (texture|{'|'.join(_SHAPES)}) (\d+)")
+_NAME = re.compile(rf"(dark )?random (texture|{'|'.join(RANDOM_SHAPES)}) (\d+)")
 _NUM_SEEDS = 1 << 31
 _KEPT = 64  # cached shapes and textures: those of a few scenes
 
@@ -299,7 +272,7 @@ def _read(name: str) -> tuple[str, np.random.Generator]:
 
 def _draw_shape(name: str) -> Geometry:
     kind, rng = _read(name)
-    return protect(_SHAPES[kind](rng))
+    return protect(RANDOM_SHAPES[kind](rng))
 
 
 def _draw_texture(name: str) -> np.ndarray:

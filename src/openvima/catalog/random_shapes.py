@@ -1,18 +1,17 @@
 """Random shapes: flat prisms with irregular outlines, and containers, independent of the catalogue."""
 
-from typing import cast
-
 import numpy as np
 
 from openvima.catalog import bodies
 from openvima.catalog.geometry import Geometry
-from openvima.catalog.meshes import combine, drape, prism, rectangle, revolve, signed_area
+from openvima.catalog.meshes import combine, drape, prism, revolve, signed_area
 
 _WIDTHS_M = (0.07, 0.125)  # smallest and largest extent of an outline, much as of the kit objects
 _HEIGHTS_M = (0.02, 0.036)
 _MICROMETRES = 6
 _NUM_RADII, _NUM_ANGLES = 14, 72  # grid on which a shape is compared with its rotations
 _SMALLEST_TURN = 5  # of these angles; smaller rotations are never distinguishable
+_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # of a rectangle, counter-clockwise
 _LEAST_DIFFERENCE = 0.15  # fraction of the area; 0.18 for the heart, 0.05 for the star
 
 Cell = tuple[int, int]
@@ -26,7 +25,7 @@ def random_shape(rng: np.random.Generator) -> Geometry:
 def random_ring(rng: np.random.Generator) -> Geometry:
     """Sample a flat prism, round outside and with a hole of any form, without collision."""
     radius = rng.uniform(*_WIDTHS_M) / 2
-    outer = radius * _circle(36)
+    outer = radius * _polar(np.ones(36), 2 * np.pi * np.arange(36) / 36)
     hole = (_blob if rng.random() < 0.5 else _polygon)(rng)[0]
     hole = hole * radius * rng.uniform(0.35, 0.75) / np.linalg.norm(hole, axis=1).max()
     return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(*_HEIGHTS_M)))
@@ -35,7 +34,7 @@ def random_ring(rng: np.random.Generator) -> Geometry:
 def random_block(rng: np.random.Generator) -> Geometry:
     """Sample a block whose sides are at most as 1 to 1.2, without collision."""
     side, ratio = rng.uniform(0.045, 0.11), rng.uniform(1 / 1.2, 1.0)
-    outline = np.array(rectangle((0.0, 0.0), (float(side / 2), float(side / 2 * ratio))))
+    outline = side / 2 * np.array([1.0, ratio]) * _CORNERS
     return Geometry(prism([outline], 0.0, rng.uniform(0.02, 0.06)))
 
 
@@ -49,22 +48,20 @@ def random_grating(rng: np.random.Generator) -> Geometry:
 
     The gaps are real: they turn with the container, and seen obliquely they close.
     """
-    length, width = (float(extent) for extent in rng.uniform(0.12, 0.2, 2))
-    beam, slat = (float(height) for height in rng.uniform(0.003, 0.02, 2))
+    length, width = rng.uniform(0.12, 0.2, 2).tolist()
+    beam, slat = rng.uniform(0.003, 0.02, 2).tolist()
     num_slats, num_beams = int(rng.integers(3, 9)), int(rng.integers(2, 5))
     slat_width, beam_width = width / num_slats * rng.uniform(0.35, 0.75), rng.uniform(0.008, 0.02)
     parts = [
-        *(
-            bodies.box((beam_width, width, beam), (x, 0.0, beam / 2))
-            for x in _spread(length, beam_width, num_beams)
-        ),
-        *(
-            bodies.box((length, slat_width, slat), (0.0, y, beam + slat / 2))
-            for y in _spread(width, slat_width, num_slats)
-        ),
+        bodies.box((beam_width, width, beam), (x, 0.0, beam / 2))
+        for x in _spread(length, beam_width, num_beams)
+    ]
+    parts += [
+        bodies.box((length, slat_width, slat), (0.0, y, beam + slat / 2))
+        for y in _spread(width, slat_width, num_slats)
     ]
     if rng.random() < 0.3:  # slats upright around it
-        height = float(rng.uniform(0.02, 0.05))
+        height = rng.uniform(0.02, 0.05)
         parts += [
             bodies.box((beam_width, bodies.WALL_M, height), (x, y, height / 2))
             for x in _spread(length, beam_width, num_slats)
@@ -77,15 +74,16 @@ def random_eared_container(rng: np.random.Generator) -> Geometry:
     """Sample a container with two opposite ears at its rim, without collision."""
     body = random_container(rng)
     points = body.visual.vertices.reshape(-1, 3)
-    axis, top = int(rng.integers(2)), float(points[:, 2].max())
+    axis, top = int(rng.integers(2)), points[:, 2].max()
     length, width, height = rng.uniform(0.01, 0.03), rng.uniform(0.02, 0.06), rng.uniform(0.003, 0.012)
     half = np.array([length / 2 + 0.004, width / 2])[[axis, 1 - axis]]  # 8 mm of it inside the rim
     ears = []
     for rim, sign in ((points[:, axis].min(), -1), (points[:, axis].max(), 1)):
         centre = np.zeros(2)
         centre[axis] = rim + sign * (length / 2 - 0.004)
-        outline = np.array(rectangle((float(centre[0]), float(centre[1])), (float(half[0]), float(half[1]))))
-        ears.append(prism([outline], top - min(height, np.ptp(points[:, 2])), top, texture_per_m=2.9))
+        ears.append(
+            prism([centre + half * _CORNERS], top - min(height, np.ptp(points[:, 2])), top, texture_per_m=2.9)
+        )
     return Geometry(combine([body.visual, *ears]), rest_z_m=body.rest_z_m)
 
 
@@ -133,7 +131,7 @@ def has_heading(loops: tuple[np.ndarray, ...]) -> bool:
     inside = _inside(grid.reshape(-1, 2), loops).reshape(_NUM_RADII, _NUM_ANGLES)
     area = (inside * radii[:, None]).sum()
     differences = [
-        (np.abs(inside ^ np.roll(inside, turn, axis=1)) * radii[:, None]).sum() / area
+        ((inside ^ np.roll(inside, turn, axis=1)) * radii[:, None]).sum() / area
         for turn in range(_SMALLEST_TURN, _NUM_ANGLES // 2 + 1)
     ]
     return bool(min(differences) >= _LEAST_DIFFERENCE)
@@ -163,10 +161,6 @@ def _sides(loops: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 def _polar(radii: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
-
-
-def _circle(sides: int) -> np.ndarray:
-    return _polar(np.ones(sides), 2 * np.pi * np.arange(sides) / sides)
 
 
 def _jittered_angles(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -205,7 +199,8 @@ def _strokes(rng: np.random.Generator) -> list[np.ndarray]:
     """Strokes of one width along a small grid, rounded or not, then slanted and tapered."""
     while True:
         cells = _random_cells(rng)
-        if not _touches_by_a_corner(cells) and not _is_straight(cells):
+        is_straight = min(len({cell[axis] for cell in cells}) for axis in (0, 1)) < 2
+        if not is_straight and not _touches_by_a_corner(cells):
             break
     loops = _borders(cells)
     if rng.random() < 0.5:
@@ -234,10 +229,6 @@ def _random_cells(rng: np.random.Generator) -> set[Cell]:
             cells.add((x, y))
             x, y = x + dx, y + dy
     return cells
-
-
-def _is_straight(cells: set[Cell]) -> bool:
-    return min(len({cell[axis] for cell in cells}) for axis in (0, 1)) < 2
 
 
 def _round_corners(loop: np.ndarray) -> np.ndarray:
@@ -283,8 +274,8 @@ def _borders(cells: set[Cell]) -> list[np.ndarray]:
 
 
 def _open_box(rng: np.random.Generator) -> Geometry:
-    x, y = rng.uniform(0.12, 0.2, 2)
-    return _drape(bodies.container((float(x), float(y), float(rng.uniform(0.015, 0.07)))))
+    x, y = rng.uniform(0.12, 0.2, 2).tolist()
+    return _drape(bodies.container((x, y, rng.uniform(0.015, 0.07))))
 
 
 def _spread(length: float, part: float, count: int) -> list[float]:
@@ -293,7 +284,7 @@ def _spread(length: float, part: float, count: int) -> list[float]:
 
 
 def _flat_square(rng: np.random.Generator) -> Geometry:
-    return _drape(bodies.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001)))
+    return _drape(bodies.square((rng.uniform(0.12, 0.2), rng.uniform(0.015, 0.05), 0.001)))
 
 
 def _drape(boxes: Geometry) -> Geometry:
@@ -302,8 +293,7 @@ def _drape(boxes: Geometry) -> Geometry:
 
 def _frame(rng: np.random.Generator) -> Geometry:
     if rng.random() < 0.5:
-        half = cast("tuple[float, float]", tuple(rng.uniform(0.06, 0.1, 2).tolist()))
-        outer = np.array(rectangle((0.0, 0.0), half))
+        outer = rng.uniform(0.06, 0.1, 2) * _CORNERS
     else:
         count = int(rng.integers(3, 9))
         outer = _polar(np.full(count, rng.uniform(0.075, 0.105)), _jittered_angles(rng, count))
@@ -332,3 +322,14 @@ def _bowl(rng: np.random.Generator, sides: int | None = None) -> Geometry:
 
 _OUTLINES = (_star, _polygon, _blob, _ring, _strokes, _strokes, _strokes)
 _CONTAINERS = (_open_box, _flat_square, _frame, _bowl)
+RANDOM_SHAPES = {
+    "shape": random_shape,
+    "ring": random_ring,
+    "block": random_block,
+    "container": random_container,
+    "grating": random_grating,
+    "eared container": random_eared_container,
+    "square container": random_square_container,
+    "round container": random_round_container,
+}
+"""What draws a shape of each kind."""

@@ -10,16 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from openvima.catalog.geometry import Geometry, Vector3, protect
+from openvima.catalog.geometry import Geometry, Vector3, product, protect
 from openvima.catalog.mesh_files import Mesh, UserMesh, check_lengths, read_mesh
 from openvima.catalog.objects import OBJECTS, REGISTERED_OBJECTS, ObjectSpec, Profile
 from openvima.catalog.textures import NEUTRAL_TEXTURE, REGISTERED_TEXTURES, TEXTURES, TextureSpec
-from openvima.errors import (
-    AssetError,
-    InputFileError,
-    ShapeError,
-    echo,
-)
+from openvima.errors import AssetError, InputFileError, ShapeError, echo
 from openvima.input_files import as_path, read_png
 
 MAX_TEXTURE_SIDE = 1024  # pixels
@@ -99,8 +94,8 @@ def register_object(
         aliases=tuple(aliases),
     )
     arrays = (user_mesh.visual.vertices, user_mesh.visual.normals, user_mesh.visual.uvs, *user_mesh.parts)
-    if _is_new("object", name, _digest(repr(spec), *arrays), user_mesh):
-        REGISTERED_OBJECTS[name] = spec
+    _keep("object", name, _digest(repr(spec), *arrays), user_mesh)
+    REGISTERED_OBJECTS[name] = spec
     return spec
 
 
@@ -131,8 +126,8 @@ def register_texture(name: str, image: np.ndarray | str | Path) -> TextureSpec:
     pixels = np.array(pixels, order="C")
     pixels.setflags(write=False)
     spec = TextureSpec(name, "registered")
-    if _is_new("texture", name, _digest(repr((spec, pixels.shape)), pixels), pixels):
-        REGISTERED_TEXTURES[name] = spec
+    _keep("texture", name, _digest(repr((spec, pixels.shape)), pixels), pixels)
+    REGISTERED_TEXTURES[name] = spec
     return spec
 
 
@@ -142,8 +137,7 @@ def registered_geometry(object_name: str, size: Vector3, scale: Vector3) -> Geom
     Raises:
         AssetError: A length is out of bounds.
     """
-    x, y, z = (length * factor for length, factor in zip(size, scale, strict=True))
-    return _geometry(_CONTENTS["object", object_name][1], object_name, (x, y, z))
+    return _geometry(_CONTENTS["object", object_name][1], object_name, product(size, scale))
 
 
 def registered_texture(texture_name: str) -> np.ndarray:
@@ -179,13 +173,10 @@ def _check_number(field: str, value: float, least: float, most: float, what: str
         raise AssetError(f"{field} of {what} is {float(value):g}; it must be {bounds}.")
 
 
-def _is_new(kind: str, name: str, digest: str, content: object) -> bool:
+def _keep(kind: str, name: str, digest: str, content: object) -> None:
     """Keep what an object or a texture is made of, unless an equal one is there."""
-    known = _CONTENTS.get((kind, name))
-    if known is not None and known[0] != digest:
+    if _CONTENTS.setdefault((kind, name), (digest, content))[0] != digest:
         raise AssetError(f"{kind} {name!r} is registered already, and differs; choose another name.")
-    _CONTENTS.setdefault((kind, name), (digest, content))
-    return known is None
 
 
 def _digest(text: str, *arrays: np.ndarray) -> str:

@@ -4,7 +4,6 @@ A box is (left, upper, right, lower) in pixels; pixel 0 covers 0 to 1.
 """
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -76,7 +75,7 @@ def decode_boxes(
 
 
 def nms(
-    boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float, groups: torch.Tensor | None = None
+    boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float, groups: torch.Tensor
 ) -> torch.Tensor:
     """Apply greedy non-maximum suppression; of equal scores the first wins. Boxes without area are dropped.
 
@@ -84,13 +83,12 @@ def nms(
         boxes: Shape (N, 4).
         scores: Shape (N,).
         iou_threshold: Largest intersection over union of two boxes that are kept.
-        groups: Shape (N,), int64; boxes of different groups are kept together. None is one group.
+        groups: Shape (N,), int64; boxes of different groups are kept together.
 
     Returns:
         Indices of the kept boxes by descending score, shape (K,), int64.
     """
     order = np.argsort(-scores.cpu().numpy(), kind="stable")
-    groups = torch.zeros(len(order), dtype=torch.int64) if groups is None else groups
     kept = suppress(boxes.detach().cpu().numpy(), order, groups.cpu().numpy(), iou_threshold)
     return torch.from_numpy(order[kept]).to(boxes.device)
 
@@ -103,57 +101,33 @@ def _centres_and_sizes(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
 ASPECT_RATIOS = (0.5, 1.0, 2.0)  # height over width
 
 
-def cell_anchors(size: float) -> torch.Tensor:
-    """Return the anchors of one cell, centred on the origin.
+@lru_cache(maxsize=64)
+def pyramid_anchors(
+    sizes: tuple[float, ...], shapes: tuple[tuple[int, int], ...], *, first_stride: int
+) -> tuple[torch.Tensor, ...]:
+    """Return the anchors of each level; the tensors are shared between calls.
 
     Args:
-        size: Square root of their common area, in pixels.
+        sizes: Anchor size of each level: the square root of the area of all its anchors, in pixels.
+        shapes: Rows and columns of each level.
+        first_stride: Stride of the finest level, in pixels; strides double from level to level. The first
+            cell of each is centred on the image's upper left corner.
 
     Returns:
-        One anchor for each of `ASPECT_RATIOS`, shape (3, 4), float32.
+        Of each level, shape (rows · columns · 3, 4), float32, ordered by row, column and `ASPECT_RATIOS`.
 
     Example:
-        >>> cell_anchors(8.0)[1]
+        >>> pyramid_anchors((8.0,), ((1, 1),), first_stride=4)[0][1]
         tensor([-4., -4.,  4.,  4.])
     """
-    ratios = torch.tensor(ASPECT_RATIOS)
-    widths = size / ratios.sqrt()
-    halves = torch.stack([widths, widths * ratios], dim=1) / 2
-    return torch.cat([-halves, halves], dim=1)
-
-
-@lru_cache(maxsize=64)
-def level_anchors(size: float, *, stride: int, height: int, width: int) -> torch.Tensor:
-    """Return all anchors of one pyramid level; the tensor is shared between calls.
-
-    Args:
-        size: As for `cell_anchors`.
-        stride: Of the level, in pixels; the first cell is centred on the image's upper left corner.
-        height: Rows of cells.
-        width: Columns of cells.
-
-    Returns:
-        Shape (height · width · 3, 4), float32, ordered by row, column and aspect ratio.
-    """
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    shifts = torch.stack([columns, rows, columns, rows], dim=-1).view(-1, 1, 4) * stride
-    return (shifts + cell_anchors(size)).view(-1, 4)
-
-
-def pyramid_anchors(
-    sizes: Sequence[float], shapes: Sequence[tuple[int, int]], *, first_stride: int
-) -> list[torch.Tensor]:
-    """Return the anchors of each level; strides double from level to level.
-
-    Args:
-        sizes: Anchor size of each level, as for `cell_anchors`.
-        shapes: Rows and columns of each level.
-        first_stride: Stride of the finest level.
-    """
-    return [
-        level_anchors(size, stride=first_stride * 2**level, height=height, width=width)
-        for level, (size, (height, width)) in enumerate(zip(sizes, shapes, strict=True))
-    ]
+    ratios, levels = torch.tensor(ASPECT_RATIOS), []
+    for level, (size, (height, width)) in enumerate(zip(sizes, shapes, strict=True)):
+        widths = size / ratios.sqrt()
+        halves = torch.stack([widths, widths * ratios], dim=1) / 2
+        rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        centres = torch.stack([columns, rows], dim=-1).view(-1, 1, 2) * first_stride * 2**level
+        levels.append(torch.cat([centres - halves, centres + halves], dim=-1).view(-1, 4))
+    return tuple(levels)
 
 
 FOREGROUND, BACKGROUND, IGNORED = 1, 0, -1  # labels of boxes

@@ -31,7 +31,7 @@ from openvima.policies.tensor_files import (
 )
 
 _KIND = "detector"
-_COUNTER = "num_batches_tracked"  # of batch normalisation; unused
+_COUNTER = "num_batches_tracked"
 
 
 def save_network(network: MaskRCNN, folder: str | Path) -> None:
@@ -48,11 +48,7 @@ def save_network(network: MaskRCNN, folder: str | Path) -> None:
 
 def write_network(network: MaskRCNN, folder: Path) -> None:
     """Write the files of a checkpoint into an existing folder."""
-    tensors = {
-        name: tensor.detach().cpu().contiguous()
-        for name, tensor in network.state_dict().items()
-        if not name.endswith(_COUNTER)
-    }
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in _tensors(network).items()}
     write_safetensors(tensors, folder / WEIGHTS_FILE)
     values = {"policy": _KIND, "openvima": __version__, "config": network.config.to_dict()}
     atomic_write_file(folder / CONFIG_FILE, yaml.safe_dump(values, sort_keys=False))
@@ -67,24 +63,14 @@ def load_network(path: str | Path) -> MaskRCNN:
     Raises:
         InputFileError: There is none, it is damaged, or weights and config do not match.
     """
-    path = Path(path)
-    restore_folder(path)
-    folder = checkpoint_folder(path)
-    file = folder / WEIGHTS_FILE
-    return build_network(read_config(folder), read_safetensors(file), source=file)
-
-
-def read_config(folder: Path) -> DetectorConfig:
-    """Read the config of a checkpoint.
-
-    Raises:
-        InputFileError: There is no config, or it is invalid.
-    """
-    file, values = folder / CONFIG_FILE, read_description(folder, _KIND)
+    restore_folder(Path(path))
+    folder = checkpoint_folder(Path(path))
+    values, file = read_description(folder, _KIND), folder / WEIGHTS_FILE
     try:
-        return DetectorConfig.from_dict(values["config"])
+        config = DetectorConfig.from_dict(values["config"])
     except ConfigError as error:
-        raise InputFileError(f"{file}: {error}") from error
+        raise InputFileError(f"{folder / CONFIG_FILE}: {error}") from error
+    return build_network(config, read_safetensors(file), source=file)
 
 
 def load_weights(network: MaskRCNN, file: Path) -> None:
@@ -118,11 +104,13 @@ def build_network(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *
 
 
 def _check(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, source: Path) -> None:
-    expected = {name: own for name, own in network.state_dict().items() if not name.endswith(_COUNTER)}
-    given = {name: tensor for name, tensor in tensors.items() if not name.endswith(_COUNTER)}
-    problems = mismatches(given, expected)
-    if problems:
+    if problems := mismatches(tensors, _tensors(network)):
         raise InputFileError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
+
+
+def _tensors(network: MaskRCNN) -> dict[str, torch.Tensor]:
+    """Return what a checkpoint holds: all but the counters of batch normalisation, which nothing uses."""
+    return {name: own for name, own in network.state_dict().items() if not name.endswith(_COUNTER)}
 
 
 _CLASS_WEIGHTS = "roi_heads.box_predictor.cls_score.weight"
@@ -208,12 +196,8 @@ def _translate_name(name: str) -> str:
     for table, conv in ((_BOTTOM_UP, "conv."), (_OTHERS, "")):  # Detectron2 nests norms in convolutions
         for pattern, own in table:
             if match := re.fullmatch(pattern + r"\.(?P<tensor>(norm\.)?\w+)", name):
-                numbers = {
-                    key: int(match[key]) - first
-                    for key, first in _FIRST.items()
-                    if key in match.re.groupindex
-                }
-                tensor = match["tensor"]
+                tensor, numbers = match["tensor"], match.groupdict()
+                numbers = {key: int(numbers[key]) - first for key, first in _FIRST.items() if key in numbers}
                 return f"{own.format(**numbers)}.{'' if tensor.startswith('norm.') else conv}{tensor}"
     return name
 

@@ -2,23 +2,23 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from dataclasses import KW_ONLY, dataclass, field
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from openvima.errors import PolicyError, ShapeError
+from openvima.perception.boxes import match_greedily
 from openvima.perception.objects import (
-    FRONT,
     MIN_PIXELS,
     TOP,
     ObjectExtractor,
     ObjectViews,
-    camera_frames,
     crop_box,
     interior_pixel,
     make_hidden_objects,
-    part_of,
+    observation_frames,
+    prompt_image_frames,
 )
 from openvima.render.camera import CAMERAS, VIEWS, View, unproject
 from openvima.scene import PromptImage
@@ -127,17 +127,15 @@ class Detections:
         edges = np.asarray(edges, np.float64)
         if edges.ndim != 2 or edges.shape[1] != 4:
             raise ShapeError(f"edges have shape {edges.shape}; it must be (N, 4): left, upper, right, lower.")
-        limit = np.array([width, height], np.float64)
-        inside = (edges[:, :2] < limit).all(axis=1) & (edges[:, 2:] > 0).all(axis=1)
-        ordered = (edges[:, 2:] >= edges[:, :2]).all(axis=1)
-        wrong = ~(inside & ordered & np.isfinite(edges).all(axis=1))
-        if wrong.any():
+        low, high, limit = edges[:, :2], edges[:, 2:], np.array([width, height], np.float64)
+        fits = np.isfinite(edges).all(axis=1) & ((low < limit) & (high > 0) & (high >= low)).all(axis=1)
+        if not fits.all():
             raise ShapeError(
-                f"box {edges[wrong][0].tolist()} lies outside the image of {width} × {height} pixels, or "
+                f"box {edges[~fits][0].tolist()} lies outside the image of {width} × {height} pixels, or "
                 "ends before it begins."
             )
-        first = np.maximum(np.floor(edges[:, :2]), 0)
-        last = np.maximum(np.minimum(np.ceil(edges[:, 2:]), limit) - 1, first)
+        first = np.maximum(np.floor(low), 0)
+        last = np.maximum(np.minimum(np.ceil(high), limit) - 1, first)
         return Detections(np.concatenate([first, last], axis=1).astype(np.int64), masks, scores)
 
     @staticmethod
@@ -194,9 +192,10 @@ class DetectedObjects:
     """
 
     detector: Detector
-    min_score: float = field(default=0.1, kw_only=True)
-    prompt_extractor: ObjectExtractor | None = field(default=None, kw_only=True)
-    cache_size: int = field(default=0, kw_only=True)
+    _: KW_ONLY
+    min_score: float = 0.1
+    prompt_extractor: ObjectExtractor | None = None
+    cache_size: int = 0
     _cache: dict[bytes, ObjectViews] = field(default_factory=dict, init=False, repr=False)
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
@@ -207,7 +206,7 @@ class DetectedObjects:
             ShapeError: An image or a detection has another shape or dtype.
             ShapeError: A detection lies outside the image.
         """
-        return self._extract(_Pair.of_observation(observation))
+        return self._extract(_Pair(observation_frames(observation), False))
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Extract the objects of a prompt image, from left to right.
@@ -222,7 +221,7 @@ class DetectedObjects:
         """
         if self.prompt_extractor is not None:
             return self.prompt_extractor.in_prompt_image(image)
-        return self._extract(_Pair.of_prompt_image(image))
+        return self._extract(_Pair(prompt_image_frames(image), image.kind == "object"))
 
     def extract_ahead(self, observations: Sequence[Mapping], images: Sequence[PromptImage]) -> None:
         """Detect the objects of new images in batches, which takes less time, if there is a cache for them.
@@ -234,25 +233,22 @@ class DetectedObjects:
         Raises:
             PolicyError, ShapeError: As those methods.
         """
-        pairs = [_Pair.of_observation(each) for each in observations]
+        pairs = [_Pair(observation_frames(each), False) for each in observations]
         if self.prompt_extractor is None:
-            pairs += [_Pair.of_prompt_image(each) for each in images]
-        new = [
-            (key, pair) for key, pair in {each.key: each for each in pairs}.items() if key not in self._cache
-        ]
-        new = new[: self.cache_size]
+            pairs += [_Pair(prompt_image_frames(each), each.kind == "object") for each in images]
+        unknown = {key: pair for pair in pairs if (key := pair.key) not in self._cache}
+        new = list(unknown.items())[: self.cache_size]
         for start in range(0, len(new), JOINT_PAIRS):
             keys, chunk = zip(*new[start : start + JOINT_PAIRS], strict=True)
             for key, found in zip(keys, self._detect(chunk), strict=True):
                 self._keep(key, found)
 
     def _extract(self, pair: "_Pair") -> ObjectViews:
-        if not self.cache_size:
-            return self._detect([pair])[0]
-        found = self._cache.pop(pair.key, None)
+        key = pair.key
+        found = self._cache.pop(key, None)
         if found is None:
             (found,) = self._detect([pair])
-        self._keep(pair.key, found)
+        self._keep(key, found)
         return found
 
     def _keep(self, key: bytes, found: ObjectViews) -> None:
@@ -262,43 +258,55 @@ class DetectedObjects:
 
     def _detect(self, pairs: Sequence["_Pair"]) -> list[ObjectViews]:
         frames = [pair.frames[view] for pair in pairs for view in VIEWS]
-        views = VIEWS * len(pairs)
         if isinstance(self.detector, BatchDetector):
             detected = self.detector.detect_batch(frames)
         else:
+            views = VIEWS * len(pairs)
             detected = [self.detector.detect(rgb, view) for rgb, view in zip(frames, views, strict=True)]
-        singles = [pair.single for pair in pairs for _ in VIEWS]
-        crops = [
-            _crop_objects(rgb, self._choose(found, rgb, view, single=single), view)
-            for rgb, view, found, single in zip(frames, views, detected, singles, strict=True)
-        ]
-        return [
-            _join(front, top, single=pair.single)
-            for pair, front, top in zip(pairs, crops[::2], crops[1::2], strict=True)
-        ]
+        both = zip(detected[::2], detected[1::2], strict=True)
+        return [self._join(pair, found) for pair, found in zip(pairs, both, strict=True)]
 
-    def _choose(self, found: Detections, rgb: np.ndarray, view: View, *, single: bool) -> Detections:
+    def _join(self, pair: "_Pair", detected: Sequence[Detections]) -> ObjectViews:
+        """Match the detections of both views; the two of a single object belong together."""
+        front, top = (self._cut_out(pair, view, own) for view, own in zip(VIEWS, detected, strict=True))
+        count = len(front.objects)
+        costs = np.zeros((count, len(top.objects))) if pair.single else _matching_costs(front, top)
+        matches = match_greedily(costs)
+        objects = ObjectViews.concatenate([front.objects, top.objects])
+        slots, moved = [row for row, _ in matches], [count + column for _, column in matches]
+        for array in (objects.masks, objects.crops, objects.boxes, objects.grasps):
+            array[TOP, slots] = array[TOP, moved]
+        others = set(range(len(objects))) - {*slots, *moved}
+        return objects.select(np.array([*slots, *sorted(others)], np.int64)).left_to_right()
+
+    def _cut_out(self, pair: "_Pair", view: View, found: Detections) -> "_Seen":
+        rgb, v = pair.frames[view], VIEWS.index(view)
         _check_within(found, rgb.shape[1:], view)
-        if single and len(found):
-            return found.select(np.array([0 if found.scores is None else found.scores.argmax()]))
-        return found if found.scores is None else found.select(found.scores >= self.min_score)
+        if pair.single and len(found):
+            found = found.select(np.array([0 if found.scores is None else found.scores.argmax()]))
+        elif found.scores is not None:
+            found = found.select(found.scores >= self.min_score)
+        objects, colours = make_hidden_objects(len(found)), np.zeros((len(found), NUM_BINS**3))
+        objects.masks[v] = True
+        for k, (left, upper, right, lower) in enumerate(found.boxes.tolist()):
+            objects.crops[v, k], objects.boxes[v, k] = crop_box(rgb, (left, right, upper, lower))
+            inside = rgb[:, upper : lower + 1, left : right + 1]
+            mask = None if found.masks is None else found.masks[k, upper : lower + 1, left : right + 1]
+            if mask is None or not mask.any():
+                objects.grasps[v, k], colours[k] = objects.boxes[v, k, :2], _histogram(inside.reshape(3, -1))
+                continue
+            extent = np.array([0, right - left, 0, lower - upper])
+            objects.grasps[v, k] = interior_pixel(np.ascontiguousarray(mask).view(np.uint8), extent, value=1)
+            objects.grasps[v, k] += left, upper
+            colours[k] = _histogram(inside[:, mask])
+        return _Seen(objects, unproject(found.boxes[:, [[0, 3], [2, 3]]], CAMERAS[view]), colours)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pair:
+class _Pair(NamedTuple):
     """Both views of an observation or a prompt image; `single` if it is of a single object."""
 
     frames: Mapping[str, np.ndarray]
     single: bool
-
-    @staticmethod
-    def of_observation(observation: Mapping) -> "_Pair":
-        return _Pair(camera_frames(part_of(observation, "rgb"), "the observation's rgb"), False)
-
-    @staticmethod
-    def of_prompt_image(image: PromptImage) -> "_Pair":
-        frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
-        return _Pair(frames, image.kind == "object")
 
     @property
     def key(self) -> bytes:
@@ -309,43 +317,19 @@ class _Pair:
         return digest.digest()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ViewDetections:
-    """The detections of one view.
+class _Seen(NamedTuple):
+    """The objects of one view, hidden in the other.
 
     Args:
-        crops: Shape (N, 3, 32, 32), uint8.
-        boxes: Centre x, centre y, height, width in pixels, shape (N, 4), int64.
-        grasps: Column and row, shape (N, 2), int64.
-        corners: Table points under the lower left and the lower right corner of the box, shape (N, 2, 2),
+        objects: The objects.
+        corners: Table points under the lower left and the lower right corner of each box, shape (N, 2, 2),
             metres. Upper corners depend on the object's height in the front view.
-        colours: Histograms of the colours inside the mask or box, shape (N, 64), each with sum 1.
+        colours: Histograms of the colours inside mask or box, shape (N, 64), each with sum 1.
     """
 
-    crops: np.ndarray
-    boxes: np.ndarray
-    grasps: np.ndarray
+    objects: ObjectViews
     corners: np.ndarray
     colours: np.ndarray
-
-
-def _crop_objects(rgb: np.ndarray, found: Detections, view: View) -> _ViewDetections:
-    blank = make_hidden_objects(len(found))
-    crops, boxes, grasps = blank.crops[0], blank.boxes[0], blank.grasps[0]
-    colours = np.zeros((len(found), NUM_BINS**3))
-    for k, (left, upper, right, lower) in enumerate(found.boxes.tolist()):
-        crops[k], boxes[k] = crop_box(rgb, (left, right, upper, lower))
-        inside = rgb[:, upper : lower + 1, left : right + 1]
-        mask = None if found.masks is None else found.masks[k, upper : lower + 1, left : right + 1]
-        if mask is None or not mask.any():
-            grasps[k], colours[k] = boxes[k, :2], _histogram(inside.reshape(3, -1))
-            continue
-        extent = np.array([0, right - left, 0, lower - upper])
-        grasps[k] = interior_pixel(np.ascontiguousarray(mask).view(np.uint8), extent, value=1)
-        grasps[k] += left, upper
-        colours[k] = _histogram(inside[:, mask])
-    corners = found.boxes[:, [[0, 3], [2, 3]]]
-    return _ViewDetections(crops, boxes, grasps, unproject(corners, CAMERAS[view]), colours)
 
 
 def _histogram(pixels: np.ndarray) -> np.ndarray:
@@ -354,42 +338,12 @@ def _histogram(pixels: np.ndarray) -> np.ndarray:
     return np.bincount(bins, minlength=NUM_BINS**3) / pixels.shape[1]
 
 
-def _join(front: _ViewDetections, top: _ViewDetections, *, single: bool) -> ObjectViews:
-    """Match the detections of both views, all of them or those of a single object."""
-    both = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
-    return _merge_views(front, top, both if single else _match_views(front, top)).left_to_right()
-
-
-def _match_views(front: _ViewDetections, top: _ViewDetections) -> list[tuple[int, int]]:
-    """Greedy matching of front and top detections: repeatedly the pair with the lowest cost."""
+def _matching_costs(front: _Seen, top: _Seen) -> np.ndarray:
+    """Return the cost of matching each object of the front view with each one of the top view."""
     gaps = np.abs(front.corners[:, None] - top.corners).max(axis=2)  # (front, top, x and y)
     distances = gaps[..., 1] + DEPTH_WEIGHT * gaps[..., 0]
     colours = np.abs(front.colours[:, None] - top.colours).sum(axis=-1) / 2
-    costs = np.where(distances <= MAX_DISTANCE_M, distances + COLOUR_WEIGHT_M * colours, np.inf)
-    pairs = []
-    while np.isfinite(costs).any():
-        row, column = (int(index) for index in np.unravel_index(costs.argmin(), costs.shape))
-        pairs.append((row, column))
-        costs[row], costs[:, column] = np.inf, np.inf
-    return pairs
-
-
-def _merge_views(front: _ViewDetections, top: _ViewDetections, pairs: list[tuple[int, int]]) -> ObjectViews:
-    """Return one row per pair, then one per object detected in a single view."""
-    only_front = sorted(set(range(len(front.boxes))) - {row for row, _ in pairs})
-    only_top = sorted(set(range(len(top.boxes))) - {row for _, row in pairs})
-    hidden = -1
-    slots = [*pairs, *((row, hidden) for row in only_front), *((hidden, row) for row in only_top)]
-    rows = np.array(slots, np.int64).reshape(-1, 2)
-    objects = make_hidden_objects(len(rows))
-    for view, detections in ((FRONT, front), (TOP, top)):
-        visible = rows[:, view] != hidden
-        chosen = rows[visible, view]
-        objects.masks[view] = visible
-        objects.crops[view, visible] = detections.crops[chosen]
-        objects.boxes[view, visible] = detections.boxes[chosen]
-        objects.grasps[view, visible] = detections.grasps[chosen]
-    return objects
+    return np.where(distances <= MAX_DISTANCE_M, distances + COLOUR_WEIGHT_M * colours, np.inf)
 
 
 def _check_within(found: Detections, shape: tuple[int, ...], view: View) -> None:

@@ -4,7 +4,6 @@ import contextlib
 import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,9 +16,10 @@ from openvima.detector.frames import Frame
 from openvima.errors import ConfigError
 from openvima.imports import import_extra
 from openvima.render import channels_last
+from openvima.video.encoder import png
 
 _CATEGORY = 1  # of all objects
-_AP, _AP50, _AP75, _RECALL = 0, 1, 2, 8  # positions in COCOeval.stats
+_STATS = 0, 1, 2, 8  # positions of AP, AP50, AP75 and recall in COCOeval.stats
 
 Record = dict[str, Any]
 
@@ -72,27 +72,33 @@ def evaluate_detector(detect: Callable[[np.ndarray], Detections], frames: Iterab
     require_pycocotools()
     from pycocotools import mask as mask_utils
 
-    def region(mask: np.ndarray, edges: np.ndarray) -> Record:
+    def annotate(regions: list[Record], mask: np.ndarray, edges: np.ndarray, **fields: float) -> None:
         left, upper, right, lower = (float(edge) for edge in edges)
         size = [right - left, lower - upper]
-        return {
-            "bbox": [left, upper, *size],
-            "segmentation": mask_utils.encode(np.asfortranarray(mask.astype(np.uint8))),
-            "area": float(size[0] * size[1]),
-            "category_id": _CATEGORY,
-        }
+        regions.append(
+            {
+                "id": len(regions) + 1,
+                "image_id": len(images),
+                "iscrowd": 0,
+                "bbox": [left, upper, *size],
+                "segmentation": mask_utils.encode(np.asfortranarray(mask.astype(np.uint8))),
+                "area": float(size[0] * size[1]),
+                "category_id": _CATEGORY,
+                **fields,
+            }
+        )
 
     images, truth, found = [], [], []
-    for number, frame in enumerate(frames):
-        _, height, width = frame.rgb.shape
-        images.append({"id": number, "height": height, "width": width})
+    for frame in frames:
         for mask, edges in zip(frame.masks, frame.boxes, strict=True):
-            truth.append({"id": len(truth) + 1, "image_id": number, "iscrowd": 0, **region(mask, edges)})
+            annotate(truth, mask, edges)
         detections = detect(frame.rgb)
         assert detections.masks is not None and detections.scores is not None  # as required
         boxes = detections.boxes + np.array([0, 0, 1, 1])  # from inclusive pixels to edges
         for mask, edges, score in zip(detections.masks, boxes, detections.scores, strict=True):
-            found.append({"image_id": number, "score": float(score), **region(mask, edges)})
+            annotate(found, mask, edges, score=float(score))
+        _, height, width = frame.rgb.shape
+        images.append({"id": len(images), "height": height, "width": width})
     if not truth:
         raise ConfigError("the frames contain no object; give others to evaluate a detector on.")
     return CocoEvaluation(
@@ -113,18 +119,14 @@ def require_pycocotools() -> None:
 def _metrics(
     images: list[Record], truth: list[Record], found: list[Record], kind: Literal["bbox", "segm"]
 ) -> CocoMetrics:
-    if not found:
-        return CocoMetrics(0.0, 0.0, 0.0, 0.0)
     from pycocotools.cocoeval import COCOeval
 
-    found = [{"id": number, "iscrowd": 0, **one} for number, one in enumerate(found, start=1)]
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
         evaluation = COCOeval(_coco(images, truth), _coco(images, found), kind)
         evaluation.evaluate()
         evaluation.accumulate()
         evaluation.summarize()
-    ap, ap50, ap75, recall = (float(evaluation.stats[k]) for k in (_AP, _AP50, _AP75, _RECALL))
-    return CocoMetrics(ap, ap50, ap75, recall)
+    return CocoMetrics(*(float(evaluation.stats[k]) for k in _STATS))
 
 
 def _coco(images: list[Record], annotations: list[Record]) -> Any:
@@ -168,8 +170,8 @@ def draw_detections(frame: Frame, found: Detections) -> Image.Image:
         colour = COLOURS[number % len(COLOURS)]
         corners = [SCALE * left, SCALE * upper, SCALE * (right + 1) - 1, SCALE * (lower + 1) - 1]
         draw.rectangle(corners, outline=colour, width=2)
-        text = f"{scores[number]:.2f}"
-        draw.text((corners[0] + 2, max(0, corners[1] - 12)), text, fill=colour)
+        above = (corners[0] + 2, max(0, corners[1] - 12))
+        draw.text(above, f"{scores[number]:.2f}", fill=colour)
     return image
 
 
@@ -182,9 +184,7 @@ def save_grid(images: Sequence[Image.Image], path: Path) -> None:
     for number, image in enumerate(images):
         row, column = divmod(number, COLUMNS)
         sheet.paste(image, (GAP + column * (width + GAP), GAP + row * (height + GAP)))
-    content = BytesIO()
-    sheet.save(content, "PNG", optimize=True)
-    atomic_write_file(path, content.getvalue())
+    atomic_write_file(path, png(sheet))
 
 
 def _dashes(length: int) -> np.ndarray:

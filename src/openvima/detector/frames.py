@@ -1,7 +1,7 @@
 """Annotated frames from demonstrations, for training and evaluating a detector, and their augmentation."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,8 +11,6 @@ from openvima.data.schema import VIEWS
 from openvima.detector.detection import Detections
 from openvima.errors import DatasetError
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
-
-_NUM_IDS = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +36,8 @@ def frame_of(rgb: np.ndarray, segm: np.ndarray, ids: Sequence[int] | np.ndarray)
         segm: Object ids, shape (H, W), uint8.
         ids: The ids of objects.
     """
-    there = np.bincount(segm.ravel(), minlength=_NUM_IDS) > 0
-    ids = np.array([object_id for object_id in ids if there[object_id]], np.int64)
-    return frame_of_masks(rgb, segm == ids[:, None, None])
+    shown = np.asarray(ids)[np.isin(ids, segm)]
+    return frame_of_masks(rgb, segm == shown[:, None, None])
 
 
 def frame_of_masks(rgb: np.ndarray, masks: np.ndarray) -> Frame:
@@ -136,7 +133,7 @@ def augment_frame(frame: Frame, rng: np.random.Generator, *, paste_prob: float =
     for mask in frame.masks:
         if rng.random() < RECOLOUR_PROB:
             rgb[:, mask] = mix_channels(rgb[:, mask], rng)
-    changed = Frame(rgb, frame.boxes, frame.masks)
+    changed = replace(frame, rgb=rgb)
     return flip_horizontally(changed) if rng.random() < FLIP_PROB else changed
 
 
@@ -154,23 +151,22 @@ def paste_object(frame: Frame, rng: np.random.Generator) -> Frame:
     Source: copy-paste augmentation (Ghiasi et al. 2021).
     """
     source, target = rng.integers(len(frame.masks), size=2).tolist()
-    left, upper, right, lower = frame.boxes[source].astype(int).tolist()
-    x0, y0, x1, y1 = frame.boxes[target].tolist()
-    centre = (x0 + x1) / 2, (y0 + y1) / 2
-    offset = rng.uniform(-0.3, 0.3, 2) * (x1 - x0, y1 - y0)
-    column, row = (
-        (np.array(centre) + offset - (right - left, lower - upper) * np.array(0.5)).round().astype(int)
-    )
-    height, width = frame.rgb.shape[1:]
-    if not (0 <= column <= width - (right - left) and 0 <= row <= height - (lower - upper)):
+    first, last = frame.boxes[source].astype(int).reshape(2, 2)  # column and row of what is copied
+    low, high = frame.boxes[target].astype(np.float64).reshape(2, 2)
+    offset = rng.uniform(-0.3, 0.3, 2) * (high - low)
+    start = ((low + high) / 2 + offset - (last - first) / 2).round().astype(int)
+    end = start + last - first
+    _, height, width = frame.rgb.shape
+    if (start < 0).any() or (end > (width, height)).any():
         return frame
     step = -1 if rng.random() < 0.5 else 1
-    shape = frame.masks[source, upper:lower, left:right][:, ::step]
-    pixels = frame.rgb[:, upper:lower, left:right][:, :, ::step]
+    source_window, window = (
+        (slice(low[1], high[1]), slice(low[0], high[0])) for low, high in ((first, last), (start, end))
+    )
+    shape = frame.masks[source][source_window][:, ::step]
     rgb, pasted = frame.rgb.copy(), np.zeros((1, height, width), bool)
-    window = slice(row, row + lower - upper), slice(column, column + right - left)
     pasted[0][window] = shape
-    rgb[(slice(None), *window)][:, shape] = pixels[:, shape]
+    rgb[:, *window][:, shape] = frame.rgb[:, *source_window][:, :, ::step][:, shape]
     left_over = frame.masks & ~pasted
     if (left_over.sum(axis=(1, 2)) < LEAST_VISIBLE * frame.masks.sum(axis=(1, 2))).any():
         return frame

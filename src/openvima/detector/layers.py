@@ -6,6 +6,7 @@ Sources: Deep Residual Learning (He et al. 2016); Feature Pyramid Networks (Lin 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import nn
@@ -109,11 +110,6 @@ class Backbone(nn.Module):
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
 
-    @property
-    def size_divisor(self) -> int:
-        """Height and width of the input must be multiples of this."""
-        return 4 * 2 ** (len(self.stages) - 1)
-
     def train(self, mode: bool = True) -> "Backbone":
         """Set the mode; frozen batch normalisation stays in evaluation mode."""
         super().train(mode)
@@ -180,7 +176,7 @@ class RegionProposalNetwork(nn.Module):
 
     def forward(self, levels: Sequence[torch.Tensor]) -> AnchorPredictions:
         """Predict from the pyramid levels, (B, C, h, w) each."""
-        shapes = [(level.shape[2], level.shape[3]) for level in levels]
+        shapes = tuple((level.shape[2], level.shape[3]) for level in levels)
         anchors = pyramid_anchors(self.config.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
         objectness, deltas = [], []
         # Both 1 × 1 convolutions as one matrix product, in the order of the anchors: (3 · 5, C)
@@ -191,8 +187,7 @@ class RegionProposalNetwork(nn.Module):
             outputs = F.linear(hidden, weight, bias).reshape(len(level), -1, 5)  # (B, h · w · 3, 5)
             objectness.append(outputs[..., 0])
             deltas.append(outputs[..., 1:])
-        device, dtype = levels[0].device, levels[0].dtype
-        return AnchorPredictions([a.to(device, dtype) for a in anchors], objectness, deltas)
+        return AnchorPredictions([each.to(levels[0]) for each in anchors], objectness, deltas)
 
     @torch.no_grad()
     def propose(self, predictions: AnchorPredictions, *, height: int, width: int) -> list[torch.Tensor]:
@@ -227,8 +222,7 @@ class RegionProposalNetwork(nn.Module):
         """
         anchors = torch.cat(predictions.anchors)
         all_logits, all_deltas = (
-            torch.cat(predictions.objectness, dim=1),
-            torch.cat(predictions.deltas, dim=1),
+            torch.cat(levels, dim=1) for levels in (predictions.objectness, predictions.deltas)
         )
         objectness_loss = box_loss = all_logits.new_zeros(())
         for logits, deltas, boxes in zip(all_logits, all_deltas, objects, strict=True):
@@ -274,14 +268,10 @@ class BoxHead(nn.Module):
 
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
-        width = config.backbone.fpn_width * config.box_pool_size**2
-        hidden = []
-        for out in config.box_head_widths:
-            hidden.append(nn.Linear(width, out))
-            width = out
-        self.hidden = nn.ModuleList(hidden)
-        self.class_logits = nn.Linear(width, config.num_classes + 1)  # the last class is background
-        self.deltas = nn.Linear(width, 4 * config.num_classes)
+        widths = (config.backbone.fpn_width * config.box_pool_size**2, *config.box_head_widths)
+        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
+        self.class_logits = nn.Linear(widths[-1], config.num_classes + 1)  # the last class is background
+        self.deltas = nn.Linear(widths[-1], 4 * config.num_classes)
         for layer in self.hidden:
             nn.init.kaiming_uniform_(layer.weight, a=1)  # type: ignore[arg-type]  # all are linear
         nn.init.normal_(self.class_logits.weight, std=0.01)
@@ -304,13 +294,10 @@ class MaskHead(nn.Module):
 
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
-        width, convs = config.backbone.fpn_width, []
-        for out in config.mask_head_widths:
-            convs.append(nn.Conv2d(width, out, 3, padding=1))
-            width = out
-        self.convs = nn.ModuleList(convs)
-        self.deconv = nn.ConvTranspose2d(width, width, 2, stride=2)
-        self.mask_logits = nn.Conv2d(width, config.num_classes, 1)
+        widths = (config.backbone.fpn_width, *config.mask_head_widths)
+        self.convs = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in pairwise(widths))
+        self.deconv = nn.ConvTranspose2d(widths[-1], widths[-1], 2, stride=2)
+        self.mask_logits = nn.Conv2d(widths[-1], config.num_classes, 1)
         for layer in (*self.convs, self.deconv):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")  # type: ignore[arg-type]  # convolutions
         nn.init.normal_(self.mask_logits.weight, std=0.001)

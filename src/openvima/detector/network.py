@@ -71,8 +71,8 @@ class MaskRCNN(nn.Module):
         self.rpn = RegionProposalNetwork(config)
         self.box_head = BoxHead(config)
         self.mask_head = MaskHead(config)
-        for name, values in (("pixel_mean", config.pixel_mean), ("pixel_std", config.pixel_std)):
-            self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
+        for name in ("pixel_mean", "pixel_std"):
+            self.register_buffer(name, torch.tensor(getattr(config, name)).view(3, 1, 1), persistent=False)
 
     @torch.no_grad()
     def forward(self, images: torch.Tensor) -> list[Instances]:
@@ -81,12 +81,13 @@ class MaskRCNN(nn.Module):
         Args:
             images: Shape (B, 3, H, W), uint8, RGB.
         """
-        height, width = images.shape[2:]
+        config, (height, width) = self.config, images.shape[2:]
         inputs, scale, size = self._preprocess(images)
         levels = self.backbone(inputs)
         proposals = self.rpn.propose(self.rpn(levels), height=size[0], width=size[1])
         boxes, scores, classes, owners = self._detect_boxes(levels, proposals, size)
-        probabilities = self._predict_masks(levels, boxes, classes, owners)
+        logits = self.mask_head(pyramid_align(levels, boxes, owners, config, size=config.mask_pool_size))
+        probabilities = logits[torch.arange(len(boxes), device=boxes.device), classes].sigmoid()
         counts = owners.bincount(minlength=len(images)).tolist()
         boxes = clip_boxes(boxes / scale, height=height, width=width)
         masks = paste_masks(probabilities, boxes, height=height, width=width)
@@ -106,28 +107,34 @@ class MaskRCNN(nn.Module):
             sampled: Proposals per image in the losses of the heads.
             generator: Samples anchors and proposals, on the CPU.
         """
-        inputs, scale, (height, width) = self._preprocess(images)
+        config, (inputs, scale, (height, width)) = self.config, self._preprocess(images)
         levels = self.backbone(inputs)
         predictions: AnchorPredictions = self.rpn(levels)
         true_boxes = [own.boxes.to(inputs.dtype) * scale for own in targets]
         losses = self.rpn.losses(predictions, true_boxes, generator)
         proposals = self.rpn.propose(predictions, height=height, width=width)
-        samples = (
-            _sample_proposals(torch.cat([boxes, own]), own, sampled=sampled, generator=generator)
-            for boxes, own in zip(proposals, true_boxes, strict=True)
-        )
-        foregrounds, backgrounds, matches = zip(*samples, strict=True)
+        foregrounds, backgrounds, matches = [], [], []
+        for proposed, own in zip(proposals, true_boxes, strict=True):
+            boxes = torch.cat([proposed, own])
+            rows, labels = match(boxes, own, low=FOREGROUND_IOU, high=FOREGROUND_IOU)
+            foreground, background = subsample(
+                labels, count=sampled, positive_fraction=POSITIVE_FRACTION, generator=generator
+            )
+            foregrounds.append(boxes[foreground])
+            backgrounds.append(boxes[background])
+            matches.append(rows[foreground])
         # Foreground proposals come first, image after image; then the background.
         boxes = torch.cat([*foregrounds, *backgrounds])
         counts = torch.tensor([len(each) for each in (*foregrounds, *backgrounds)])
         indices = torch.arange(len(targets)).repeat(2).repeat_interleave(counts).to(boxes.device)
-        logits, deltas = self.box_head(self._pool(levels, boxes, indices, self.config.box_pool_size))
+        pooled = pyramid_align(levels, boxes, indices, config, size=config.box_pool_size)
+        logits, deltas = self.box_head(pooled)
         matched = torch.cat([own[rows] for own, rows in zip(true_boxes, matches, strict=True)])
         losses |= box_losses(logits, deltas, proposals=boxes, boxes=matched)
         masks = torch.cat([own.masks[rows] for own, rows in zip(targets, matches, strict=True)])
-        foreground = boxes[: len(matched)]
-        pooled = self._pool(levels, foreground, indices[: len(matched)], self.config.mask_pool_size)
-        losses["mask"] = mask_loss(self.mask_head(pooled), proposals=foreground / scale, masks=masks)
+        boxes, indices = boxes[: len(matched)], indices[: len(matched)]
+        pooled = pyramid_align(levels, boxes, indices, config, size=config.mask_pool_size)
+        losses["mask"] = mask_loss(self.mask_head(pooled), proposals=boxes / scale, masks=masks)
         return losses
 
     def _preprocess(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, tuple[int, int]]:
@@ -141,19 +148,20 @@ class MaskRCNN(nn.Module):
             pixels = pixels.to(self.pixel_mean.dtype)
             pixels = F.interpolate(pixels, (height, width), mode="bilinear", antialias=True).round()
         scale = self.pixel_mean.new_tensor([width / before[1], height / before[0]]).repeat(2)
-        divisor = self.backbone.size_divisor
+        divisor = FIRST_STRIDE * 2 ** (len(config.backbone.widths) - 1)  # of the coarsest level
         padding = (0, -width % divisor, 0, -height % divisor)
         inputs = F.pad((pixels - self.pixel_mean) / self.pixel_std, padding)
         return inputs, scale, (height, width)
 
     def _detect_boxes(
-        self, levels: Sequence[torch.Tensor], proposals: Sequence[torch.Tensor], size: tuple[int, int]
+        self, levels: Sequence[torch.Tensor], proposals: list[torch.Tensor], size: tuple[int, int]
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return boxes, scores, classes and images' indices; each proposal counts for its best class only."""
-        config, references = self.config, torch.cat(list(proposals))
+        config, references = self.config, torch.cat(proposals)
         counts = torch.tensor([len(boxes) for boxes in proposals])
         owners = torch.arange(len(proposals)).repeat_interleave(counts).to(references.device)
-        logits, deltas = self.box_head(self._pool(levels, references, owners, config.box_pool_size))
+        pooled = pyramid_align(levels, references, owners, config, size=config.box_pool_size)
+        logits, deltas = self.box_head(pooled)
         scores, classes = logits.softmax(dim=1)[:, :-1].max(dim=1)
         rows = (scores >= config.score_threshold).nonzero()[:, 0]
         deltas = deltas[rows, classes[rows]]
@@ -165,32 +173,6 @@ class MaskRCNN(nn.Module):
         rows = rows[kept]
         return boxes[kept], scores[rows], classes[rows], owners[rows]
 
-    def _predict_masks(
-        self,
-        levels: Sequence[torch.Tensor],
-        boxes: torch.Tensor,
-        classes: torch.Tensor,
-        images: torch.Tensor,
-    ) -> torch.Tensor:
-        """Return mask probabilities inside the boxes, (N, 2 · size, 2 · size)."""
-        logits = self.mask_head(self._pool(levels, boxes, images, self.config.mask_pool_size))
-        return logits[torch.arange(len(boxes), device=boxes.device), classes].sigmoid()
-
-    def _pool(
-        self, levels: Sequence[torch.Tensor], boxes: torch.Tensor, images: torch.Tensor, size: int
-    ) -> torch.Tensor:
-        config = self.config
-        return pyramid_align(
-            levels[: len(config.backbone.widths)],  # the extra level is for proposals only
-            boxes,
-            images,
-            size=size,
-            sampling_ratio=config.roi_sampling_ratio,
-            first_stride=FIRST_STRIDE,
-            canonical_size=config.canonical_size,
-            canonical_level=config.canonical_level,
-        )
-
 
 def resized_shape(config: DetectorConfig, height: int, width: int) -> tuple[int, int]:
     """Return the height and width to which an image is resized; halves are rounded up."""
@@ -198,17 +180,6 @@ def resized_shape(config: DetectorConfig, height: int, width: int) -> tuple[int,
         return height, width
     scale = min(config.min_size / min(height, width), config.max_size / max(height, width))
     return math.floor(height * scale + 0.5), math.floor(width * scale + 0.5)
-
-
-def _sample_proposals(
-    proposals: torch.Tensor, objects: torch.Tensor, *, sampled: int, generator: torch.Generator
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Sample proposals of one image: foreground, background, and indices of the foreground's objects."""
-    indices, labels = match(proposals, objects, low=FOREGROUND_IOU, high=FOREGROUND_IOU)
-    foreground, background = subsample(
-        labels, count=sampled, positive_fraction=POSITIVE_FRACTION, generator=generator
-    )
-    return proposals[foreground], proposals[background], indices[foreground]
 
 
 class FrameDetector:
@@ -230,7 +201,6 @@ class FrameDetector:
         network = fuse_batch_norm(network).to(self.device)
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    @torch.inference_mode()
     def detect(self, rgb: np.ndarray, view: str) -> Detections:
         """Detect the objects in an image.
 
@@ -257,12 +227,9 @@ class FrameDetector:
 def to_detections(found: Instances) -> Detections:
     """Convert instances to arrays; boxes contain the pixels that they cover by at least half."""
     _, height, width = found.masks.shape
-    edges = found.boxes.cpu().double().numpy()
-    first = np.floor(edges[:, :2] + 0.5)
-    last = np.floor(edges[:, 2:] + 0.5) - 1
-    limit = np.array([width, height]) - 1
-    first = np.clip(first, 0, limit)
-    last = np.clip(np.maximum(last, first), 0, limit)
+    edges, limit = np.floor(found.boxes.cpu().double().numpy() + 0.5), np.array([width, height]) - 1
+    first = edges[:, :2].clip(0, limit)
+    last = np.maximum(edges[:, 2:] - 1, first).clip(0, limit)
     boxes = np.concatenate([first, last], axis=1).astype(np.int64)
     return Detections(boxes, found.masks.cpu().numpy(), found.scores.cpu().double().numpy())
 

@@ -127,22 +127,19 @@ class PluggedExtractor:
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
         """Extract the objects of an observation, at least one masked object."""
-        found = _visible(self.extractor.in_observation(observation))
+        found = self.extractor.in_observation(observation)
+        found = found.select(found.visible())
         return found if len(found) else make_hidden_objects(1)
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Extract the objects of a prompt image; there may be none."""
-        return _visible(self.extractor.in_prompt_image(image))
+        found = self.extractor.in_prompt_image(image)
+        return found.select(found.visible())
 
     def extract_ahead(self, observations: Sequence[Mapping], images: Sequence[PromptImage]) -> None:
         """Pass on images to an extractor that can process them together."""
         if isinstance(self.extractor, AheadExtractor):
             self.extractor.extract_ahead(observations, images)
-
-
-def _visible(found: ObjectViews) -> ObjectViews:
-    visible = found.visible()
-    return found if visible.all() else found.select(visible)
 
 
 def _folder_of(source: str) -> Path | None:

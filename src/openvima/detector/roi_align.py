@@ -12,6 +12,7 @@ import torch
 from torch.nn import functional as F
 
 from openvima.detector.boxes import box_area
+from openvima.detector.config import FIRST_STRIDE, DetectorConfig
 from openvima.detector.kernels import align, paste
 
 
@@ -43,15 +44,16 @@ def roi_align(
     """
     boxes = boxes / stride - 0.5
     lows, extents = boxes[:, :2], boxes[:, 2:] - boxes[:, :2]
-    if sampling_ratio and len(boxes):
-        x, y = (_sample_points(lows[:, axis], extents[:, axis], size, sampling_ratio) for axis in (0, 1))
-        return _pool(features, x, y, images)
     counts = (extents / size).ceil().clamp(min=1).long()
+    if sampling_ratio:
+        counts = torch.full_like(counts, sampling_ratio)
     result = features.new_zeros(len(boxes), features.shape[1], size, size)
     for columns, rows in counts.unique(dim=0).tolist():  # boxes with equally many samples at once
         chosen = ((counts[:, 0] == columns) & (counts[:, 1] == rows)).nonzero()[:, 0]
-        x = _sample_points(lows[chosen, 0], extents[chosen, 0], size, columns)
-        y = _sample_points(lows[chosen, 1], extents[chosen, 1], size, rows)
+        x, y = (
+            _sample_points(lows[chosen, axis], extents[chosen, axis], size, count)
+            for axis, count in enumerate((columns, rows))
+        )
         result = result.index_put((chosen,), _pool(features, x, y, images[chosen]))
     return result
 
@@ -60,33 +62,28 @@ def pyramid_align(
     levels: Sequence[torch.Tensor],
     boxes: torch.Tensor,
     images: torch.Tensor,
+    config: DetectorConfig,
     *,
     size: int,
-    sampling_ratio: int,
-    first_stride: int,
-    canonical_size: float,
-    canonical_level: int,
 ) -> torch.Tensor:
     """Apply `roi_align` to each box on the pyramid level that fits its size.
 
     Args:
-        levels: Features of each level, shape (B, C, H, W); strides double from level to level.
+        levels: Features of each level, shape (B, C, H, W); strides double from level to level. An extra one
+            is for proposals only.
         boxes: In image pixels, shape (R, 4).
         images: Index of each box's image, shape (R,), int64.
+        config: Decides levels and sampling.
         size: Cells of the grid in each direction.
-        sampling_ratio: As for `roi_align`.
-        first_stride: Stride of the first level.
-        canonical_size: Square root of the area of boxes that belong to `canonical_level`.
-        canonical_level: Index of that level.
 
     Returns:
         Shape (R, C, size, size).
     """
-    indices = box_levels(boxes, len(levels), canonical_size=canonical_size, canonical_level=canonical_level)
+    indices, sampling_ratio = box_levels(boxes, config), config.roi_sampling_ratio
     result = levels[0].new_zeros(len(boxes), levels[0].shape[1], size, size)
     is_cpu_inference = boxes.device.type == "cpu" and not torch.is_grad_enabled()
-    for level, features in enumerate(levels):
-        stride, chosen = first_stride * 2**level, (indices == level).nonzero()[:, 0]
+    for level, features in enumerate(levels[: len(config.backbone.widths)]):
+        stride, chosen = FIRST_STRIDE * 2**level, (indices == level).nonzero()[:, 0]
         if is_cpu_inference:
             arrays = (each.numpy() for each in (boxes, images, indices))
             pixels = features.permute(0, 2, 3, 1).contiguous().numpy()
@@ -104,16 +101,14 @@ def pyramid_align(
     return result
 
 
-def box_levels(
-    boxes: torch.Tensor, num_levels: int, *, canonical_size: float, canonical_level: int
-) -> torch.Tensor:
+def box_levels(boxes: torch.Tensor, config: DetectorConfig) -> torch.Tensor:
     """Return the level that fits each box (R, 4), shape (R,), int64.
 
     Source: Feature Pyramid Networks (Lin et al. 2017), equation 1.
     """
     sides = box_area(boxes).clamp(min=0).sqrt()
-    levels = (canonical_level + (sides / canonical_size + 1e-8).log2()).floor()
-    return levels.clamp(0, num_levels - 1).long()
+    levels = (config.canonical_level + (sides / config.canonical_size + 1e-8).log2()).floor()
+    return levels.clamp(0, len(config.backbone.widths) - 1).long()
 
 
 def _sample_points(low: torch.Tensor, extent: torch.Tensor, size: int, samples: int) -> torch.Tensor:

@@ -8,11 +8,11 @@ import numpy as np
 
 from openvima.perception.objects import (
     ObjectViews,
-    camera_frames,
     crop_box,
+    observation_frames,
     observe,
     observe_prompt_image,
-    part_of,
+    prompt_image_frames,
 )
 from openvima.perception.preprocessing import FOUND, FoundImage
 from openvima.render.camera import VIEWS
@@ -52,12 +52,25 @@ def match_ids_to_slots(found: ObjectViews, true: ObjectViews) -> dict[int, int]:
         Id of a true object to its slot in `found`; objects below `IOU_THRESHOLD` are omitted.
     """
     iou = object_iou(found, true)
-    slots = {}
-    while iou.size and iou.max() >= IOU_THRESHOLD:
-        slot, row = (int(index) for index in np.unravel_index(iou.argmax(), iou.shape))
-        slots[int(true.ids[row])] = slot
-        iou[slot], iou[:, row] = 0, 0
-    return slots
+    pairs = match_greedily(np.where(iou >= IOU_THRESHOLD, -iou, np.inf))
+    return {int(true.ids[row]): slot for slot, row in pairs}
+
+
+def match_greedily(costs: np.ndarray) -> list[tuple[int, int]]:
+    """Match rows to columns: repeatedly the pair with the lowest cost, of equal ones the first.
+
+    Args:
+        costs: Shape (rows, columns), float64; infinite where there must be no match.
+
+    Returns:
+        Row and column of each pair.
+    """
+    costs, pairs = costs.copy(), []
+    while np.isfinite(costs).any():
+        row, column = (int(index) for index in np.unravel_index(costs.argmin(), costs.shape))
+        pairs.append((row, column))
+        costs[row], costs[:, column] = np.inf, np.inf
+    return pairs
 
 
 def _edges(boxes: np.ndarray) -> np.ndarray:
@@ -90,28 +103,25 @@ class BoxJitter:
         """Return an observation with its objects, found beforehand."""
         if "segm" not in observation or "rgb" not in observation:
             return observation  # of a policy on whole frames
-        frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
-        return {**observation, FOUND: self._move(frames, observe(observation)).left_to_right()}
+        found = self._move(observation_frames(observation), observe(observation))
+        return {**observation, FOUND: found.left_to_right()}
 
     def prompt_image(self, image: PromptImage) -> PromptImage:
         """Return a prompt image with its objects, found beforehand."""
-        frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
-        found = self._move(frames, observe_prompt_image(image))
+        found = self._move(prompt_image_frames(image), observe_prompt_image(image))
         return FoundImage(**{f.name: getattr(image, f.name) for f in fields(image)}, found=found)
 
     def _move(self, frames: Mapping[str, np.ndarray], objects: ObjectViews) -> ObjectViews:
         crops, boxes, grasps = objects.crops.copy(), objects.boxes.copy(), objects.grasps.copy()
         for v, view in enumerate(VIEWS):
-            height, width = frames[view].shape[1:]
+            limits = np.array(frames[view].shape[:0:-1])[:, None] - 1  # of columns and rows
             for k in np.flatnonzero(objects.masks[v]):
-                x, y, tall, wide = objects.boxes[v, k].tolist()
+                centre, size = objects.boxes[v, k, :2], objects.boxes[v, k, :1:-1]
                 # The centre of a box is rounded down, so twice the centre lacks the parity of the size.
-                left, upper = (2 * x + wide % 2 - wide) // 2, (2 * y + tall % 2 - tall) // 2
-                shifts = self.rng.integers(-self.pixels, self.pixels, 4, endpoint=True)
-                edges = np.array([left, left + wide, upper, upper + tall]) + shifts
-                columns = np.sort(edges[:2].clip(0, width - 1))
-                rows = np.sort(edges[2:].clip(0, height - 1))
-                crops[v, k], boxes[v, k] = crop_box(frames[view], [*columns.tolist(), *rows.tolist()])
-                moved = grasps[v, k] + boxes[v, k, :2] - (x, y)
-                grasps[v, k] = moved.clip((columns[0], rows[0]), (columns[1], rows[1]))
+                first = (2 * centre + size % 2 - size) // 2
+                shifts = self.rng.integers(-self.pixels, self.pixels, (2, 2), endpoint=True)
+                edges = np.stack([first, first + size], axis=1) + shifts
+                extent = np.sort(edges.clip(0, limits), axis=1)
+                crops[v, k], boxes[v, k] = crop_box(frames[view], extent.ravel().tolist())
+                grasps[v, k] = (grasps[v, k] + boxes[v, k, :2] - centre).clip(*extent.T)
         return replace(objects, crops=crops, boxes=boxes, grasps=grasps)

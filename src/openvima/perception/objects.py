@@ -7,7 +7,7 @@ pixels around the object, and the resize is OpenCV's area interpolation bit for 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -87,8 +87,7 @@ class ObjectViews:
         return self._on_table(self.grasps)
 
     def _on_table(self, pixels: np.ndarray) -> np.ndarray:
-        top = unproject(pixels[TOP].astype(np.float64), CAMERAS["top"])[:, :2]
-        front = unproject(pixels[FRONT].astype(np.float64), CAMERAS["front"])[:, :2]
+        front, top = (unproject(own, CAMERAS[view]) for own, view in zip(pixels, VIEWS, strict=True))
         return np.where(self.masks[TOP][:, None], top, front)
 
 
@@ -111,22 +110,6 @@ class AheadExtractor(ObjectExtractor, Protocol):
     def extract_ahead(self, observations: Sequence[Mapping], images: Sequence[PromptImage]) -> None:
         """Find the objects of observations and prompt images that will be asked for."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class GroundTruth:
-    """Finds the objects by the simulator's segmentation, as the published policies do."""
-
-    def in_observation(self, observation: Mapping) -> ObjectViews:
-        """Find the objects of an observation; see `observe`."""
-        return observe(observation)
-
-    def in_prompt_image(self, image: PromptImage) -> ObjectViews:
-        """Find the objects that a prompt's image shows; see `observe_prompt_image`."""
-        return observe_prompt_image(image)
-
-
-GROUND_TRUTH = GroundTruth()
 
 
 def make_hidden_objects(count: int = 0) -> ObjectViews:
@@ -161,11 +144,9 @@ def whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
     halves = np.empty((len(VIEWS), 1, 3, height // 2, width // 2), np.uint8)
     for view, frame in enumerate(frames):
         halve_frame(frame, halves[view, 0])
-    centre = np.array([(width - 1) // 2, (height - 1) // 2])
-    boxes = np.tile(np.array([*centre, height - 1, width - 1]), (len(VIEWS), 1, 1))
-    return ObjectViews(
-        np.full(1, -1), halves, boxes, np.ones((len(VIEWS), 1), np.bool_), np.tile(centre, (len(VIEWS), 1, 1))
-    )
+    objects, centre = replace(make_hidden_objects(1), crops=halves), ((width - 1) // 2, (height - 1) // 2)
+    objects.boxes[:], objects.masks[:], objects.grasps[:] = (*centre, height - 1, width - 1), True, centre
+    return objects
 
 
 def extract_objects(
@@ -212,8 +193,7 @@ def observe(observation: Mapping) -> ObjectViews:
         ShapeError: An image has another shape or dtype.
     """
     first = FIRST_OBJECT_ID[END_EFFECTORS[end_effector_of(observation)]]
-    frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
-    views = _measure(frames, part_of(observation, "segm"))
+    views = _measure(observation_frames(observation), part_of(observation, "segm"))
     shown = np.max([view.num_pixels for view in views], axis=0) >= MIN_PIXELS
     return _cut_out(views, first + np.flatnonzero(shown[first:BACKGROUND_ID])).left_to_right()
 
@@ -225,9 +205,20 @@ def observe_prompt_image(image: PromptImage) -> ObjectViews:
         PolicyError: A view is missing.
         ShapeError: An image has another shape or dtype.
     """
-    frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
-    objects = extract_objects(frames, image.segm, [record.object_id for record in image.objects])
+    ids = [record.object_id for record in image.objects]
+    objects = extract_objects(prompt_image_frames(image), image.segm, ids)
     return objects.select(objects.visible())
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """Finds the objects by the simulator's segmentation, as the published policies do."""
+
+    in_observation = staticmethod(observe)
+    in_prompt_image = staticmethod(observe_prompt_image)
+
+
+GROUND_TRUTH = GroundTruth()
 
 
 def part_of(observation: Mapping, name: str) -> Mapping:
@@ -255,6 +246,16 @@ def end_effector_of(observation: Mapping) -> int:
         names = " or ".join(f"{number} ({name})" for number, name in enumerate(END_EFFECTORS))
         raise PolicyError(f"ee is {observation['ee']!r}; it must be {names}.")
     return int(index)
+
+
+def observation_frames(observation: Mapping) -> dict[str, np.ndarray]:
+    """Return the frames of an observation; see `camera_frames`."""
+    return camera_frames(part_of(observation, "rgb"), "the observation's rgb")
+
+
+def prompt_image_frames(image: PromptImage) -> dict[str, np.ndarray]:
+    """Return the frames of a prompt image; see `camera_frames`."""
+    return camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
 
 
 def camera_frames(rgb: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
@@ -312,8 +313,7 @@ def crop_box(rgb: np.ndarray, extent: Sequence[int]) -> tuple[np.ndarray, np.nda
     return crop, np.array([(xmin + xmax) // 2, (ymin + ymax) // 2, ymax - ymin, xmax - xmin])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Measured:
+class _Measured(NamedTuple):
     """One view and what its segmentation says: extents (256, 4) and numbers of pixels (256,) of all ids."""
 
     rgb: np.ndarray

@@ -128,8 +128,10 @@ class ObjectTable:
         return ObjectTable(
             objects.ids.astype(np.int16),
             np.ascontiguousarray(crop_index.T),
-            np.ascontiguousarray(objects.boxes.swapaxes(0, 1).astype(np.int16)),
-            np.ascontiguousarray(objects.grasps.swapaxes(0, 1).astype(np.int16)),
+            *(
+                np.ascontiguousarray(part.swapaxes(0, 1), np.int16)
+                for part in (objects.boxes, objects.grasps)
+            ),
         )
 
 

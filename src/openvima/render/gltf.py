@@ -1,6 +1,5 @@
 """Meshes with textures as binary glTF, for viewers in 3D."""
 
-import io
 from functools import lru_cache
 
 import numpy as np
@@ -52,6 +51,4 @@ def _encoded(mesh: TriangleMesh, texture: np.ndarray) -> bytes:
         visual=trimesh.visual.TextureVisuals(uv=mesh.uvs.reshape(-1, 2), material=material),
         process=False,
     )
-    with io.BytesIO() as stream:
-        body.export(stream, file_type="glb", include_normals=True)
-        return stream.getvalue()
+    return body.export(file_type="glb", include_normals=True)

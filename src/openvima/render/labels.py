@@ -45,8 +45,7 @@ def stamp(raster: np.ndarray, heights: np.ndarray, placement: Placement, assets:
         mesh.upward if is_level else mesh.corners,
         matrix_3x4(placement.pose),
         placement.id,
-        _ORIGIN[0],
-        _ORIGIN[1],
+        *_ORIGIN,
         CELL_M,
         CEILING_M,
         raster,
@@ -81,6 +80,4 @@ def cell_centres(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     Returns:
         x, y of the cells' centres in metres, shape (..., 2), float64.
     """
-    return np.stack(
-        [_ORIGIN[0] + np.asarray(columns) * CELL_M, _ORIGIN[1] + np.asarray(rows) * CELL_M], axis=-1
-    )
+    return np.stack([columns, rows], axis=-1) * CELL_M + _ORIGIN

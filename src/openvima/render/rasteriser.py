@@ -4,12 +4,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from openvima.catalog.geometry import Assets, TriangleMesh
 from openvima.errors import ShapeError
-from openvima.render.camera import CAMERAS, VIEWS, Camera, View, channels_last
+from openvima.render.camera import CAMERAS, VIEWS, Camera, View, channels_first, channels_last
 from openvima.render.kernels import (
     MICROMETRES,
     IndexedMesh,
@@ -176,8 +177,7 @@ class Rasteriser:
         return images
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Canvas:
+class _Canvas(NamedTuple):
     """Camera matrix, and the images of one view that bodies are drawn into."""
 
     camera: np.ndarray
@@ -196,17 +196,19 @@ def _photo_image(name: str, fill: PhotoImage) -> PromptImage:
     for view in VIEWS:
         camera = CAMERAS[view]
         column, row = PHOTO_CENTRES[view]
-        rows = slice(row - fill.height // 2, row - fill.height // 2 + fill.height)
-        columns = slice(column - fill.width // 2, column - fill.width // 2 + fill.width)
+        upper, left = row - fill.height // 2, column - fill.width // 2
+        window = slice(upper, upper + fill.height), slice(left, left + fill.width)
         rgb[view] = np.full((3, camera.height, camera.width), 255, np.uint8)
-        rgb[view][:, rows, columns] = np.moveaxis(pixels, -1, 0)
+        rgb[view][:, *window] = channels_first(pixels)
         segm[view] = np.full((camera.height, camera.width), BACKGROUND_ID, np.uint8)
-        segm[view][rows, columns][is_object] = 0
+        segm[view][window][is_object] = 0
     return PromptImage(name, "object", rgb, segm, (ObjectRecord(0, PHOTO_OBJECT, PHOTO_TEXTURE),))
 
 
 def _prepare(body: Drawable) -> _Prepared:
-    return index_mesh(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id)
+    if not 0 <= body.id <= LARGEST_ID:
+        raise ShapeError(f"object id {body.id} does not fit a segmentation image; use 0 to {LARGEST_ID}.")
+    return index_mesh(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), body.id
 
 
 def _draw_body(body: _Prepared, canvas: _Canvas) -> None:
@@ -268,12 +270,6 @@ def _texture_array(texture: np.ndarray | Rgb) -> np.ndarray:
     array = np.ascontiguousarray(texture).view()
     array.setflags(write=False)
     return array
-
-
-def _checked_id(object_id: int) -> int:
-    if not 0 <= object_id <= LARGEST_ID:
-        raise ShapeError(f"object id {object_id} does not fit a segmentation image; use 0 to {LARGEST_ID}.")
-    return object_id
 
 
 def front_above_top(images: Mapping[View, Image]) -> np.ndarray:

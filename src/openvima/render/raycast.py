@@ -76,11 +76,8 @@ def _nearest(triangles: np.ndarray, start: np.ndarray, ray: np.ndarray) -> float
 
     Möller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997; both sides count.
     """
-    first, edge1, edge2 = (
-        triangles[:, 0],
-        triangles[:, 1] - triangles[:, 0],
-        triangles[:, 2] - triangles[:, 0],
-    )
+    first = triangles[:, 0]
+    edge1, edge2 = triangles[:, 1] - first, triangles[:, 2] - first
     across = np.cross(ray, edge2)
     det = (edge1 * across).sum(axis=1)
     crossed = np.abs(det) > _SMALLEST

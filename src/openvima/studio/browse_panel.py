@@ -43,38 +43,33 @@ class BrowsePanel:
                 self._path = gui.add_text("folder", str(session.config.path or ""), hint=hint)
             form.on_submit(session.callback(self.open))
             self._title = gui.add_markdown("Open the folder of an evaluation or of demonstrations.")
-            self._results_folder = gui.add_folder("Evaluation", visible=False)
-            self._data_folder = gui.add_folder("Demonstrations", visible=False)
-        with self._results_folder:
-            self._add_results_fields(gui)
-        with self._data_folder:
-            self._add_data_fields(gui)
-
-    def _add_results_fields(self, gui: viser.GuiApi) -> None:
-        self._policy = gui.add_dropdown("policy", [_NONE])
-        self._ablation = gui.add_dropdown("ablation", [_NONE])
-        self._matrix = gui.add_folder("Success in % by task and level")
-        self._failures = gui.add_checkbox("failures only", True)
-        self._outcome = gui.add_dropdown("episode", [_NONE])
-        self._source = gui.add_text("weights", "", hint="run folder; empty: found by the hash of its weights")
-        self.session.add_buttons("play again", {"live": self._replay})
-        self._reason = gui.add_markdown("")
-        self.session.on_update(self._show_matrix, self._policy, self._ablation)
-        self.session.on_update(self._show_cell, self._failures)
-        self.session.on_update(self._replay, self._outcome)
-
-    def _add_data_fields(self, gui: viser.GuiApi) -> None:
-        choices = {"task": (), "level": LEVELS, "object": OBJECTS, "texture": TEXTURES}
-        self._choices = {name: gui.add_dropdown(name, [_ALL, *known]) for name, known in choices.items()}
-        self._steps = gui.add_multi_slider("steps", 0, _MOST_STEPS, 1, (0, _MOST_STEPS))
-        self._count = gui.add_markdown("")
-        self._number = gui.add_slider("demonstration", 0, 1, 1, 0)
-        self._step = gui.add_slider("after step", 0, 1, 1, 0)
-        self._caption = gui.add_markdown("")
-        self._views = gui.add_image(_NOTHING, label="front, top")
-        self.session.on_update(self._find, *self._choices.values(), self._steps)
-        self.session.on_update(self._load, self._number)
-        self.session.on_update(self._scrub, self._step)
+            with gui.add_folder("Evaluation", visible=False) as self._results_folder:
+                self._policy = gui.add_dropdown("policy", [_NONE])
+                self._ablation = gui.add_dropdown("ablation", [_NONE])
+                self._matrix = gui.add_folder("Success in % by task and level")
+                self._failures = gui.add_checkbox("failures only", True)
+                self._outcome = gui.add_dropdown("episode", [_NONE])
+                hint = "run folder; empty: found by the hash of its weights"
+                self._source = gui.add_text("weights", "", hint=hint)
+                session.add_buttons("play again", {"live": self._replay})
+                self._reason = gui.add_markdown("")
+            with gui.add_folder("Demonstrations", visible=False) as self._data_folder:
+                choices = {"task": (), "level": LEVELS, "object": OBJECTS, "texture": TEXTURES}
+                self._choices = {
+                    name: gui.add_dropdown(name, [_ALL, *known]) for name, known in choices.items()
+                }
+                self._steps = gui.add_multi_slider("steps", 0, _MOST_STEPS, 1, (0, _MOST_STEPS))
+                self._count = gui.add_markdown("")
+                self._number = gui.add_slider("demonstration", 0, 1, 1, 0)
+                self._step = gui.add_slider("after step", 0, 1, 1, 0)
+                self._caption = gui.add_markdown("")
+                self._views = gui.add_image(_NOTHING, label="front, top")
+        session.on_update(self._show_matrix, self._policy, self._ablation)
+        session.on_update(self._show_cell, self._failures)
+        session.on_update(self._replay, self._outcome)
+        session.on_update(self._find, *self._choices.values(), self._steps)
+        session.on_update(self._load, self._number)
+        session.on_update(self._scrub, self._step)
 
     def open(self) -> None:
         """Open what the path names.
@@ -84,25 +79,24 @@ class BrowsePanel:
         """
         folder = as_path(self._path.value)
         if (folder / FILE_NAME).is_file() or folder.suffix == ".json":
-            self._results, self._dataset = (folder, Results.read(folder)), None
+            results = Results.read(folder)
+            self._results, self._dataset = (folder, results), None
+            self._title.content = f"`{folder}`: {sum(row.episodes for row in results.rows):,} episodes"
+            self._policy.options = results.policy_names()
+            self._ablation.options = list(dict.fromkeys(row.ablation or _NONE for row in results.rows))
+            self._show_matrix()
         elif (folder / MANIFEST_NAME).is_file():
-            self._results, self._dataset = None, Dataset(folder)
+            dataset = Dataset(folder)
+            self._results, self._dataset = None, dataset
+            self._title.content = f"`{folder}`: {len(dataset):,} demonstrations"
+            self._choices["task"].options = [_ALL, *dataset.manifest["tasks"]]
+            self._find()
         else:
             raise DatasetError(
                 f"{folder} holds neither {FILE_NAME} nor {MANIFEST_NAME}; give another folder."
             )
         self._results_folder.visible = self._results is not None
         self._data_folder.visible = self._dataset is not None
-        if self._results is not None:
-            results = self._results[1]
-            self._title.content = f"`{folder}`: {sum(row.episodes for row in results.rows):,} episodes"
-            self._policy.options = results.policy_names()
-            self._ablation.options = list(dict.fromkeys(row.ablation or _NONE for row in results.rows))
-            self._show_matrix()
-        if self._dataset is not None:
-            self._title.content = f"`{folder}`: {len(self._dataset):,} demonstrations"
-            self._choices["task"].options = [_ALL, *self._dataset.manifest["tasks"]]
-            self._find()
 
     def _show_matrix(self) -> None:
         """Show a row of buttons for each task, one for each level."""

@@ -75,12 +75,19 @@ class Table:
         assets: Asset pack.
         root: Name of the node that all others are below.
         offset_y_m: How far to the left of the robot's usual place all is shown.
+        on_drag: Called with id and event whenever an object is dragged; None: none can be.
     """
 
     def __init__(
-        self, scene: viser.SceneApi, assets: Assets, *, root: str = "/first", offset_y_m: float = 0.0
+        self,
+        scene: viser.SceneApi,
+        assets: Assets,
+        *,
+        root: str = "/first",
+        offset_y_m: float = 0.0,
+        on_drag: Callable[[int, viser.SceneNodeDragEvent], None] | None = None,
     ) -> None:
-        self.scene_api, self.assets, self.root = scene, assets, root
+        self.scene_api, self.assets, self.root, self._on_drag = scene, assets, root, on_drag
         self.objects: dict[int, viser.GlbHandle] = {}
         self.shown: VideoFrame | None = None
         self._shapes: dict[int, Shape] = {}
@@ -142,7 +149,9 @@ class Table:
         for object_id, placement in placements.items():
             if object_id not in self.objects:
                 self._shapes[object_id] = self._shape(placement)
-                self.objects[object_id] = self.add_object(f"objects/{object_id}", placement)
+                node = self.objects[object_id] = self.add_object(f"objects/{object_id}", placement)
+                if self._on_drag is not None:
+                    node.on_drag()(partial(self._on_drag, object_id))
             move(self.objects[object_id], placement.pose)
 
     def add_object(self, name: str, placement: Placement) -> viser.GlbHandle:
@@ -167,34 +176,6 @@ class Table:
                 self.scene_api.add_glb(name, coloured_glb(mesh, rgb), cast_shadow=False, receive_shadow=False)
             self._arm = (end_effector, nodes)
         return self._arm[1]
-
-
-def animate(tables: Mapping[Table, Sequence[VideoFrame]], *, speed: float, stops: Callable[[], bool]) -> None:
-    """Show the frames of steps by table, 30 a second times `speed`; the last at once if `stops` says so."""
-    start = time.perf_counter()
-    for number in range(max(map(len, tables.values()), default=0)):
-        wait = start + number / (FRAMES_PER_SECOND * speed) - time.perf_counter()
-        if stops():
-            break
-        if wait < -1 / FRAMES_PER_SECOND and number % 2:
-            continue  # late: half of the frames suffice
-        time.sleep(max(0.0, wait))
-        for table, frames in tables.items():
-            if number < len(frames):
-                table.show(frames[number])
-    for table, frames in tables.items():
-        if frames:
-            table.show(frames[-1])
-
-
-def hit_of(
-    event: viser.SceneClickEvent | viser.SceneNodeDragEvent, placements: Iterable[Placement], assets: Assets
-) -> Hit | None:
-    """Return what a click, or the end of a drag so far, points at; None: nothing."""
-    if isinstance(event, viser.SceneClickEvent):
-        return first_hit(placements, event.ray_origin, event.ray_direction, assets)
-    origin = event.client.camera.position
-    return first_hit(placements, origin.tolist(), np.subtract(event.end_position, origin).tolist(), assets)
 
 
 def move(node: viser.SceneNodeHandle, pose: Pose) -> None:
@@ -235,13 +216,14 @@ class BrowserSession:
     """What one browser sees and does; its work runs in a thread of its own, in order.
 
     Panels read `current`, the episode in view, and change it by `open`, `step` and `back`, inside of
-    `submit`. Functions given to `on_change` are called, in that thread, whenever it has changed.
+    `submit`. The functions in `on_change` are called, in that thread, whenever it has changed, those in
+    `on_drag` with id and event whenever an object on the table is dragged.
     """
 
     def __init__(self, client: viser.ClientHandle, config: StudioConfig) -> None:
         self.client, self.gui, self.config, self.env_config = client, client.gui, config, config.env_config
         self.assets = load_assets(self.env_config.assets)
-        self.table = Table(client.scene, self.assets)
+        self.table = Table(client.scene, self.assets, on_drag=self._dragged)
         self.current: EpisodeSession | None = None
         self.compared: EpisodeSession | None = None  # the same episode by another policy, in lockstep
         self.policy: RolloutPolicy | None = None  # the chosen one
@@ -253,9 +235,8 @@ class BrowserSession:
         self._other_policy: RolloutPolicy | None = None
         self._other_table: Table | None = None
         self._compat = config.env_config.compat
-        self._changed: list[Callable[[], None]] = []
-        self._drags: list[Callable[[int, viser.SceneNodeDragEvent], None]] = []
-        self._bound: dict[int, viser.GlbHandle] = {}  # objects that can be dragged
+        self.on_change: list[Callable[[], None]] = []
+        self.on_drag: list[Callable[[int, viser.SceneNodeDragEvent], None]] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"browser-{client.client_id}")
         client.camera.position, client.camera.look_at = VIEW
         self.gui.main_panel.dock_right()
@@ -265,14 +246,6 @@ class BrowserSession:
         with window.add_tab("Prompt", viser.Icon.MESSAGE):
             self._prompt = self.gui.add_image(np.full((1, 1, 3), 255, np.uint8))
         window.float(x=12, y=-12, width=_PROMPT_WIDTH)  # messages are shown above
-
-    def on_change(self, function: Callable[[], None]) -> None:
-        """Call a function whenever the current episode or its state has changed."""
-        self._changed.append(function)
-
-    def on_drag(self, function: Callable[[int, viser.SceneNodeDragEvent], None]) -> None:
-        """Call a function with id and event whenever an object on the table is dragged."""
-        self._drags.append(function)
 
     def submit(self, work: Callable[[], object]) -> "Future[None]":
         """Do work in this browser's thread; what it raises is shown, and the page lives on."""
@@ -377,9 +350,26 @@ class BrowserSession:
                 frames[table] = step.frames
             elif error := run.propose().error:
                 self.warn(str(error))
-        animate(frames, speed=self.speed, stops=self.is_paused)
+        self._animate(frames)
         self.changed()
         return bool(frames)
+
+    def _animate(self, tables: Mapping[Table, Sequence[VideoFrame]]) -> None:
+        """Show the frames of a step by table, 30 a second times the speed; the last at once if paused."""
+        start = time.perf_counter()
+        for number in range(max(map(len, tables.values()), default=0)):
+            wait = start + number / (FRAMES_PER_SECOND * self.speed) - time.perf_counter()
+            if self.is_paused():
+                break
+            if wait < -1 / FRAMES_PER_SECOND and number % 2:
+                continue  # late: half of the frames suffice
+            time.sleep(max(0.0, wait))
+            for table, frames in tables.items():
+                if number < len(frames):
+                    table.show(frames[number])
+        for table, frames in tables.items():
+            if frames:
+                table.show(frames[-1])
 
     def run(self) -> None:
         """Step until the episode is over, no action is there, or the user pauses."""
@@ -400,25 +390,30 @@ class BrowserSession:
 
     def changed(self) -> None:
         """Tell the panels that the current episode has changed, and show the prompt."""
-        for object_id, node in self.table.objects.items():
-            if self._bound.get(object_id) is not node:
-                self._bound[object_id] = node
-                node.on_drag()(partial(self._dragged, object_id))
-        for function in self._changed:
+        for function in self.on_change:
             self._reported(function)
         if self.current is not None:
             self.show_prompt(self.current.prompt)
 
     def _dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
-        for function in self._drags:
+        for function in self.on_drag:
             function(object_id, event)
 
     def show_prompt(self, prompt: RenderedPrompt) -> None:
         """Show a prompt in its window."""
-        weights = self.prompt_weights if self.current is not None else ()
         self._prompt.image = draw_prompt_strip(  # twice as large as shown, to be sharp
-            prompt, width=2 * _PROMPT_WIDTH, image_height=128, font_size=38, weights=weights
+            prompt, width=2 * _PROMPT_WIDTH, image_height=128, font_size=38, weights=self.prompt_weights
         )
+
+    def hit(
+        self, event: viser.SceneClickEvent | viser.SceneNodeDragEvent, placements: Iterable[Placement]
+    ) -> Hit | None:
+        """Return what a click, or the end of a drag so far, points at; None: nothing."""
+        if isinstance(event, viser.SceneClickEvent):
+            return first_hit(placements, event.ray_origin, event.ray_direction, self.assets)
+        origin = event.client.camera.position
+        ray = np.subtract(event.end_position, origin).tolist()
+        return first_hit(placements, origin.tolist(), ray, self.assets)
 
     def warn(self, message: str) -> None:
         """Show a message over the page."""

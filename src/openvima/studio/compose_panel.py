@@ -14,7 +14,7 @@ from openvima.env.episode_file import load_episode, save_episode
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
-from openvima.studio.browser_session import BrowserSession, hit_of, move
+from openvima.studio.browser_session import BrowserSession, move
 from openvima.studio.composition import Composition, shelf
 
 _FIRST = Composition((), "Put the {a} into the {b}.", goals=(("in", "a", "b"),))
@@ -35,48 +35,41 @@ class ComposePanel:
             actions = {"edit this episode": self._take_over, "new scene": self._begin, "play": self._play}
             session.add_buttons("", actions)
             self._edits = gui.add_checkbox("clicks select objects", True, hint="else they act, as in You")
-            session.on_update(self._follow, self._edits)
             with gui.add_folder("Object"):
-                self._add_object_fields(gui)
+                self._object = gui.add_dropdown("shape", [*OBJECTS], initial_value="heart")
+                self._texture = gui.add_dropdown("texture", [*TEXTURES], initial_value="red swirl")
+                changes = {"add": self._drop, "replace": self._replace, "remove": self._remove}
+                session.add_buttons("", changes)
+                self._selected = gui.add_dropdown("selected", [_NONE])
+                self._pose = gui.add_vector3("x, y (m), turn (°)", (0.5, 0.0, 0.0), step=0.005)
+                self._scale = gui.add_slider("size", 0.5, 2.0, 0.05, 1.0)
             with gui.add_form("Sentence") as sentence:
-                self._add_sentence_fields(gui)
-            sentence.on_submit(session.callback(self._rewrite))
+                self._prompt = gui.add_text("prompt", "", hint="{a} shows object a; Enter applies")
+                self._goals = gui.add_text(
+                    "goals", "", hint="[in, a, b], [at, a, [0.5, 0.1]], [rotated, a, 60]"
+                )
+                self._tool = gui.add_dropdown("tool", END_EFFECTORS)
+                self._steps = gui.add_number("steps", 10, min=1, max=1000, step=1)
+                gui.add_button("apply").on_click(session.callback(self._rewrite))
             with gui.add_folder("Image for a {placeholder}", expand_by_default=False):
-                self._add_image_fields(gui)
+                self._slot = gui.add_text("placeholder", "c", hint="a name for the image, without braces")
+                shape = lambda: self._insert((self._object.value, self._texture.value))  # noqa: E731
+                scene = lambda: self._insert(self._present().scene_image())  # noqa: E731
+                session.add_buttons("shows", {"shape above": shape, "scene as it is": scene})
+                upload = gui.add_upload_button("PNG file …", mime_type="image/png")
             with gui.add_folder("File", expand_by_default=False):
                 self._path = gui.add_text("file", "scene.yaml")
                 session.add_buttons("", {"save": self._save, "load": self._load})
+        session.on_update(self._follow, self._edits)
+        session.on_update(self._show_shelf, self._texture)
+        session.on_update(self._show_selected, self._selected)
+        session.on_update(lambda: self._move(self._pose.value), self._pose)
+        session.on_update(lambda: self._change_selected(scale=self._scale.value), self._scale)
+        sentence.on_submit(session.callback(self._rewrite))
+        upload.on_upload(session.callback(lambda: self._insert(photo_from_bytes(upload.value.content))))
         session.client.scene.on_click()(self._clicked)
-        session.on_drag(self._object_dragged)
-        session.on_change(self._follow)
-
-    def _add_object_fields(self, gui: viser.GuiApi) -> None:
-        self._object = gui.add_dropdown("shape", [*OBJECTS], initial_value="heart")
-        self._texture = gui.add_dropdown("texture", [*TEXTURES], initial_value="red swirl")
-        changes = {"add": self._drop, "replace": self._replace, "remove": self._remove}
-        self.session.add_buttons("", changes)
-        self._selected = gui.add_dropdown("selected", [_NONE])
-        self._pose = gui.add_vector3("x, y (m), turn (°)", (0.5, 0.0, 0.0), step=0.005)
-        self._scale = gui.add_slider("size", 0.5, 2.0, 0.05, 1.0)
-        self.session.on_update(self._show_shelf, self._texture)
-        self.session.on_update(self._show_selected, self._selected)
-        self.session.on_update(lambda: self._move(self._pose.value), self._pose)
-        self.session.on_update(lambda: self._change_selected(scale=self._scale.value), self._scale)
-
-    def _add_sentence_fields(self, gui: viser.GuiApi) -> None:
-        self._prompt = gui.add_text("prompt", "", hint="{a} shows object a; Enter applies")
-        self._goals = gui.add_text("goals", "", hint="[in, a, b], [at, a, [0.5, 0.1]], [rotated, a, 60]")
-        self._tool = gui.add_dropdown("tool", END_EFFECTORS)
-        self._steps = gui.add_number("steps", 10, min=1, max=1000, step=1)
-        gui.add_button("apply").on_click(self.session.callback(self._rewrite))
-
-    def _add_image_fields(self, gui: viser.GuiApi) -> None:
-        self._slot = gui.add_text("placeholder", "c", hint="a name for the image, without braces")
-        shape = lambda: self._insert((self._object.value, self._texture.value))  # noqa: E731
-        scene = lambda: self._insert(self._present().scene_image())  # noqa: E731
-        self.session.add_buttons("shows", {"shape above": shape, "scene as it is": scene})
-        upload = gui.add_upload_button("PNG file …", mime_type="image/png")
-        upload.on_upload(self.session.callback(lambda: self._insert(photo_from_bytes(upload.value.content))))
+        session.on_drag.append(self._object_dragged)
+        session.on_change.append(self._follow)
 
     def _use(self, new: Composition, selected: str | None = None) -> None:
         """Put a composition in place of the present one; if it is impossible, nothing changes but a message.
@@ -167,7 +160,7 @@ class ComposePanel:
     def _select(self, event: viser.SceneClickEvent) -> None:
         names = self._names()
         if self.session.current is not None:
-            hit = hit_of(event, self.session.current.scene.placements, self.session.assets)
+            hit = self.session.hit(event, self.session.current.scene.placements)
             self._show(names.get(hit.object_id, _NONE) if hit else _NONE)
 
     def _names(self) -> dict[int, str]:
@@ -198,7 +191,7 @@ class ComposePanel:
 
     def _taken(self, placement: Placement, event: viser.SceneNodeDragEvent) -> None:
         """Move an object out of the shelf, and add it where it is let go."""
-        hit = hit_of(event, (), self.session.assets)
+        hit = self.session.hit(event, ())
         if hit is None or event.phase == "start":
             return
         x, y, _ = hit.point
@@ -209,7 +202,7 @@ class ComposePanel:
 
     def _object_dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
         """Move an object of the scene by dragging it."""
-        hit = hit_of(event, (), self.session.assets)
+        hit = self.session.hit(event, ())
         if not self.session.editing or hit is None:
             return
         name = self._names()[object_id]

@@ -11,12 +11,7 @@ import yaml
 
 from openvima.catalog import OBJECTS, object_spec
 from openvima.catalog.geometry import Assets
-from openvima.env.composing import (
-    SCALES,
-    SceneObject,
-    compose,
-    default_names,
-)
+from openvima.env.composing import SCALES, SceneObject, compose, default_names
 from openvima.errors import SceneError
 from openvima.scene import (
     AtPose,
@@ -27,6 +22,7 @@ from openvima.scene import (
     Placement,
     Pose,
     PromptFill,
+    Scene,
 )
 
 _DECIMALS = 6  # of positions and angles that `compose` was given, which come back exactly
@@ -57,9 +53,8 @@ def _object(placement: Placement, name: str = "") -> SceneObject:
     return SceneObject(placement.object, placement.texture, position, yaw_deg, name, scale, placement.fixed)
 
 
-def _goal(goal: object, episode: Episode, handles: Mapping[int, str], number: int) -> tuple[Any, ...]:
+def _goal(goal: object, scene: Scene, handles: Mapping[int, str], number: int) -> tuple[Any, ...]:
     """A goal by name."""
-    scene = episode.problem.scene
     object_id, relative_to = getattr(goal, "object_id", None), getattr(goal, "relative_to", None)
     if object_id is None or object_id not in handles or not hasattr(goal, "relative_to"):
         raise SceneError(f"goal {number} is a {type(goal).__name__}, which has no composed form.")
@@ -142,7 +137,7 @@ class Composition:
             tuple(_object(p, handles[p.id]) for p in placements),
             problem.prompt.text,
             images,
-            tuple(_goal(goal, episode, handles, number) for number, goal in enumerate(problem.goals)),
+            tuple(_goal(goal, problem.scene, handles, number) for number, goal in enumerate(problem.goals)),
             episode.max_steps,
             problem.scene.end_effector,
             episode.level,
@@ -282,7 +277,7 @@ def shelf(texture: str, assets: Assets) -> list[Placement]:
     for number, (name, spec) in enumerate(OBJECTS.items()):
         row, column = divmod(number, _SHELF_COLUMNS)
         y = _SHELF_STEP_M * (column - (_SHELF_COLUMNS - 1) / 2)
-        corners = assets.geometry(name, spec.size_max, (1.0, 1.0, 1.0)).visual.vertices.reshape(-1, 3)
+        corners = assets.geometry(name, spec.size_max).visual.vertices.reshape(-1, 3)
         factor = _SHELF_OBJECT_M / float(np.ptp(corners[:, :2], axis=0).max())
         scale = (factor, factor, factor)
         height_m = assets.geometry(name, spec.size_max, scale).rest_z_m

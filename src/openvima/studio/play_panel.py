@@ -18,7 +18,7 @@ from openvima.render.raycast import TABLE, Hit
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, Pose
 from openvima.scene.action import pose_after
 from openvima.scene.explanation import Explanation
-from openvima.studio.browser_session import YOU, BrowserSession, Table, clicked_action, hit_of
+from openvima.studio.browser_session import YOU, BrowserSession, Table, clicked_action
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.sampling import MAX_SEED
 from openvima.video.explanation import (
@@ -28,9 +28,8 @@ from openvima.video.explanation import (
     attention_rows,
     draw_panel,
     heat_opacity,
-    percent,
 )
-from openvima.video.prompt_strip import Colour
+from openvima.video.prompt_strip import Colour, percent
 
 _FIRST_TASK = "rearrange"
 _OTHER = "other …"
@@ -43,35 +42,28 @@ class PlayPanel:
         self.session = session
         gui = session.gui
         with session.tabs.add_tab("Play", viser.Icon.ROBOT):
-            self._add_choices(gui)
+            self._task = gui.add_dropdown("task", list_tasks(), initial_value=_FIRST_TASK)
+            self._level = gui.add_dropdown("level", LEVELS, initial_value="train")
+            self._seed = gui.add_number("seed", 0, min=0, max=2**53, step=1)
+            packs = dict.fromkeys((session.config.env_config.assets, *ASSET_PACKS))
+            self._assets = gui.add_dropdown("assets", [*packs])
+            names = (*BUNDLED, "oracle", "random", YOU, *session.config.policies, _OTHER)
+            self._name = gui.add_dropdown("policy", names, initial_value=SMALL)
+            hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
+            self._source = gui.add_text("source", "", hint=hint, visible=False)
             self._outcome = gui.add_markdown("")
-            self._add_controls(gui)
+            works = {"step": session.step, "play": session.run, "pause": session.pause}
+            session.add_buttons("", {**works, "next seed": self._next_seed})
+            self._time = gui.add_slider("after step", 0, 1, 1, 0)
+            self._speed = gui.add_slider("speed", 0.25, 8.0, 0.25, 1.0)
             self._views = gui.add_image(np.zeros((1, 1, 3), np.uint8), label="what the policy sees")
-        session.on_change(self._show)
-        session.submit(self._open)
-
-    def _add_choices(self, gui: viser.GuiApi) -> None:
-        self._task = gui.add_dropdown("task", list_tasks(), initial_value=_FIRST_TASK)
-        self._level = gui.add_dropdown("level", LEVELS, initial_value="train")
-        self._seed = gui.add_number("seed", 0, min=0, max=2**53, step=1)
-        packs = dict.fromkeys((self.session.config.env_config.assets, *ASSET_PACKS))
-        self._assets = gui.add_dropdown("assets", [*packs])
-        names = (*BUNDLED, "oracle", "random", YOU, *self.session.config.policies, _OTHER)
-        self._name = gui.add_dropdown("policy", names, initial_value=SMALL)
-        hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
-        self._source = gui.add_text("source", "", hint=hint, visible=False)
-        self.session.on_update(self._open, self._task, self._level, self._seed, self._assets)
-        self.session.on_update(self._choose_policy, self._name, self._source)
-
-    def _add_controls(self, gui: viser.GuiApi) -> None:
-        session = self.session
-        works = {"step": session.step, "play": session.run, "pause": session.pause}
-        session.add_buttons("", {**works, "next seed": self._next_seed})
         session.next_seed = self._next_seed
-        self._time = gui.add_slider("after step", 0, 1, 1, 0)
-        self._speed = gui.add_slider("speed", 0.25, 8.0, 0.25, 1.0)
+        session.on_update(self._open, self._task, self._level, self._seed, self._assets)
+        session.on_update(self._choose_policy, self._name, self._source)
         session.on_update(lambda: session.back(self._time.value), self._time)
         self._speed.on_update(lambda _: setattr(session, "speed", self._speed.value))
+        session.on_change.append(self._show)
+        session.submit(self._open)
 
     def _choose_policy(self) -> None:
         self._source.visible = self._name.value == _OTHER
@@ -138,8 +130,8 @@ class UserPanel:
         back = gui.add_command(f"turn by -{_TURN_DEG}°", hotkey="T", modifier="shift")
         back.on_trigger(lambda _: self._turn_by(-_TURN_DEG))
         session.client.scene.on_click()(self._clicked)
-        session.on_drag(self._dragged)
-        session.on_change(self._show)
+        session.on_drag.append(self._dragged)
+        session.on_change.append(self._show)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if not self.session.editing:
@@ -160,7 +152,7 @@ class UserPanel:
         if current is None or current.outcome is not None:
             return
         others = [p for p in current.scene.placements if p.id != first.object_id]
-        if (hit := hit_of(event, others, self.session.assets)) is not None:
+        if (hit := self.session.hit(event, others)) is not None:
             self._act(first, hit)
 
     def _click(self, event: viser.SceneClickEvent) -> None:
@@ -168,7 +160,7 @@ class UserPanel:
         current = self.session.current
         if current is None or current.outcome is not None:
             return
-        hit = hit_of(event, current.scene.placements, self.session.assets)
+        hit = self.session.hit(event, current.scene.placements)
         if hit is None:
             return
         if self._first is not None:
@@ -272,7 +264,7 @@ class WhyPanel:
             self._images = [gui.add_image(blank, visible=False) for _ in range(2)]
         session.on_update(session.changed, self._shown)
         session.on_update(self._choose_other, self._other)
-        session.on_change(self._show)
+        session.on_change.append(self._show)
 
     def _choose_other(self) -> None:
         name = self._other.value

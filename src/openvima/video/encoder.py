@@ -9,9 +9,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from io import BytesIO
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -107,13 +105,11 @@ class VideoWriter:
     def __enter__(self) -> "VideoWriter":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is not None:
+    def __exit__(self, *exception: Any) -> None:  # kind, error and trace, as of any context manager
+        if exception[0] is not None:
             with contextlib.suppress(OSError):  # a container without frames cannot be finished
                 self._container.close()
-            self._closing.__exit__(kind, error, trace)
+            self._closing.__exit__(*exception)
             return
         with self._closing:
             self._container.mux(self._stream.encode(None))
@@ -196,10 +192,9 @@ def save_clips(clips: Sequence[Clip], folder: Path) -> Path:
     records = []
     for clip in clips:
         atomic_write_file(folder / clip.file_name, clip.video)
-        record = asdict(clip)
+        prompt = [part if isinstance(part, str) else {"png": _text(part)} for part in clip.prompt]
+        record = asdict(clip) | {"prompt": prompt, "poster": _text(clip.poster)}
         del record["video"]
-        record["prompt"] = [part if isinstance(part, str) else {"png": _text(part)} for part in clip.prompt]
-        record["poster"] = _text(clip.poster)
         records.append(record)
     return atomic_write_file(folder / _INDEX, json.dumps(records, indent=1, ensure_ascii=False) + "\n")
 
@@ -223,7 +218,7 @@ def load_clips(folder: Path) -> tuple[Clip, ...]:
 
 def png(image: Image.Image) -> bytes:
     """Encode an image as a PNG file."""
-    stream = BytesIO()
+    stream = io.BytesIO()
     image.save(stream, "PNG", optimize=True)
     return stream.getvalue()
 

@@ -16,7 +16,7 @@ from openvima.render import TOP, channels_last, project, unproject
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
 from openvima.scene.explanation import Explanation, ObjectProbability, PlaceProbability
-from openvima.video.prompt_strip import INK, MUTED, PAPER, Colour, font
+from openvima.video.prompt_strip import INK, MUTED, PAPER, Colour, font, percent
 
 ENLARGE = 2
 WIDTH, HEIGHT = TOP.width * ENLARGE, TOP.height * ENLARGE + 160  # pixels of a panel
@@ -112,11 +112,8 @@ def _draw_words(draw: ImageDraw.ImageDraw, explanation: Explanation) -> None:
 
 def attention_rows(explanation: Explanation) -> list[tuple[Colour, np.ndarray]]:
     """Return attention to the prompt as rows of colour and weights, for `draw_prompt_strip`."""
-    rows = [(COLOURS.get(kind, INK), weights) for kind, weights in explanation.attention.items()]
-    if explanation.bins:
-        return rows
-    # policies that point attend to objects and their names, never to the end
-    return [(colour, weights[:-1]) for colour, weights in rows]
+    end = None if explanation.bins else -1  # policies that point never attend to the end of the prompt
+    return [(COLOURS.get(kind, INK), weights[:end]) for kind, weights in explanation.attention.items()]
 
 
 def heat_opacity(probabilities: np.ndarray) -> np.ndarray:
@@ -148,7 +145,7 @@ def _box_mask(each: ObjectProbability, shape: tuple[int, ...]) -> np.ndarray:
 def _tint_heat_maps(panel: np.ndarray, explanation: Explanation) -> None:
     """Colour the table by the probabilities of both positions."""
     rows, columns = np.indices((TOP.height * ENLARGE, WIDTH))
-    points = unproject(np.stack([columns, rows], -1) / ENLARGE, TOP)[..., :2]
+    points = unproject(np.stack([columns, rows], -1) / ENLARGE, TOP)
     low, high = np.array(WORKSPACE_LOW), np.array(WORKSPACE_HIGH)
     is_inside = ((low <= points) & (points < high)).all(axis=-1)
     shares = (points[is_inside] - low) / (high - low)
@@ -223,11 +220,6 @@ def _label(
         stroke_width=3,
         stroke_fill=PAPER,
     )
-
-
-def percent(probability: float) -> str:
-    """Return a probability in percent, as a label."""
-    return f"{100 * probability:.0f} %"
 
 
 def _name_of(place: PlaceProbability, objects: Sequence[ObjectProbability], names: dict[int, str]) -> str:

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -22,8 +22,7 @@ _CLOSING = ".,;:!?)"  # no space before these
 _ROW_HEIGHT = 18  # pixels of a row of attention
 
 
-@dataclass(frozen=True, slots=True)
-class _Piece:
+class _Piece(NamedTuple):
     """A word or a thumbnail, with its size and the space before it, in pixels."""
 
     content: str | Image.Image
@@ -89,7 +88,7 @@ def draw_prompt_strip(
     if any(len(row) > len(pieces) for _, row in weights):
         pieces.append(_piece("(end)", image_height, typeface, font_size))
     lines = _wrap(pieces, width - 2 * margin)
-    heights = [max(piece.height for piece in line) for line in lines]
+    heights = [max((piece.height for piece in line), default=1) for line in lines]
     attended = _ROW_HEIGHT * len(weights) + (4 if weights else 0)
     total = sum(heights) + margin * (len(lines) + 1) + attended * len(lines)
     strip = Image.new("RGB", (width, total + total % 2), PAPER)
@@ -121,11 +120,16 @@ def _draw_weight(
     shade = math.sqrt(min(max(weight, 0.0), 1.0))  # small weights stay visible
     fill = tuple(round(255 + (part - 255) * shade) for part in colour)
     draw.rectangle((left, top, left + width - 1, top + _ROW_HEIGHT - 3), fill=fill)
-    text, typeface = f"{100 * weight:.0f} %", font(12, bold=True)
+    text, typeface = percent(weight), font(12, bold=True)
     if weight >= 0.01 and typeface.getlength(text) <= width:
         ink = PAPER if shade > 0.6 else INK
         middle = (left + width / 2, top + _ROW_HEIGHT / 2 - 1)
         draw.text(middle, text, font=typeface, fill=ink, anchor="mm")
+
+
+def percent(probability: float) -> str:
+    """Return a probability in percent, as a label."""
+    return f"{100 * probability:.0f} %"
 
 
 @cache
@@ -163,7 +167,7 @@ def _wrap(pieces: list[_Piece], width: int) -> list[list[_Piece]]:
             used, needed = 0, piece.width
         lines[-1].append(piece)
         used += needed
-    return [line for line in lines if line] or [[_Piece("", 0, 1, 0)]]
+    return lines
 
 
 def cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:

@@ -131,7 +131,7 @@ class EpisodeRecorder:
         self._video = VideoWriter(
             self._path, first.shape[1], first.shape[0], frames_per_second=FRAMES_PER_SECOND
         )
-        self._video.write(first, repeat=math.ceil(_STILL_START_S * FRAMES_PER_SECOND))
+        self._write(first, _STILL_START_S)
 
     def _write(self, frame: np.ndarray, seconds: float = 0.0) -> None:
         assert self._video is not None  # it was started
