@@ -14,8 +14,8 @@ import pytest
 from rich.table import Table
 
 from openvima import __version__
+from openvima.cli import terminal
 from openvima.cli.main import VERBS, main
-from openvima.cli.terminal import plain_lines, print_table
 from openvima.cli.train import COMMON
 from openvima.data import Dataset, Shard
 from openvima.errors import ConfigError, DatasetError
@@ -144,7 +144,7 @@ def test_a_table_that_is_too_wide_becomes_a_paragraph_for_each_row(
         table.add_column(policy, no_wrap=True)
     table.add_row("L1", "rotate", "100.0 (51–100)", "0.0 (0–49)")
     monkeypatch.setenv("COLUMNS", "30")
-    print_table(table, num_heads=2)
+    terminal.print_table(table, num_heads=2)
     assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
         "rates",
         "L1 rotate",
@@ -152,7 +152,7 @@ def test_a_table_that_is_too_wide_becomes_a_paragraph_for_each_row(
         "  second: 0.0 (0–49)",
     ]
     monkeypatch.setenv("COLUMNS", "60")
-    print_table(table, num_heads=2)
+    terminal.print_table(table, num_heads=2)
     assert "│ L1    │ rotate │ 100.0 (51–100) │" in capsys.readouterr().out
 
 
@@ -183,10 +183,11 @@ def test_parts_of_a_job_array_tell_whether_the_data_set_is_finished(
 
 
 def test_without_a_terminal_progress_is_a_line_each_minute_and_at_the_end(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 0.0
-    report = plain_lines("training", clock=lambda: now)
+    monkeypatch.setattr(terminal, "time", SimpleNamespace(monotonic=lambda: now))
+    report = terminal.plain_lines("training")
     for step in range(401):
         now = float(step)
         stage = "pretraining" if step < 150 else "cloning"

@@ -387,9 +387,9 @@ def test_an_edited_detector_plays_its_batches_again_and_no_others(tmp_path, monk
     config = replace(CONFIG, boxes=f"{file}:make", out=tmp_path / "out", episodes=1)
     play_batch = runner.play_batch
 
-    def noting(job, count):
-        played.append(job.batch.ablation)
-        return play_batch(job, count)
+    def noting(batch, count):
+        played.append(batch.ablation)
+        return play_batch(batch, count)
 
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt

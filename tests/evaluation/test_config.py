@@ -160,6 +160,7 @@ def test_the_hash_of_a_run_changes_with_its_weights_only(tmp_path):
 
 def test_stored_batches_of_other_weights_or_seeds_have_other_names():
     first, second = plan(EvaluationConfig(("random",), ("rotate",), ("L1",), episodes=2, batch=1))
-    assert len({first.key("a"), first.key("b"), second.key("a")}) == 3
-    assert replace(first, ablation="no_prompt").key("a") != first.key("a")
-    assert replace(first, source="elsewhere").key("a") == first.key("a")
+    batches = (first, replace(first, fingerprint="b"), second)
+    assert len({batch.key for batch in batches}) == 3
+    assert replace(first, source="elsewhere", may_fail=True).key == first.key
+    assert replace(first, ablation="no_prompt").key != first.key

@@ -11,7 +11,9 @@ from openvima.evaluation.rollout import (
     WRONG_PICKED,
     play,
 )
-from openvima.scene import RenderedPrompt
+from openvima.scene import Action, RenderedPrompt
+
+GO = Action.planar((0.5, 0.0), (0.5, 0.1))
 
 
 class Env:
@@ -57,9 +59,9 @@ class Env:
 
 
 class RolloutPolicy:
-    """Gives numbered actions and notes whom it was asked for."""
+    """Gives the same action and notes whom it was asked for."""
 
-    def __init__(self, decision="go"):
+    def __init__(self, decision=GO):
         self.decision = decision
         self.asked = []
 
@@ -131,7 +133,7 @@ def test_whoever_watches_sees_every_step_but_no_action_that_was_refused():
     class BadAtLast(RolloutPolicy):
         def decide(self, observations):
             super().decide(observations)
-            return ["go" if len(self.asked) < 3 else "bad"]
+            return [GO if len(self.asked) < 3 else "bad"]
 
     env, seen = Env({}, {}, {}), []
     (outcome,) = play([env], [0], BadAtLast(), after_step=lambda env: seen.append(env.steps))

@@ -42,12 +42,12 @@ def test_jobs_that_share_a_folder_play_their_own_batches_and_give_the_same_bytes
 ):
     played, play_batch = [], runner.play_batch
     monkeypatch.setattr(
-        runner, "play_batch", lambda job, count: played.append(job.batch) or play_batch(job, count)
+        runner, "play_batch", lambda batch, count: played.append(batch) or play_batch(batch, count)
     )
     config = replace(ORACLE, out=tmp_path)
     assert len(plan(config)) == 4
     assert not runner.evaluate_range(config, (2, 9))
-    assert sorted(map(str, played)) == sorted(map(str, plan(config)[2:]))
+    assert sorted(batch.episode for batch in played) == sorted(batch.episode for batch in plan(config)[2:])
     assert not (tmp_path / "results.json").exists()
     with (
         holding(tmp_path, 1, 2),
@@ -69,11 +69,11 @@ def test_jobs_that_share_a_folder_play_their_own_batches_and_give_the_same_bytes
 def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, monkeypatch):
     played = []
 
-    def play_two(job, count):
+    def play_two(batch, count):
         if len(played) == 2:
             raise KeyboardInterrupt
-        played.append(job.batch)
-        return play_batch(job, count)
+        played.append(batch)
+        return play_batch(batch, count)
 
     play_batch = runner.play_batch
     config = replace(ORACLE, out=tmp_path)
@@ -83,7 +83,7 @@ def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, mon
     assert not (tmp_path / "results.json").exists()
     rest = []
     monkeypatch.setattr(
-        runner, "play_batch", lambda job, count: rest.append(job.batch) or play_batch(job, count)
+        runner, "play_batch", lambda batch, count: rest.append(batch) or play_batch(batch, count)
     )
     assert evaluate(config).read_bytes() == first.read_bytes()
     assert len(rest) == 2
@@ -121,7 +121,7 @@ def test_damaged_parts_are_played_again(first, tmp_path):
 
 
 def test_finished_results_are_kept_and_others_not_overwritten(first, monkeypatch):
-    monkeypatch.setattr(runner, "play_batch", lambda job, count: pytest.fail("nothing should be played"))
+    monkeypatch.setattr(runner, "play_batch", lambda batch, count: pytest.fail("nothing should be played"))
     config = replace(ORACLE, out=first.parent)
     before = first.read_bytes()
     assert evaluate(config) == first

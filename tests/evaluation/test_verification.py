@@ -10,8 +10,8 @@ import pytest
 from openvima.env import EnvConfig
 from openvima.errors import DatasetError, OpenVimaError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
-from openvima.evaluation.actions import ACTIONS_NAME, ActionRecorder, ActionReplay
-from openvima.evaluation.rollout import BAD_ACTION, play
+from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay
+from openvima.evaluation.rollout import BAD_ACTION, play, roll_out
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.verification import VERIFICATION_NAME, is_marked_verified, verify_results
 from openvima.scene import Action
@@ -173,11 +173,11 @@ class OnceRight:
 
 
 def test_an_episode_that_an_invalid_action_ends_is_replayed_up_to_it():
-    recorder = ActionRecorder(PromptedRolloutPolicy(OnceRight()))
-    (outcome,) = play([EnvConfig().make("rotate", "L1", domain="eval")], [3], recorder)
-    assert (outcome.kind, outcome.steps, len(recorder.steps[0])) == (BAD_ACTION, 1, 1)
     env = EnvConfig().make("rotate", "L1", domain="eval")
-    (again,) = play([env], [3], ActionReplay([np.array(steps, np.float32) for steps in recorder.steps]))
+    (played,) = roll_out([env], [3], PromptedRolloutPolicy(OnceRight()))
+    outcome, actions = played.outcome, np.array(played.actions, np.float32)
+    assert (outcome.kind, outcome.steps, actions.shape) == (BAD_ACTION, 1, (1, 12))
+    (again,) = play([env], [3], ActionReplay([actions]))
     assert (again.success, again.steps) == (False, 1)
 
 

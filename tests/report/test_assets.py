@@ -17,8 +17,8 @@ from small_data_sets import contents
 
 def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(results):
     config = EvaluationConfig(("mine=runs/a", "oracle", "random"))
-    jobs = report_videos.recording_jobs(config, VideoSelection(2), results)
-    recorded = [(job.batch.policy, job.batch.task, job.batch.level, job.batch.first_seed) for job in jobs]
+    batches = report_videos.recordings(config, VideoSelection(2), results)
+    recorded = [(batch.policy, batch.task, batch.level, batch.first_seed) for batch in batches]
     assert sorted(recorded) == [
         *(("mine", "rotate", "L1", seed) for seed in (0, 1, 9)),
         *(("mine", "rotate", "L3", seed) for seed in (0, 1, 3, 4)),
@@ -26,15 +26,15 @@ def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(resul
         *(("oracle", "rotate", "L1", seed) for seed in (0, 1)),
         *(("oracle", "stack<b>", "L1", seed) for seed in (0, 1)),
     ]
-    assert {job.batch.source for job in jobs} == {"runs/a", "oracle"}
-    assert all(job.batch.episodes == 1 for job in jobs)
+    assert {batch.source for batch in batches} == {"runs/a", "oracle"}
+    assert all(batch.episodes == 1 for batch in batches)
 
 
 def test_failures_are_recorded_first_and_within_a_budget(results, monkeypatch):
     monkeypatch.setattr(report_videos, "MOST_VIDEOS", 4)
     config = EvaluationConfig(("mine=runs/a", "oracle"))
-    jobs = report_videos.recording_jobs(config, VideoSelection(), results)
-    assert [job.episode for job in jobs] == [
+    batches = report_videos.recordings(config, VideoSelection(), results)
+    assert [batch.episode for batch in batches] == [
         *(("mine", *cell) for cell in (("rotate", "L1", 9), ("rotate", "L3", 3), ("stack<b>", "L1", 6))),
         ("mine", "rotate", "L1", 0),
     ]
@@ -54,16 +54,16 @@ def test_the_table_is_printed_before_any_video(tmp_path, monkeypatch, capsys):
 
 
 def test_without_trained_policies_all_are_recorded_and_none_unless_requested(results):
-    assert report_videos.recording_jobs(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
-    jobs = report_videos.recording_jobs(EvaluationConfig(("random",)), VideoSelection(), results)
-    assert {job.batch.policy for job in jobs} == {"random"}
+    assert report_videos.recordings(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
+    batches = report_videos.recordings(EvaluationConfig(("random",)), VideoSelection(), results)
+    assert {batch.policy for batch in batches} == {"random"}
 
 
 def test_requested_episodes_are_recorded_of_every_policy(results):
     settings = {"tasks": ("rotate",), "levels": ("L1", "L3"), "episodes": 10}
     config = EvaluationConfig(("mine=runs/a", "oracle"), **settings)
     videos = VideoSelection(0, ("rotate/4", "rotate/L3/5"))
-    assert [job.episode for job in report_videos.recording_jobs(config, videos, results)] == [
+    assert [batch.episode for batch in report_videos.recordings(config, videos, results)] == [
         *(("mine", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
         *(("oracle", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
     ]

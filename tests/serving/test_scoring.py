@@ -140,6 +140,6 @@ def test_an_episode_in_which_a_served_policy_raises_has_failed(error: Exception,
 
 def test_one_connection_serves_all_that_a_process_plays() -> None:
     with serve_in_thread(Telltale()) as url:  # which lets in one client at a time
-        batch = Batch("p", url, "rotate", "L1", first_seed=0, episodes=1)
         for fingerprint in ("for the scores", "for the films"):
-            assert isinstance(load_rollout_policy(batch, fingerprint), PromptedRolloutPolicy)
+            batch = Batch("p", url, "rotate", "L1", first_seed=0, episodes=1, fingerprint=fingerprint)
+            assert isinstance(load_rollout_policy(batch), PromptedRolloutPolicy)

@@ -58,13 +58,10 @@ def import_(
     return 1 if problems else 0
 
 
-def info() -> int:
+def info() -> None:
     """Show which asset packs there are, and what the cache holds.
 
     Example: openvima assets info
-
-    Returns:
-        Exit status.
     """
     from openvima.catalog import OBJECTS, TEXTURES
     from openvima.catalog.objects import REGISTERED_OBJECTS
@@ -87,7 +84,6 @@ def info() -> int:
     size_mb = sum(file.stat().st_size for file in cache_dir().rglob("*") if file.is_file()) / 1e6
     print(f"cache       {size_mb:.0f} MB in {cache_dir()}; all but the import is made anew when needed")
     _list_problems(problems or [])
-    return 0
 
 
 def _list_problems(problems: list[str]) -> None:

@@ -27,7 +27,7 @@ def main(
     view: ChatView = "top",
     vlm: VlmOptions = DEFAULT_OPTIONS,
     environment: Environment = DEFAULT_ENVIRONMENT,
-) -> int:
+) -> None:
     """Record one episode: the prompt above, the table and the arm below.
 
     Example: openvima demo rotate --seed 3 --out rotate.mp4
@@ -54,9 +54,6 @@ def main(
         view: Camera that it sees, and in whose picture it points; top+front shows both.
         vlm: How it is asked.
         environment: Tasks, prompts and control.
-
-    Returns:
-        Exit status; it does not tell whether the task was solved.
     """
     from openvima.errors import ConfigError
     from openvima.tasks import task_spec
@@ -78,15 +75,12 @@ def main(
     from openvima.env import EnvConfig, load_episode
     from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_own_rollout_policy
-    from openvima.evaluation.sources import PolicySource
-    from openvima.policies.naming import ORACLE
+    from openvima.policies.naming import ORACLE, PolicyRef
     from openvima.scene import HOST_TASK
     from openvima.serving.chat import VlmConfig
     from openvima.tasks.oracle import require_goals
     from openvima.tasks.sampling import check_task_options
 
-    source = PolicySource(policy, policy, trust_code)
-    source.check()  # before a scene is built
     env_config = EnvConfig(**asdict(environment))
     load_assets(env_config.assets)  # may register objects of the task that is sampled next
     start: int | Episode = seed
@@ -101,7 +95,7 @@ def main(
         check_task_options((task,), env_config.task_options)
         env = env_config.make(task, level, domain="user", realtime=True)
         what, title = f"{task}, seed {seed}", f"{task} · {level} · seed {seed}"
-    explain = explain or source.kind == "vlm"
+    explain = explain or PolicyRef.parse(policy).kind == "vlm"
     title = f"{title} · {Path(policy).name}"
     acts = load_own_rollout_policy(
         policy, boxes=boxes or "", trust_code=trust_code, device=device, vlm=VlmConfig(base_url, view, vlm)
@@ -112,4 +106,3 @@ def main(
         ended = outcome.reason
     steps = f"{outcome.steps} step{'s' * (outcome.steps != 1)}"
     print(f"{out}: {what}, by {policy}: {ended}; {steps}")
-    return 0

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from openvima.cli.options import Json, Out
-from openvima.cli.terminal import Report, progress_bar
+from openvima.cli.terminal import Report, progress_bar, refuse_existing
+from openvima.errors import ConfigError
+from openvima.policies.base import require_torch, torch_threads
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
 if TYPE_CHECKING:
@@ -26,13 +28,10 @@ LEVEL = "L3"  # with objects and textures that are not in the training set
 FRAMES_PER_EPISODE = 2  # one time step in both views
 
 
-def train(config: Training) -> int:
+def train(config: Training) -> None:
     """Train a detector on the segmentation of demonstrations, or go on with a run that was interrupted.
 
     Example: openvima detector train --data demos --out detector --runtime.threads 2
-
-    Returns:
-        Exit status.
     """
     from openvima.training.detector import train_detector
 
@@ -41,7 +40,6 @@ def train(config: Training) -> int:
     hint = f"`openvima detector evaluate {shlex.quote(str(folder))}` scores it on novel objects."
     print(hint, file=sys.stderr)
     print(folder)
-    return 0
 
 
 def evaluate(
@@ -54,7 +52,7 @@ def evaluate(
     seed: int = 0,
     device: str = "cpu",
     as_json: Json = False,
-) -> int:
+) -> None:
     """Evaluate a detector with class-agnostic COCO metrics.
 
     Example: openvima detector evaluate detector --level L3
@@ -69,14 +67,10 @@ def evaluate(
         seed: Seed of the image sampling; also the first seed of generated episodes.
         device: cpu or cuda.
         as_json: Print JSON instead of a table.
-
-    Returns:
-        Exit status.
     """
     from openvima.detector import load_detector
     from openvima.detector.evaluation import evaluate_detector, require_pycocotools
     from openvima.detector.frames import held_out_frames
-    from openvima.policies.base import torch_threads
 
     require_pycocotools()  # fail early
     loaded = load_detector(detector, device=device)
@@ -93,7 +87,6 @@ def evaluate(
         print(json.dumps({"detector": name, **source, "seed": seed, **asdict(result)}))
     else:
         _print_result(result)
-    return 0
 
 
 def show(
@@ -104,7 +97,7 @@ def show(
     level: str | None = None,
     frames: int = 12,
     seed: int = 0,
-) -> int:
+) -> None:
     """Draw detections: masks, boxes and scores; ground-truth boxes are dashed.
 
     Example: openvima detector show detector --out detections.png
@@ -116,15 +109,10 @@ def show(
         level: train, L1 to L8, instead of --data; by default L3, with novel objects and textures.
         frames: Number of images, rounded up to pairs of views.
         seed: Seed of the image sampling; also the first seed of generated episodes.
-
-    Returns:
-        Exit status.
     """
     from openvima.detector import load_detector
     from openvima.detector.evaluation import draw_detections, save_grid
     from openvima.detector.frames import held_out_frames
-    from openvima.errors import ConfigError
-    from openvima.policies.base import torch_threads
 
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out is {str(out)!r}; give the name of a PNG file, ending in .png.")
@@ -136,7 +124,6 @@ def show(
         ]
     save_grid(images, out)
     print(out)
-    return 0
 
 
 def convert(
@@ -144,7 +131,7 @@ def convert(
     out: Out,
     *,
     force: bool = False,
-) -> int:
+) -> None:
     """Convert a Detectron2 checkpoint of Mask R-CNN with ResNet-50; nothing in the file is executed.
 
     Example: openvima detector convert mask_rcnn.pth published-detector
@@ -153,21 +140,13 @@ def convert(
         source: The .pth file.
         out: Folder to write to.
         force: Replace an existing checkpoint.
-
-    Returns:
-        Exit status.
     """
-    from openvima.errors import ConfigError
-    from openvima.policies.base import require_torch
-
-    if out.exists() and not force:
-        raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
+    refuse_existing(out, force=force)
     require_torch("reading a detector")
     from openvima.detector.checkpoint import load_detectron2, save_network
 
     save_network(load_detectron2(source), out)
     print(out)
-    return 0
 
 
 @contextmanager
@@ -181,7 +160,6 @@ def _frames(
     """Frames of a folder, or of temporary demonstrations."""
     from openvima.data import Dataset
     from openvima.detector.frames import FrameSampler
-    from openvima.errors import ConfigError
 
     problems = []
     if frames < 1:

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -21,8 +20,7 @@ from openvima.cli.terminal import (
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 if TYPE_CHECKING:
-    from openvima.evaluation import EvaluationConfig, Results
-    from openvima.report import VideoSelection
+    from openvima.evaluation import Results
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +139,7 @@ def main(
     jobs: tyro.conf.OmitArgPrefixes[JobOptions] = JobOptions(),
     chat: tyro.conf.OmitArgPrefixes[ChatOptions] = ChatOptions(),
     vlm: VlmOptions = DEFAULT_OPTIONS,
-) -> int:
+) -> None:
     """Score policies on tasks and levels, and write results.json and report.html.
 
     The numbers depend on neither the number of workers nor the machine's load. An interrupted evaluation
@@ -174,9 +172,6 @@ def main(
         jobs: Clusters and job arrays.
         chat: Servers of vision-language models.
         vlm: How these models are asked.
-
-    Returns:
-        Exit status.
     """
     from openvima.env import EnvConfig
     from openvima.errors import ConfigError, LimitReachedError
@@ -186,7 +181,7 @@ def main(
     from openvima.evaluation.results import FILE_NAME
     from openvima.evaluation.runner import evaluate_range, finished_part
     from openvima.multiprocess import num_cpus
-    from openvima.report import VideoSelection
+    from openvima.report.videos import VideoSelection, check_report, report_on
     from openvima.serving.chat import VlmConfig
 
     config = EvaluationConfig(
@@ -212,7 +207,7 @@ def main(
         page, estimate = write_preview(config)
         print(f"About {estimate}.")
         print(page)
-        return 0
+        return
     if workers is None and jobs.engine == "processes" and network.device == "cpu":
         config = replace(config, workers=max(1, min(num_cpus(), len(plan(config)) // 2)))
     print_left_out(config.tasks, environment.prompts, config.levels)
@@ -223,21 +218,24 @@ def main(
         for number, shard in enumerate(plan(config)):
             names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)
             print(number, *names, shard.first_seed, shard.episodes, sep="\t")
-        return 0
+        return
     if (shards := parse_shard_range(jobs.shard_range)) is not None:
         with progress_bar("evaluation") as bar:
             is_last = evaluate_range(config, shards, bar)
         if not is_last:
             what = "is finished" if (out / FILE_NAME).exists() else "lacks batches of other ranges"
             print(f"{out} {what}.", file=sys.stderr)
-            return 0
+            return
+    if recording.report:
+        check_report(config, selection)
     try:
-        if recording.report:
-            path = _evaluate_and_report(config, selection, as_json=as_json)
-        else:
+        with config.served() as served:
             with progress_bar("evaluation") as bar:
-                path = evaluate(config, bar)
+                path = evaluate(served, bar)
             _print_scores(Results.read(path), path, as_json=as_json)
+            if recording.report:
+                with progress_bar("evaluation") as bar:
+                    report_on(served, selection, bar, policies=config.policies)
     except LimitReachedError:
         if (finished := finished_part(config)) is not None:
             print_results(finished)
@@ -246,24 +244,6 @@ def main(
         f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if recording.report else ""),
         file=sys.stderr,
     )
-    return 0
-
-
-def _evaluate_and_report(config: "EvaluationConfig", videos: "VideoSelection", *, as_json: bool) -> Path:
-    """Evaluate, print the scores, then record videos; evaluation and videos have a bar each."""
-    from openvima.evaluation.results import FILE_NAME
-    from openvima.report import evaluate_and_report
-
-    with ExitStack() as bars:
-        bar = bars.enter_context(progress_bar("evaluation"))
-
-        def on_results(results: "Results") -> None:
-            nonlocal bar
-            bars.close()
-            _print_scores(results, config.out / FILE_NAME, as_json=as_json)
-            bar = bars.enter_context(progress_bar("evaluation"))
-
-        return evaluate_and_report(config, videos, lambda *now: bar(*now), on_results)
 
 
 def _print_scores(results: "Results", path: Path, *, as_json: bool) -> None:

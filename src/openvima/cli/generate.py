@@ -27,7 +27,7 @@ def main(
     images: bool = True,
     force: bool = False,
     environment: Environment = DEFAULT_ENVIRONMENT,
-) -> int:
+) -> None:
     """Write demonstrations with the oracle, or those that a folder still lacks.
 
     The same settings give the same bytes, whoever does the work; repeating a command that was interrupted
@@ -53,9 +53,6 @@ def main(
         images: Store images; without, they are drawn anew on reading.
         force: Delete the data set that is in the folder.
         environment: Tasks, prompts and control.
-
-    Returns:
-        Exit status.
     """
     from openvima.data import GenerateConfig, generate, plan
     from openvima.data.manifest import is_finished
@@ -81,7 +78,7 @@ def main(
     if list_shards:
         for number, block in enumerate(plan(config)):
             print(f"{number}\t{block.path.name}\t{block.episodes}")
-        return 0
+        return
     with progress_bar("demonstrations") as report:
         folder = generate(config, report)
     if is_finished(folder):
@@ -89,4 +86,3 @@ def main(
     else:
         print(f"{folder} is not finished yet: shards of other ranges are missing.", file=sys.stderr)
     print(folder)
-    return 0

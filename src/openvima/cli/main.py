@@ -21,7 +21,7 @@ from openvima.errors import (
 from openvima.imports import lacks_memory
 from openvima.input_files import expand_home
 
-# Verb → summary. Each verb is a module of this package.
+# Verb → summary. Each verb is a module of this package; its functions return an exit status, or None for 0.
 VERBS = {
     "quickstart": "generate, train, evaluate and report in ten minutes",
     "tasks": "list the tasks: prompt, tool, levels, steps",
@@ -90,7 +90,7 @@ def _run(verb: str, rest: list[str]) -> int:
     try:
         rest = [expand_home(word) for word in rest]
         module = importlib.import_module(f"openvima.cli.{verb.replace('-', '_')}")
-        commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
+        commands: dict[str, Callable[..., int | None]] | None = getattr(module, "COMMANDS", None)
         if commands is not None:
             names_none = not rest or (rest[0].startswith("-") and rest[0] not in _HELP)
             if names_none and hasattr(module, "DEFAULT"):
@@ -103,7 +103,7 @@ def _run(verb: str, rest: list[str]) -> int:
         else:
             status = tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
         sys.stdout.flush()  # while a full disk can still be reported
-        return status
+        return status or 0
     except KeyboardInterrupt as error:
         status = 143 if isinstance(error, Terminated) else 130  # 128 and the signal, as shells say it
         return _fail(_INTERRUPTED.get(verb, "interrupted."), status)
@@ -144,11 +144,9 @@ def _warnings_in_one_line() -> Iterator[None]:
         else:
             shown(message, category, *place)
 
-    warnings.showwarning = show
-    try:
+    with warnings.catch_warnings():
+        warnings.showwarning = show
         yield
-    finally:
-        warnings.showwarning = shown
 
 
 def _fail(message: str, status: int) -> int:

@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from openvima.cli.options import Out, Policy, Repository
-from openvima.cli.terminal import print_files, print_table
+from openvima.cli.terminal import print_files, print_table, refuse_existing
+from openvima.errors import UnknownPolicyError
+from openvima.policies.base import require_torch
+from openvima.policies.naming import (
+    BUNDLED,
+    MODEL_CARD,
+    WEIGHTS_FILE,
+    PolicyRef,
+    find_checkpoint,
+    unknown_policy,
+)
+from openvima.policies.presets import PRESETS, own_policies, preset
 
 if TYPE_CHECKING:
     from openvima.policies.build import Count, PolicyConfig
@@ -21,18 +32,11 @@ _NOTES = (
 DEFAULT = "list"  # what `openvima policies` does without a further word
 
 
-def list_() -> int:
+def list_() -> None:
     """List the presets with parameter counts by part, the bundled checkpoints, and learners of your own.
 
     Example: openvima policies
-
-    Returns:
-        Exit status.
     """
-    from openvima.policies.base import require_torch
-    from openvima.policies.naming import BUNDLED
-    from openvima.policies.presets import PRESETS, own_policies, preset
-
     require_torch("counting parameters")
     from openvima.policies.build import count_parameters, outline_network
     from openvima.policies.checkpoint import read_info
@@ -44,10 +48,9 @@ def list_() -> int:
         _print_facts(folder)
     for name, source in own_policies().items():
         print(f"\n{name}, a learner of your own, {source}")
-    return 0
 
 
-def show(policy: Policy) -> int:
+def show(policy: Policy) -> None:
     """Show one policy: parameter counts by part, and its config.
 
     Example: openvima policies show vima-200m
@@ -55,13 +58,7 @@ def show(policy: Policy) -> int:
     Args:
         policy: Name of a preset or of a bundled checkpoint, a run folder or checkpoint folder, a published
             file, or OWNER/NAME[@REVISION] on the Hugging Face Hub.
-
-    Returns:
-        Exit status.
     """
-    from openvima.policies.base import require_torch
-    from openvima.policies.naming import BUNDLED
-
     require_torch("counting parameters")
     from openvima.policies.build import config_to_dict, count_parameters, outline_network
 
@@ -76,7 +73,6 @@ def show(policy: Policy) -> int:
     for part, count in counts.items():
         print(f"{part:<10}{count.trainable:>14,}{count.frozen:>14,}{count.total:>14,}")
     print(f"\n{yaml.safe_dump(config_to_dict(config), sort_keys=False)}", end="")
-    return 0
 
 
 def convert(
@@ -86,7 +82,7 @@ def convert(
     tokenizer: str | None = None,
     precision: Precision = "float32",
     force: bool = False,
-) -> int:
+) -> None:
     """Convert a published .ckpt file, or export the best checkpoint of a run, into a checkpoint folder.
 
     No code in a file is executed. With a checkpoint folder as IN, add a tokenizer, or change the precision of
@@ -103,15 +99,8 @@ def convert(
         precision: Of the stored weights. float16 halves the file size of float32, with a relative rounding
             error of 1/2,000; inference still runs in float64 or float32.
         force: Replace an existing checkpoint.
-
-    Returns:
-        Exit status.
     """
-    from openvima.errors import ConfigError
-    from openvima.policies.base import require_torch
-
-    if out.exists() and not force:
-        raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
+    refuse_existing(out, force=force)
     require_torch("reading a policy")
     from openvima.policies.build import count_parameters
     from openvima.policies.checkpoint import load_network, save_checkpoint
@@ -130,7 +119,6 @@ def convert(
             "Stored without a tokenizer: convert again with --tokenizer, or give one whenever it is loaded."
         )
         print(hint, file=sys.stderr)
-    return 0
 
 
 def push_to_hub(
@@ -141,7 +129,7 @@ def push_to_hub(
     licence: str = "mit",
     private: bool = False,
     dry_run: bool = False,
-) -> int:
+) -> None:
     """Push a checkpoint to the Hugging Face Hub, with a generated model card.
 
     The token is that of `hf auth login` or HF_TOKEN. The card says what the run recorded of data and settings
@@ -157,9 +145,6 @@ def push_to_hub(
         licence: Identifier of the licence of the weights.
         private: Make a new repository private.
         dry_run: Print the card and list the files; nothing is sent.
-
-    Returns:
-        Exit status.
     """
     from openvima.publishing.push import policy_files, push_policy
 
@@ -167,17 +152,12 @@ def push_to_hub(
         print_files(policy_files(source, name, results=results, licence=licence))
     else:
         print(push_policy(source, name, results=results, licence=licence, private=private))
-    return 0
 
 
 def _config(policy: str) -> "PolicyConfig":
-    from openvima.policies.presets import PRESETS, preset
-
     if policy in PRESETS:
         return preset(policy)
-    from openvima.errors import UnknownPolicyError
     from openvima.policies.checkpoint import load_network, read_info
-    from openvima.policies.naming import PolicyRef, find_checkpoint, unknown_policy
 
     if not PolicyRef.parse(policy).has_weights:
         raise UnknownPolicyError(unknown_policy(policy, ()))
@@ -195,8 +175,6 @@ def _summary(config: "PolicyConfig", total: "Count") -> str:
 
 
 def _print_facts(bundled: Path) -> None:
-    from openvima.policies.naming import MODEL_CARD, WEIGHTS_FILE
-
     print(f"  weights:     {(bundled / WEIGHTS_FILE).stat().st_size / 1e6:.1f} MB")
     print(f"  model card:  {bundled / MODEL_CARD}")
 

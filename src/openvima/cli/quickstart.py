@@ -19,7 +19,7 @@ def main(
     episodes: int = 30,
     seed: int = 0,
     workers: int | None = None,
-) -> int:
+) -> None:
     """Write demonstrations, train a small pointer network on them, score it, and leave a report.
 
     openvima-small, which comes trained with the package, is scored beside it. Takes at most ten minutes on
@@ -33,9 +33,6 @@ def main(
         episodes: Evaluation episodes for each policy, task and level.
         seed: Seed of the training and number of the first episode.
         workers: Processes for demonstrations and evaluation; by default one for each CPU, at most 8.
-
-    Returns:
-        Exit status.
     """
     from openvima.cli.evaluate import print_results
     from openvima.cli.train import parse, train_in_processes
@@ -74,4 +71,3 @@ def main(
         path = evaluate_and_report(evaluated, progress=report)
     print_results(Results.read(path))
     print(f"Report: {out / 'report.html'}")
-    return 0

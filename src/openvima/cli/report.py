@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +20,7 @@ def main(
     runs: tuple[Path, ...] = (),
     published: bool = True,
     as_json: Json = False,
-) -> int:
+) -> None:
     """Write the report of one or several evaluations, as one HTML file that needs nothing else.
 
     Videos are those that the evaluations made. Policies of the same name that differ get that of their folder
@@ -38,11 +37,9 @@ def main(
         runs: Folders of training runs, or their metrics.jsonl, whose learning curves to show.
         published: Whether to show published numbers of the same tasks beside those measured.
         as_json: Print the comparisons as JSON.
-
-    Returns:
-        Exit status.
     """
     from openvima.atomic_io import atomic_write_file
+    from openvima.errors import ConfigError
     from openvima.evaluation.comparison import compare_pairs, default_pairs, merge
     from openvima.evaluation.results import Results
     from openvima.evaluation.verification import is_marked_verified
@@ -55,24 +52,38 @@ def main(
     from openvima.report.videos import REPORT_NAME, require_extra
     from openvima.video.encoder import load_clips
 
-    _check(results, out)
-    evaluations = {path: Results.read(path) for path in dict.fromkeys(results)}
-    labels = run_labels([_folder(path) for path in evaluations])
-    merged = merge(dict(zip(labels, evaluations.values(), strict=True)))
-    pairs = _pairs(compare) if compare is not None else default_pairs(merged.results)
+    if not results:
+        raise ConfigError("give at least one folder of an evaluation, or a results.json.")
+    paths = list(dict.fromkeys(results))
+    folders = [path if path.is_dir() else path.parent for path in paths]
+    is_single = len(paths) == 1
+    # Several have no place in common, and each may have a report of its own.
+    page = out or (folders[0] if is_single else Path()) / REPORT_NAME
+    writers = {".html": None, ".md": markdown, ".tex": latex}
+    if page.suffix.lower() not in writers:
+        raise ConfigError(
+            f"--out is {str(out)!r}; give the name of an HTML file, such as report.html, or one that ends in "
+            ".md or .tex for tables."
+        )
+    # A single evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
+    labels = ["DIR"] if is_single else run_labels(folders)
+    evaluations = dict(zip(labels, map(Results.read, paths), strict=True))
+    merged = merge(evaluations)
+    if compare is None:
+        pairs = default_pairs(merged.results)
+    else:
+        first, *others = parse_list(compare) or ("",)
+        if not others:
+            raise ConfigError(f"--compare is {compare!r}; give two or more policies with commas in between.")
+        pairs = [(first, other) for other in others]
     comparisons = compare_pairs(merged.results, pairs)
-    confirmations = {
-        # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
-        label if len(labels) > 1 else "DIR": is_marked_verified(path)
-        for label, path in zip(labels, evaluations, strict=True)
-    }
-    write = None if out is None else {".md": markdown, ".tex": latex}.get(out.suffix.lower())
-    if out is not None and write is not None:
+    confirmations = dict(zip(labels, map(is_marked_verified, paths), strict=True))
+    if write := writers[page.suffix.lower()]:
         confirmed = all(confirmations.values())
         tables = paper_tables(merged.results, comparisons, published=published, confirmed=confirmed)
-        atomic_write_file(out, write(tables))
-        print(f"Tables: {out}")
-        return 0
+        atomic_write_file(page, write(tables))
+        print(f"Tables: {page}")
+        return
     if as_json:
         print(json.dumps([comparison.record() for comparison in comparisons], indent=1))
     said = sys.stderr if as_json else sys.stdout  # what is printed for other programs has stdout to itself
@@ -81,18 +92,16 @@ def main(
             for difference in comparison.means:
                 print(finding(comparison, difference), file=said)
     if out is None and as_json:
-        return 0
+        return
     require_extra()
     clips = [
         replace(clip, policy=names.get(clip.policy, clip.policy))  # as in the common report
-        for path, names in zip(evaluations, merged.names.values(), strict=True)
-        for clip in load_clips(_folder(path))
+        for folder, names in zip(folders, merged.names.values(), strict=True)
+        for clip in load_clips(folder)
     ]
-    # Several have no place in common, and each may have a report of its own.
-    beside = Path() if len(evaluations) > 1 else _folder(results[0])
-    path = write_report(
+    write_report(
         merged.results,
-        out or beside / REPORT_NAME,
+        page,
         command="\n".join(default_command(found) for found in evaluations.values()),
         runs=runs,
         clips=clips,
@@ -101,31 +110,4 @@ def main(
         with_published=published,
         confirmations=confirmations,
     )
-    print(f"Report: {path}", file=said)
-    return 0
-
-
-def _check(results: Sequence[Path], out: Path | None) -> None:
-    from openvima.errors import ConfigError
-
-    if not results:
-        raise ConfigError("give at least one folder of an evaluation, or a results.json.")
-    if out is not None and out.suffix.lower() not in (".html", ".md", ".tex"):
-        raise ConfigError(
-            f"--out is {str(out)!r}; give the name of an HTML file, such as report.html, or one that ends in "
-            ".md or .tex for tables."
-        )
-
-
-def _pairs(names: str) -> list[tuple[str, str]]:
-    """Pair the first name with each of the others."""
-    from openvima.errors import ConfigError
-
-    first, *others = parse_list(names) or ("",)
-    if not others:
-        raise ConfigError(f"--compare is {names!r}; give two or more policies with commas in between.")
-    return [(first, other) for other in others]
-
-
-def _folder(path: Path) -> Path:
-    return path if path.is_dir() else path.parent
+    print(f"Report: {page}", file=said)

@@ -22,7 +22,7 @@ def main(
     max_message_mb: int = 128,
     idle_s: float = 600.0,
     trust_code: bool = False,
-) -> int:
+) -> None:
     """Serve a policy until Ctrl-C; `openvima evaluate --policy ws://HOST:PORT` scores it.
 
     Messages are MessagePack with arrays over a WebSocket; docs/serving.md describes them for programs in
@@ -49,9 +49,6 @@ def main(
         max_message_mb: Size of the largest message, in 2**20 bytes; an image of a prompt takes 0.26.
         idle_s: Seconds after which a client is dropped that sends nothing.
         trust_code: Run the code that a run folder names, as that of a learner of your own does.
-
-    Returns:
-        Exit status.
     """
     from openvima.evaluation.results import versions
     from openvima.evaluation.sources import policy_sources
@@ -72,8 +69,8 @@ def main(
         num_threads=threads,
         prompts=prompts,
     )
-    (source,) = policy_sources([f"{name}={policy}" if name else policy], trust_code=trust_code)
-    source.check()
+    (source,) = policy_sources([f"{name}={policy}" if name else policy])
+    source.check(trust_code=trust_code)
     loaded = load_policy(policy, device=device, trust_code=trust_code)
     found = versions(with_torch=source.kind != "random")
     about = {
@@ -84,4 +81,3 @@ def main(
     }
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
     serve(loaded, **asdict(settings), about=about, ready=lambda url: print(url, flush=True))
-    return 0

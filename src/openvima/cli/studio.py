@@ -26,7 +26,7 @@ def main(
     task_options: str = "",
     device: str = "cpu",
     trust_code: bool = False,
-) -> int:
+) -> None:
     """Open the studio until Ctrl-C: step through episodes, ask policies why, compose, act, browse.
 
     Every browser has a session of its own. Nothing leaves this machine.
@@ -48,9 +48,6 @@ def main(
         device: Where networks compute: cpu, in float64, or cuda, in float32.
         trust_code: Run the code that run folders name, as those of learners of your own do, and
             that which results name as their detector.
-
-    Returns:
-        Exit status.
     """
     from openvima.imports import import_extra
 
@@ -75,4 +72,3 @@ def main(
         if open:
             webbrowser.open(studio.url)
         threading.Event().wait()
-    return 0

@@ -30,7 +30,7 @@ def main(
     address: str | None = None,
     device: str | None = None,
     dry_run: bool = False,
-) -> int:
+) -> None:
     """Run an experiment of the papers: generate, train, evaluate, and write report.html and study.json.
 
     The same command resumes an interrupted study, with the same numbers.
@@ -58,9 +58,6 @@ def main(
         device: Where networks are trained and act: cpu or cuda. By default they are trained on a GPU if
             there is one, and act on a CPU.
         dry_run: Print the stages; write nothing.
-
-    Returns:
-        Exit status.
     """
     from openvima.studies import StudyInputs, check_options, make_study, run_study, scale_named
     from openvima.studies.plan import plan_study
@@ -73,13 +70,14 @@ def main(
     study = make_study(name, inputs)
     check_options(name, inputs)
     options = {
-        "episodes": str(episodes or ""),
+        "episodes": episodes,
         "policy": policy,
         "t5": t5,
         "assets": assets if assets != "procedural" else None,
+        "checkpoint": checkpoint,
+        "device": device,
     }
-    options |= {"checkpoint": checkpoint, "device": device}
-    words = [f"--{option} {shlex.quote(value)}" for option, value in options.items() if value]
+    words = [f"--{option} {shlex.quote(str(value))}" for option, value in options.items() if value]
     start = f"openvima study {shlex.quote(name)} --scale {scale} --seeds {seeds}"
     command = " ".join([start, *words, "--out DIR"])
     how = {"device": device, "workers": workers, "engine": engine, "address": address}
@@ -87,12 +85,11 @@ def main(
         found = plan_study(study, inputs, out, seeds=seeds, **how)
         check_plan(found)
         _print_plan(found)
-        return 0
+        return
     with progress_bar("stages") as bar:
         page = run_study(study, inputs, out, seeds=seeds, command=command, report=bar, **how)
     print(f"Report: {page}", file=sys.stderr)
     print(page)
-    return 0
 
 
 def _print_plan(plan: "Plan") -> None:

@@ -16,7 +16,7 @@ def main(
     name: Task = None,
     *,
     level: str | None = None,
-) -> int:
+) -> None:
     """List the tasks: prompt, tool, levels, steps and success rate of the oracle; or describe one.
 
     Example: openvima tasks rotate
@@ -24,15 +24,13 @@ def main(
     Args:
         name: Task to describe, with its options for --task-options.
         level: List the tasks of this level only: train, L1 to L8.
-
-    Returns:
-        Exit status.
     """
     from openvima.tasks import task_spec
     from openvima.tasks.registry import tasks_of
 
     if name is not None:
-        return _describe(task_spec(name))
+        _describe(task_spec(name))
+        return
     specs = [task_spec(name) for name in tasks_of(level)]
     from rich.table import Table
     from rich.text import Text
@@ -53,10 +51,9 @@ def main(
     print("steps: the oracle's limit, and what a policy may add to it")
     print("oracle: success rate in %, over all levels")
     print("`openvima tasks TASK` lists the options of a task")
-    return 0
 
 
-def _describe(spec: "TaskSpec") -> int:
+def _describe(spec: "TaskSpec") -> None:
     """Print one task with its options."""
     from rich.table import Table
 
@@ -72,7 +69,6 @@ def _describe(spec: "TaskSpec") -> int:
         print_table(table)
     if "difficulty" in descriptions:
         print(f"Example: openvima demo {spec.name} --task-options difficulty=hard")
-    return 0
 
 
 def _shown(default: object) -> str:

@@ -9,7 +9,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -36,10 +36,22 @@ def parse_shard_range(text: str | None) -> tuple[int, int] | None:
     Raises:
         ConfigError: It is none, or empty.
     """
-    found = None if text is None else re.fullmatch(r"(\d+):(\d+)", text)
-    if text is not None and (found is None or int(found[1]) >= int(found[2])):
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+):(\d+)", text)
+    if found is None or int(found[1]) >= int(found[2]):
         raise ConfigError(f"shard_range is {text!r}; it must be a:b with 0 ≤ a < b, such as 0:10.")
-    return None if found is None else (int(found[1]), int(found[2]))
+    return int(found[1]), int(found[2])
+
+
+def refuse_existing(out: Path, *, force: bool) -> None:
+    """Refuse to write a checkpoint where something is, unless it may be replaced.
+
+    Raises:
+        ConfigError: There is something.
+    """
+    if out.exists() and not force:
+        raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
 
 
 def accept_any_text() -> None:
@@ -100,12 +112,11 @@ def progress_bar(label: str) -> Iterator[Report]:
         progress.stop()
 
 
-def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> Report:
+def plain_lines(label: str) -> Report:
     """Return a progress callback that prints lines: at the start, once a minute, and at the end.
 
     Args:
         label: What is being done, in a word or two.
-        clock: Returns the time in seconds.
 
     Returns:
         A callback `report(done, total, note)`.
@@ -115,7 +126,7 @@ def plain_lines(label: str, *, clock: Callable[[], float] = time.monotonic) -> R
 
     def report(done: int, total: int, note: str) -> None:
         nonlocal start, shown_s, is_ended
-        now_s, was_ended, is_ended = clock(), is_ended, done == total
+        now_s, was_ended, is_ended = time.monotonic(), is_ended, done == total
         if start is None:
             start = now_s, done
         elif now_s - shown_s < LINE_S and (was_ended or not is_ended):

@@ -5,13 +5,14 @@ import logging
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from openvima.cli.options import parse_config
+import tyro
+
 from openvima.cli.terminal import progress_bar
 from openvima.errors import ConfigError
 
@@ -65,32 +66,26 @@ COMMON = (
 _DECIDING = ("preset", "init_from", "schedule.steps", "schedule.epochs", "model.image_tokens", "model.head")
 
 
-def run(words: Sequence[str]) -> int:
+def run(words: Sequence[str]) -> None:
     """Parse the settings, and train.
 
     Args:
         words: Arguments after the verb.
-
-    Returns:
-        Exit status.
     """
     from openvima.policies.presets import PRESETS
 
     config = parse(words)
     folder = train_in_processes(config, words)
     if os.environ.get("RANK", "0") != "0":
-        return 0
+        return
     trust = "" if config.preset in PRESETS else " --trust-code"
     hint = f"`openvima evaluate --policy {shlex.quote(str(folder))}{trust} --out scores` scores it."
     print(hint, file=sys.stderr)
     print(folder)
-    return 0
 
 
 def parse(words: Sequence[str]) -> "TrainingConfig":
     """Parse the settings; those that are not given are of the recipe and the file that are."""
-    import tyro
-
     from openvima.multiprocess import num_cpus
     from openvima.training import TrainingConfig
     from openvima.training.recipes import default_recipe, override, read_settings, recipe_settings
@@ -119,14 +114,31 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
     default = TrainingConfig.of({"data": Path(), "out": Path(), **settings})
     for name in {"data", "out"} - settings.keys():
         object.__setattr__(default, name, tyro.MISSING)  # required, but a config checks that it is a path
-    return parse_config(
-        TrainingConfig,
-        [*rest, "--help"] if chosen.help_all else rest,
-        default=default,
-        prog="openvima train",
-        description=DESCRIPTION,
-        shown=None if chosen.help_all else COMMON,
+    if chosen.help_all:
+        rest.append("--help")
+    shown = COMMON if {"-h", "--help"} & {*rest} and not chosen.help_all else None
+    # The parser would report in a box of its own what a config refuses, so it gets one without checks.
+    unchecked = _unchecked(default, shown)
+    parsed = tyro.cli(
+        type(unchecked), prog="openvima train", description=DESCRIPTION, args=rest, default=unchecked
     )
+    return TrainingConfig(**{setting.name: getattr(parsed, setting.name) for setting in fields(parsed)})
+
+
+def _unchecked(default: Any, shown: Collection[str] | None, prefix: str = "") -> Any:
+    """Return a config with the same settings, of a class without checks; it hides what is not shown."""
+    kind, hints = type(default), get_type_hints(type(default), include_extras=True)
+    settings = []
+    for name, value in ((setting.name, getattr(default, setting.name)) for setting in fields(default)):
+        hint = hints[name]
+        if shown is not None and is_dataclass(value):
+            value = _unchecked(value, shown, f"{prefix}{name}.")
+            hint = type(value)
+        elif shown is not None and prefix + name not in shown:
+            hint = Annotated[hint, tyro.conf.Suppress]
+        settings.append((name, hint, value))
+    namespace = {"__doc__": kind.__doc__, "__post_init__": lambda self: None}
+    return make_dataclass(kind.__name__, settings, bases=(kind,), frozen=True, namespace=namespace)()
 
 
 def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: str = "training") -> Path:

@@ -10,10 +10,11 @@ the number of workers. They are the same at every rate: what a low rate masks or
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -120,13 +121,14 @@ def shuffled(env: TabletopEnv, seen: AblatedInput, rng: np.random.Generator) -> 
     prompt_id_map = _permutation({record.object_id for image in scenes for record in image.objects}, rng)
 
     def relabelled(image: PromptImage) -> PromptImage:
+        if image.kind != "scene":
+            return image
         records = tuple(
             replace(record, object_id=int(prompt_id_map[record.object_id])) for record in image.objects
         )
         return replace(image, segm=renumbered(image.segm, prompt_id_map), objects=records)
 
-    changed = _with_images(seen, lambda image: relabelled(image) if image.kind == "scene" else image)
-    return replace(changed, id_map=id_map)
+    return replace(_with_images(seen, relabelled), id_map=id_map)
 
 
 def with_shuffled_prompt_objects(seen: AblatedInput, rng: np.random.Generator) -> AblatedInput:
@@ -164,8 +166,7 @@ ORACLE_DEMONSTRATION = "oracle_demonstration"
 Change = Callable[[TabletopEnv, AblatedInput, float, np.random.Generator], AblatedInput]
 
 
-@dataclass(frozen=True, slots=True)
-class Rate:
+class Rate(NamedTuple):
     """The number in an ablation's name.
 
     Args:
@@ -178,30 +179,19 @@ class Rate:
     most: float
     example: float
 
-    def parse(self, text: str) -> float | None:
-        """Return the number, or None where the text is no rate."""
-        try:
-            rate = type(self.example)(text)
-        except ValueError:
-            return None
-        return rate if self.least <= rate <= self.most else None
-
-    def __str__(self) -> str:
-        kind = "an integer" if isinstance(self.example, int) else "a number"
-        return f"{kind} from {self.least} to {self.most}"
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InputAblation:
     """An input ablation. It changes the input, the environment, or (detected boxes) the policy's extractor.
 
     Args:
-        name: Its name, without rate.
+        name: Its name, without the rate.
         description: What the policy gets, in one sentence.
         change: Changes the inputs of an episode.
         environment: Changes the settings of the environment.
         takes: Whether it applies to a task, given the changed settings.
-        rate: The rate it takes; None for none.
+        rates: The rates that it takes; None for none.
+        rate: Its rate; 0 without one.
         exclusive: What only one ablation of several can set: "prompts" (their form), "words" or "boxes".
         changes_scenes: Whether a seed stands for another scene.
     """
@@ -211,30 +201,32 @@ class InputAblation:
     change: Change = lambda env, seen, rate, rng: seen
     environment: Callable[[EnvConfig, float], EnvConfig] = lambda env_config, rate: env_config
     takes: Callable[[str, EnvConfig], bool] = lambda task, env_config: True
-    rate: Rate | None = None
+    rates: Rate | None = None
+    rate: float = 0
     exclusive: str = ""
     changes_scenes: bool = False
 
-
-@dataclass(frozen=True, slots=True)
-class RatedAblation:
-    """An ablation with its rate, which is 0 without one."""
-
-    ablation: InputAblation
-    rate: float = 0
-
     def __str__(self) -> str:
         rate = np.format_float_positional(self.rate, trim="-")
-        return f"{self.ablation.name}:{rate}" if self.ablation.rate else self.ablation.name
+        return f"{self.name}:{rate}" if self.rates else self.name
+
+    @property
+    def form(self) -> str:
+        """How it is written, with an example of a rate."""
+        return str(replace(self, rate=self.rates.example)) if self.rates else self.name
 
 
 def _in_words(rewrite: Callable[[str, float, np.random.Generator], str]) -> Change:
     """Lift a change of text to a change of inputs."""
 
     def change(env: TabletopEnv, seen: AblatedInput, rate: float, rng: np.random.Generator) -> AblatedInput:
-        return replace(seen, prompt=replace(seen.prompt, text=rewrite(seen.prompt.text, rate, rng)))
+        return _with_text(seen, rewrite(seen.prompt.text, rate, rng))
 
     return change
+
+
+def _with_text(seen: AblatedInput, text: str) -> AblatedInput:
+    return replace(seen, prompt=replace(seen.prompt, text=text))
 
 
 _PROBABILITY = Rate(0, 1, 0.2)
@@ -262,7 +254,7 @@ INPUT_ABLATIONS = {
             "So many distractors lie on the table, in scenes of their own.",
             environment=with_num_distractors,
             takes=allows_num_distractors,
-            rate=Rate(0, MAX_DISTRACTORS, 6),
+            rates=Rate(0, MAX_DISTRACTORS, 6),
             changes_scenes=True,
         ),
         InputAblation(
@@ -292,11 +284,8 @@ INPUT_ABLATIONS = {
         InputAblation(
             "held_out_phrasings",
             "The prompt is in other words, in one of twenty phrasings that no training used.",
-            lambda env, seen, rate, rng: replace(
-                seen,
-                prompt=replace(
-                    seen.prompt, text=in_held_out_phrasing(seen.prompt.text, env.episode.task, rng)
-                ),
+            lambda env, seen, rate, rng: _with_text(
+                seen, in_held_out_phrasing(seen.prompt.text, env.episode.task, rng)
             ),
             takes=lambda task, env_config: task in held_out_phrasings(),
             exclusive="words",
@@ -322,13 +311,13 @@ INPUT_ABLATIONS = {
             "swapped_words",
             "The prompt keeps its images; neighbouring words are swapped, each pair with this probability.",
             _in_words(swapped),
-            rate=_PROBABILITY,
+            rates=_PROBABILITY,
         ),
         InputAblation(
             "masked_words",
             "The prompt keeps its images; each word is the unknown token with this probability.",
             _in_words(masked),
-            rate=_PROBABILITY,
+            rates=_PROBABILITY,
         ),
         InputAblation(
             "shuffled_objects",
@@ -349,7 +338,7 @@ INPUT_ABLATIONS = {
             NOISY_BOXES,
             "The borders of all boxes are moved by up to so many pixels.",
             lambda env, seen, rate, rng: jittered(seen, int(rate), rng),
-            rate=Rate(1, 32, 3),
+            rates=Rate(1, 32, 3),
             exclusive="boxes",
         ),
     )
@@ -374,9 +363,9 @@ def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
     """
     seen, episode = AblatedInput(env.prompt), env.episode
     for part in ablation_parts(ablation):
-        purpose = f"control {part.ablation.name}"
+        purpose = f"control {part.name}"
         rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, purpose)
-        seen = part.ablation.change(env, seen, part.rate, rng)
+        seen = part.change(env, seen, part.rate, rng)
     return seen
 
 
@@ -387,7 +376,7 @@ def ablated_environment(ablation: str, env_config: EnvConfig) -> EnvConfig:
         ConfigError: As for `ablation_parts`.
     """
     for part in ablation_parts(ablation):
-        env_config = part.ablation.environment(env_config, part.rate)
+        env_config = part.environment(env_config, part.rate)
     return env_config
 
 
@@ -399,7 +388,7 @@ def applies_to(ablation: str, task: str, env_config: EnvConfig) -> bool:
         task: Name of the task.
         env_config: Settings under the ablation, from `ablated_environment`.
     """
-    return all(part.ablation.takes(task, env_config) for part in ablation_parts(ablation))
+    return all(part.takes(task, env_config) for part in ablation_parts(ablation))
 
 
 def scenes_of(ablation: str) -> str:
@@ -418,7 +407,7 @@ def names_in(text: str) -> list[str]:
 
 
 @lru_cache
-def ablation_parts(text: str) -> tuple[RatedAblation, ...]:
+def ablation_parts(text: str) -> tuple[InputAblation, ...]:
     """Read NAME, NAME:RATE, or several of them joined by "+".
 
     Returns:
@@ -429,29 +418,29 @@ def ablation_parts(text: str) -> tuple[RatedAblation, ...]:
             ablations exclude each other.
     """
     parts = [_rated(word.strip()) for word in text.split("+")] if text else []
-    parts.sort(key=lambda part: [*INPUT_ABLATIONS].index(part.ablation.name))
+    parts.sort(key=lambda part: [*INPUT_ABLATIONS].index(part.name))
     for one, other in combinations(parts, 2):
-        same = one.ablation.exclusive and one.ablation.exclusive == other.ablation.exclusive
-        if same or one.ablation is other.ablation:
+        if one.name == other.name or (one.exclusive and one.exclusive == other.exclusive):
             raise ConfigError(
                 f"ablation {echo(repr(text))}: {one} and {other} exclude each other; give one of them."
             )
     return tuple(parts)
 
 
-def _rated(text: str) -> RatedAblation:
-    name, colon, rate = text.partition(":")
+def _rated(text: str) -> InputAblation:
+    name, colon, number = text.partition(":")
     ablation = INPUT_ABLATIONS.get(name)
     if ablation is None:
-        alone = ", ".join(MORE_ABLATIONS)
-        allowed = f"Allowed: {', '.join(map(_form, INPUT_ABLATIONS.values()))}; and alone {alone}."
+        known = ", ".join(each.form for each in INPUT_ABLATIONS.values())
+        allowed = f"Allowed: {known}; and alone {', '.join(MORE_ABLATIONS)}."
         raise ConfigError(unknown_name("ablation", name, INPUT_ABLATIONS, allowed))
-    number = ablation.rate.parse(rate) if ablation.rate else 0
-    if number is None or (colon and not ablation.rate):
-        kind = f", with {ablation.rate}" if ablation.rate else ""
-        raise ConfigError(f"ablation {echo(repr(text))}: write {_form(ablation)}{kind}.")
-    return RatedAblation(ablation, number)
-
-
-def _form(ablation: InputAblation) -> str:
-    return f"{ablation.name}:{ablation.rate.example}" if ablation.rate else ablation.name
+    rates, kind = ablation.rates, ""
+    if rates is not None:
+        with suppress(ValueError):
+            if rates.least <= (rate := type(rates.example)(number)) <= rates.most:
+                return replace(ablation, rate=rate)
+        kind = "an integer" if isinstance(rates.example, int) else "a number"
+        kind = f", with {kind} from {rates.least} to {rates.most}"
+    elif not colon:
+        return ablation
+    raise ConfigError(f"ablation {echo(repr(text))}: write {ablation.form}{kind}.")

@@ -3,16 +3,17 @@
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
 from openvima.data.shard import DAMAGE_ERRORS
-from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import ActionError, AnswerError, DatasetError, OracleError, one_line
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import DatasetError, OracleError, one_line
 from openvima.evaluation.results import Row
-from openvima.evaluation.rollout_policies import Decision, Observation, RolloutPolicy
+from openvima.evaluation.rollout_policies import Decision, Observation
 from openvima.input_files import read_bytes
 from openvima.scene import ACTION_SHAPES, Action
 from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES, ToolCommand
@@ -28,60 +29,21 @@ _MAX_BYTES = 1 << 28  # five million steps
 Steps = list[list[float]]  # the actions of one episode, 12 float32 numbers each, or 5 of a command
 
 
-class ActionRecorder:
-    """A rollout policy that records the valid actions of another, of the last episode of each environment."""
-
-    def __init__(self, policy: RolloutPolicy) -> None:
-        self._policy, self._control = policy, PRIMITIVES
-        self._of_env: dict[TabletopEnv, Steps] = {}
-        self._running: list[Steps] = []
-
-    @property
-    def steps(self) -> list[Steps]:
-        """The actions of each episode, in the order in which the environments first began one."""
-        return list(self._of_env.values())
-
-    def begin(self, envs: Sequence[TabletopEnv]) -> None:
-        """Start a batch of episodes."""
-        self._control = envs[0].control
-        self._running = [[] for _ in envs]
-        self._of_env.update(zip(envs, self._running, strict=True))
-        self._policy.begin(envs)
-
-    def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
-        """Pass on the decisions, and record those that are actions."""
-        decisions = self._policy.decide(observations)
-        for steps, observation, decision in zip(self._running, observations, decisions, strict=False):
-            if observation is not None and (numbers := _numbers(decision, self._control)):
-                steps.append(numbers)
-        return decisions
-
-    @property
-    def near_ties(self) -> Sequence[bool]:
-        """Those of the policy."""
-        return getattr(self._policy, "near_ties", ())
-
-    @property
-    def modalities(self) -> tuple[str, ...]:
-        """What the policy asks observations to hold."""
-        return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
-
-
 class ActionReplay:
     """A rollout policy that replays recorded actions; where none is left it gives an `OracleError`."""
 
     def __init__(self, actions: Sequence[np.ndarray]) -> None:
         self._actions = actions
-        self._left: list[Iterator[np.ndarray]] = []
+        self._left: list[Iterator[Decision]] = []
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start with the first actions; nothing is read from the environments."""
-        self._left = [iter(steps) for steps in self._actions]
+        self._left = [map(action_arrays, steps) for steps in self._actions]
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Give the next recorded action of each episode that is not over."""
         return [
-            None if observation is None else _next(steps)
+            None if observation is None else next(steps, OracleError("no action is recorded"))
             for steps, observation in zip(self._left, observations, strict=True)
         ]
 
@@ -107,7 +69,7 @@ def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]], *, contro
     return _digest(seeds, numbers)
 
 
-def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.ndarray]], str]:
+def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[list[list[np.ndarray]], str]:
     """Read the actions of an evaluation.
 
     Args:
@@ -115,7 +77,7 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
         rows: The rows of its `results.json`.
 
     Returns:
-        For the index of each row the actions of its episodes, shape (steps, 12 or 5), float32; and the
+        For each row the actions of its episodes, shape (steps, 12 or 5), float32; and the
         SHA-256 of the recorded numbers.
 
     Raises:
@@ -139,25 +101,17 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
     if not np.array_equal(seeds, np.repeat([outcome.seed for outcome in outcomes], counts)):
         raise DatasetError(f"{path} has other steps than results.json counts.")
     episodes = iter(np.split(numbers, np.cumsum(counts)[:-1]))
-    return {i: [next(episodes) for _ in row.outcomes] for i, row in enumerate(rows)}, _digest(seeds, numbers)
+    return [[next(episodes) for _ in row.outcomes] for row in rows], _digest(seeds, numbers)
 
 
-def _numbers(decision: Decision, control: str) -> list[float]:
-    if decision is None or isinstance(decision, OracleError | AnswerError):
-        return []
-    try:
-        if control == END_EFFECTOR:
-            given = decision.to_array() if isinstance(decision, ToolCommand) else decision
-            return ToolCommand.from_array(given).to_array().tolist()
-        action = decision if isinstance(decision, Action) else Action.from_arrays(decision)  # type: ignore[arg-type]
-    except ActionError:
-        return []
-    return np.concatenate(list(action.to_arrays().values())).tolist()
-
-
-def _next(steps: Iterator[np.ndarray]) -> Decision:
-    step = next(steps, None)
-    return OracleError("no action is recorded") if step is None else action_arrays(step)
+def numbers_of(action: Decision, control: str) -> list[float]:
+    """Return the numbers of an action that was executed: 12, or 5 of a command."""
+    given: Any = action
+    if control == END_EFFECTOR:
+        command = given.to_array() if isinstance(given, ToolCommand) else given
+        return ToolCommand.from_array(command).to_array().tolist()
+    primitive = given if isinstance(given, Action) else Action.from_arrays(given)
+    return np.concatenate(list(primitive.to_arrays().values())).tolist()
 
 
 def action_arrays(numbers: Sequence[float] | np.ndarray) -> dict[str, np.ndarray] | np.ndarray:

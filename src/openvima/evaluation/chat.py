@@ -13,6 +13,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from openvima.atomic_io import atomic_write_file
@@ -22,6 +23,7 @@ from openvima.detector.plugins import chat_extractor
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import AnswerError, ConfigError, OracleError
 from openvima.evaluation.config import EvaluationConfig, cells
+from openvima.evaluation.prompt_ablations import settings_of
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.html import render_page
 from openvima.perception.objects import ObjectExtractor
@@ -54,8 +56,8 @@ def shot_turns(
     """
     if not count or _SHOT_LEVEL not in task_spec(env.task).levels:
         return ()
-    settings: dict[str, Any] = {"assets": env.assets, "compat": env.compat, "prompts": env.prompts}
-    shown = TabletopEnv(env.task, level=_SHOT_LEVEL, domain="train", **settings, **env.task_options)
+    changed: dict[str, Any] = {"level": _SHOT_LEVEL, "domain": "train", "prompts": env.prompts}
+    shown = TabletopEnv(env.task, **settings_of(env) | changed)
     turns: list[Turn] = []
     seed = 0
     while count:
@@ -92,16 +94,14 @@ def mistake_in(env: TabletopEnv, action: Action) -> dict[str, Any] | None:
     picked = int(label_raster(scene, env.assets)[row, column])
     if picked not in {object_of(goal) for goal in goals}:
         return {"kind": _OTHER if picked else _NOTHING}
-    moves = [oracle_move(goal, scene) for goal in goals if object_of(goal) == picked]
+    move = next(oracle_move(goal, scene) for goal in goals if object_of(goal) == picked)
     placed = scene.with_poses({picked: pose_after(scene[picked].pose, action)})
-    for move in moves:
-        if not isinstance(move, AtPose) or move.is_met(placed):
-            return None
-        distance_m, angle_rad = move.distance(placed)
-        if distance_m >= move.tolerance.position_m:
-            return {"kind": _PLACE, "by": round(100 * distance_m, 1)}
-        return {"kind": _ROTATION, "by": round(math.degrees(angle_rad), 1)}
-    return None
+    if not isinstance(move, AtPose) or move.is_met(placed):
+        return None
+    distance_m, angle_rad = move.distance(placed)
+    if distance_m >= move.tolerance.position_m:
+        return {"kind": _PLACE, "by": round(100 * distance_m, 1)}
+    return {"kind": _ROTATION, "by": round(math.degrees(angle_rad), 1)}
 
 
 def summarise(episodes: Sequence[tuple[EpisodeOutcome, Said]]) -> dict[str, Any]:
@@ -162,7 +162,7 @@ def write_preview(config: EvaluationConfig) -> tuple[Path, str]:
     form, tokens = config.vlm.format_of(models[0]), family_of(models[0]).image_tokens
     extractor = chat_extractor(config.vlm.options.boxes)
     first: tuple[Turn, ...] = ()
-    requests = image_tokens = text_tokens = 0
+    requests, totals = 0, np.zeros(2, int)
     for task, level in cells(config):
         env = config.env_config.make(task, level, domain="eval")
         observation, _ = env.reset(seed=config.seed)
@@ -171,22 +171,22 @@ def write_preview(config: EvaluationConfig) -> tuple[Path, str]:
         first = first or begin
         steps = len(rollout_oracle(env, config.seed).actions)
         later = steps * (steps - 1) // 2  # messages after the first, in all requests of an episode
-        images, text = _count(begin, tokens)
-        more_images, more_text = _count([form.next_turn(observation, extractor)], tokens)
+        more = _count([form.next_turn(observation, extractor)], tokens)
         requests += config.episodes * steps
-        image_tokens += config.episodes * (steps * images + later * more_images)
-        text_tokens += config.episodes * (steps * text + later * more_text)
+        totals += config.episodes * (steps * _count(begin, tokens) + later * more)
+    images, text = totals.tolist()
     estimate = (
-        f"{requests:,} requests, {image_tokens:,} tokens of images and {text_tokens:,} of text, if episodes "
+        f"{requests:,} requests, {images:,} tokens of images and {text:,} of text, if episodes "
         "take as many steps as the oracle; failures take more, and answers come on top"
     )
     page = render_page("chat", model=models[0], turns=first, estimate=estimate, points=form.points)
     return atomic_write_file(config.out / PREVIEW_NAME, page), estimate
 
 
-def _count(turns: Sequence[Turn], tokens: Tokens) -> tuple[int, int]:
-    """Return the tokens of the images and of the text."""
+def _count(turns: Sequence[Turn], tokens: Tokens) -> np.ndarray:
+    """Count the tokens of the images and of the text; shape (2,)."""
     parts = [part for turn in turns for part in turn.parts]
     sizes = [Image.open(BytesIO(part)).size for part in parts if isinstance(part, bytes)]
     images = sum(tokens(width, height) for width, height in sizes)
-    return images, sum(len(part) for part in parts if isinstance(part, str)) // _CHARACTERS_PER_TOKEN
+    text = sum(len(part) for part in parts if isinstance(part, str)) // _CHARACTERS_PER_TOKEN
+    return np.array([images, text])

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import combinations, groupby
+from itertools import groupby
 from typing import Literal
 
 from openvima.catalog.partitions import LEVELS
@@ -81,27 +81,24 @@ def _names(evaluations: Mapping[str, Results]) -> dict[str, dict[str, str]]:
     names: dict[str, dict[str, str]] = {label: {} for label in evaluations}
     for policy in dict.fromkeys(name for results in evaluations.values() for name in results.policy_names()):
         holders = {label: found for label, found in evaluations.items() if policy in found.policy_names()}
-        same = all(_is_same(policy, one, other) for one, other in combinations(holders.values(), 2))
+        same = _is_same(policy, list(holders.values()))
         for label in holders:
             names[label][policy] = policy if same else f"{policy}@{label}"
     return names
 
 
-def _is_same(policy: str, one: Results, other: Results) -> bool:
-    """Whether two evaluations can have scored the same policy: equal weights, and no contradiction."""
-    if one.policies.get(policy) != other.policies.get(policy):
-        return False
-    known = _outcomes(policy, one)
-    return all(known.get(key, outcome) == outcome for key, outcome in _outcomes(policy, other).items())
-
-
-def _outcomes(policy: str, results: Results) -> dict[tuple[str, str, str, int], tuple[bool, int]]:
-    return {
-        (row.task, row.level, row.ablation, outcome.seed): (outcome.success, outcome.steps)
+def _is_same(policy: str, evaluations: Sequence[Results]) -> bool:
+    """Whether evaluations can have scored the same policy: equal weights, and no contradiction."""
+    first = evaluations[0].policies.get(policy)
+    known: dict[tuple[str, str, str, int], tuple[bool, int]] = {}
+    return all(results.policies.get(policy) == first for results in evaluations) and all(
+        known.setdefault((row.task, row.level, row.ablation, o.seed), (o.success, o.steps))
+        == (o.success, o.steps)
+        for results in evaluations
         for row in results.rows
         if row.policy == policy
-        for outcome in row.outcomes
-    }
+        for o in row.outcomes
+    )
 
 
 def _rows(evaluations: Mapping[str, Results], names: Mapping[str, Mapping[str, str]]) -> tuple[Row, ...]:
@@ -145,6 +142,7 @@ def _versions(found: Sequence[Results]) -> tuple[dict[str, str], tuple[str, ...]
 
 
 Verdict = Literal["a", "b", "unsure", "noise"]
+Rows = Mapping[tuple[str, str], Row]  # by level and task
 ABLATION_SEPARATOR = ":"  # "mine:no_prompt" is the policy `mine` under the ablation `no_prompt`
 _FALSE_ALARMS = 0.05
 _MOST_PAIRS = 6  # that are compared unasked
@@ -283,38 +281,29 @@ def default_pairs(results: Results) -> list[tuple[str, str]]:
     learned = [name for name, kind in kinds.items() if kind in TRAINED_KINDS]
     others = [name for name, kind in kinds.items() if name not in learned[:1] and kind != "oracle"]
     pairs = [(learned[0], other) for other in others] if learned else []
-    return [pair for pair in pairs if _have_common_episodes(results, *pair)][:_MOST_PAIRS]
-
-
-def _have_common_episodes(results: Results, a: str, b: str) -> bool:
-    rows_a, rows_b = _rows_of(results, a), _rows_of(results, b)
-    return any(_pair(rows_a[cell], rows_b[cell]) for cell in rows_a.keys() & rows_b.keys())
+    return [pair for pair in pairs if _pairs(*(_rows_of(results, name) for name in pair))][:_MOST_PAIRS]
 
 
 def _compare(results: Results, a: str, b: str) -> Comparison:
     rows_a, rows_b = _rows_of(results, a), _rows_of(results, b)
-    cells: list[Difference] = []
-    num_paired = 0
-    for cell, row in rows_a.items():
-        pair = _pair(row, rows_b[cell]) if cell in rows_b else None
-        if pair is not None:
-            num_paired += pair.episodes
-            cells.append(_difference(*cell, (pair,)))
-    if not cells:
+    pairs = _pairs(rows_a, rows_b)
+    if not pairs:
         raise ConfigError(
             f"{a} and {b} have no episode in common; evaluate both on the same tasks, levels and seeds, with "
             "the same number of distractors."
         )
+    cells = [_difference(*cell, (pair,)) for cell, pair in pairs.items()]
     levels = [
         _difference(level, "", tuple(cell.pairs[0] for cell in of_level))
         for level, of_level in groupby(cells, key=lambda cell: cell.level)
     ]
-    overall = _difference("", "", tuple(cell.pairs[0] for cell in cells)) if len(levels) > 1 else levels[0]
+    overall = _difference("", "", tuple(pairs.values())) if len(levels) > 1 else levels[0]
     played = sum(row.episodes for row in (*rows_a.values(), *rows_b.values()))
-    return Comparison(a, b, tuple(cells), tuple(levels), overall, played - 2 * num_paired)
+    unpaired = played - 2 * PairCounts.sum(pairs.values()).episodes
+    return Comparison(a, b, tuple(cells), tuple(levels), overall, unpaired)
 
 
-def _rows_of(results: Results, name: str) -> dict[tuple[str, str], Row]:
+def _rows_of(results: Results, name: str) -> Rows:
     """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
     rows: dict[str, list[Row]] = {}
     for row in results.rows:
@@ -325,13 +314,18 @@ def _rows_of(results: Results, name: str) -> dict[tuple[str, str], Row]:
     return {(row.level, row.task): row for row in sorted(rows[name], key=lambda row: order.index(row.level))}
 
 
-def _pair(a: Row, b: Row) -> PairCounts | None:
-    """Count outcomes on the seeds that both rows hold; None if there are none."""
-    if scenes_of(a.ablation) != scenes_of(b.ablation):  # a seed is not the same episode
-        return None
-    solved_b: Mapping[int, bool] = {outcome.seed: outcome.success for outcome in b.outcomes}
-    outcomes = [(o.success, solved_b[o.seed]) for o in a.outcomes if o.seed in solved_b]
-    return PairCounts.of(outcomes) if outcomes else None
+def _pairs(rows_a: Rows, rows_b: Rows) -> dict[tuple[str, str], PairCounts]:
+    """Count outcomes on the seeds that both policies played, by level and task."""
+    pairs = {}
+    for cell, a in rows_a.items():
+        b = rows_b.get(cell)
+        if b is None or scenes_of(a.ablation) != scenes_of(b.ablation):  # a seed is not the same episode
+            continue
+        solved_b = {outcome.seed: outcome.success for outcome in b.outcomes}
+        outcomes = [(o.success, solved_b[o.seed]) for o in a.outcomes if o.seed in solved_b]
+        if outcomes:
+            pairs[cell] = PairCounts.of(outcomes)
+    return pairs
 
 
 def _difference(level: str, task: str, pairs: tuple[PairCounts, ...]) -> Difference:

@@ -6,9 +6,9 @@ does not change the results.
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -28,12 +28,10 @@ from openvima.evaluation.ablations import (
     names_in,
 )
 from openvima.evaluation.prompt_ablations import IN_CONTEXT_TASKS
-from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import PolicySource, policy_sources
 from openvima.input_files import settle
 from openvima.multiprocess import engine_problems
 from openvima.policies.naming import ORACLE, RANDOM
-from openvima.scene.action import steps_per_primitive
 from openvima.serving.chat import DEFAULT_VLM, VlmConfig
 from openvima.serving.lerobot import lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
@@ -123,27 +121,19 @@ class EvaluationConfig:
             for name in filter(None, (*self.ablations, *[DETECTED_BOXES] * is_implied))
         ]
         object.__setattr__(self, "ablations", tuple(dict.fromkeys(spelled)))
-        problems = [
-            f"{name} is {value}; it must be at least {least}."
-            for name, value, least in (
-                ("episodes", self.episodes, 1),
-                ("seed", self.seed, 0),
-                ("workers", self.workers, 1),
-                ("batch", self.batch, 1),
-            )
-            if value is not None and value < least
-        ]
-        if self.seed + self.episodes - 1 > MAX_SEED:
-            problems.append(f"seed is {self.seed}; seeds of all episodes must lie within 0 to 2**63 - 1.")
-        problems += [
-            f"{name} is empty; give at least one."
-            for name, values in (("policy", self.policies), ("tasks", self.tasks), ("levels", self.levels))
-            if not values
-        ]
-        if problems := [*problems, *self._contradictions()]:
-            raise ConfigError(" ".join(problems))
+        if problems := " ".join(self._problems()):
+            raise ConfigError(problems)
 
-    def _contradictions(self) -> Iterator[str]:
+    def _problems(self) -> Iterator[str]:
+        for name, least in (("episodes", 1), ("seed", 0), ("workers", 1), ("batch", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                yield f"{name} is {value}; it must be at least {least}."
+        if self.seed + self.episodes - 1 > MAX_SEED:
+            yield f"seed is {self.seed}; seeds of all episodes must lie within 0 to 2**63 - 1."
+        for name, values in (("policy", self.policies), ("tasks", self.tasks), ("levels", self.levels)):
+            if not values:
+                yield f"{name} is empty; give at least one."
         if self.precision is not None and self.precision not in PRECISIONS:
             yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
         yield from engine_problems(self.engine, self.address)
@@ -157,7 +147,7 @@ class EvaluationConfig:
         Raises:
             ConfigError: As for `policy_sources`.
         """
-        given = policy_sources(self.policies, trust_code=self.trust_code, vlm=self.vlm)
+        given = policy_sources(self.policies)
         asked = REFERENCE_POLICIES if "all" in self.ablations else self.ablations
         there = {source.source for source in given}
         added = [name for name in REFERENCE_POLICIES if name in asked and name not in there]
@@ -272,6 +262,9 @@ class Batch:
         boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
         trust_code: As in `EvaluationConfig`.
         vlm: As in `EvaluationConfig`.
+        fingerprint: Text that stands for the policy's weights, wherever they lie, and the versions.
+        may_fail: Whether the policy may raise throughout. Where it does so in all of its first batch, that is
+            an error, not a result.
     """
 
     policy: str
@@ -287,6 +280,8 @@ class Batch:
     boxes: str = ""
     trust_code: bool = False
     vlm: VlmConfig = DEFAULT_VLM
+    fingerprint: str = ""
+    may_fail: bool = field(default=False, compare=False)
 
     @property
     def cell(self) -> tuple[str, str, str, str]:
@@ -294,18 +289,21 @@ class Batch:
         return self.policy, self.ablation, self.task, self.level
 
     @property
+    def episode(self) -> tuple[str, str, str, int]:
+        """Policy, task, level and seed of the first episode."""
+        return self.policy, self.task, self.level, self.first_seed
+
+    @property
     def seeds(self) -> range:
         """Seeds of the episodes."""
         return range(self.first_seed, self.first_seed + self.episodes)
 
-    def key(self, fingerprint: str) -> str:
-        """Name for the batch's stored outcomes: changes with anything that they depend on.
-
-        Args:
-            fingerprint: Text that stands for the policy's weights, wherever they lie, and the versions.
-        """
+    @property
+    def key(self) -> str:
+        """Name for the batch's stored outcomes: changes with anything that they depend on."""
         settings = {**asdict(self), "source": "", "trust_code": False}
-        del settings["vlm"]  # the fingerprint stands for it
+        del settings["vlm"], settings["may_fail"]  # the fingerprint stands for the model's settings
+        fingerprint = settings.pop("fingerprint")
         content = json.dumps([settings, fingerprint], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:24]
 
@@ -383,16 +381,3 @@ def plan(config: EvaluationConfig) -> list[Batch]:
         for task, level in cells(config, ablation)
         for offset in range(0, config.episodes, config.batch)
     ]
-
-
-def rows_of(outcomes: Mapping[Batch, Sequence[EpisodeOutcome]]) -> tuple[Row, ...]:
-    """Join the batches of each policy, ablation, task and level; they are given in their order."""
-    joined: dict[tuple[str, str, str, str], tuple[EpisodeOutcome, ...]] = {}
-    factor = 1
-    for batch, played in outcomes.items():
-        factor = steps_per_primitive(batch.env_config.control)
-        joined[batch.cell] = (*joined.get(batch.cell, ()), *played)
-    return tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps * factor, played, ablation)
-        for (policy, ablation, task, level), played in joined.items()
-    )

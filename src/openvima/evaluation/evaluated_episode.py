@@ -1,6 +1,6 @@
 """One episode of an evaluation, with the exact settings to play it again live."""
 
-from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -138,9 +138,10 @@ def evaluated_episode(
         boxes=str(config.get("boxes") or "") if DETECTED_BOXES in ablation else "",
         trust_code=trust_code,
     )
-    return EvaluatedEpisode(
-        batch, row.outcomes[place], _actions(folder, results, results.rows.index(row), place)
-    )
+    recorded, actions = folder if folder.is_dir() else folder.parent, None
+    if (recorded / ACTIONS_NAME).is_file():
+        actions = read_actions(recorded, results.rows)[0][results.rows.index(row)][place]
+    return EvaluatedEpisode(batch, row.outcomes[place], actions)
 
 
 def find_source(folder: Path, results: Results, policy: str) -> str | None:
@@ -166,22 +167,10 @@ def find_source(folder: Path, results: Results, policy: str) -> str | None:
         return str(kind)
     if kind != "run" or not sha256:
         return None
-    for run in _runs_near(folder.resolve()):
-        try:
-            if weights_hash(run) == sha256:
-                return str(run)
-        except (OpenVimaError, OSError):
-            continue
-    return None
-
-
-def _runs_near(folder: Path) -> Iterator[Path]:
+    folder = folder.resolve()
     for place in (folder, folder.parent):
-        yield from sorted(path.parent for path in place.glob(f"*/{CHECKPOINTS_FOLDER}"))
-
-
-def _actions(folder: Path, results: Results, row: int, place: int) -> np.ndarray | None:
-    folder = folder if folder.is_dir() else folder.parent
-    if not (folder / ACTIONS_NAME).is_file():
-        return None
-    return read_actions(folder, results.rows)[0][row][place]
+        for run in sorted(path.parent for path in place.glob(f"*/{CHECKPOINTS_FOLDER}")):
+            with suppress(OpenVimaError, OSError):
+                if weights_hash(run) == sha256:
+                    return str(run)
+    return None

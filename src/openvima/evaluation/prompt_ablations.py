@@ -22,6 +22,7 @@ frame … frame". It contains the answer, so this measures whether a policy repr
 import re
 from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -162,15 +163,13 @@ def with_images_of_another(env: TabletopEnv, rng: np.random.Generator) -> Render
 
 def _multimodal(env: TabletopEnv, seed: int) -> Episode:
     """Sample an episode of an environment, with the published prompt."""
-    return sample_episode(
-        env.task,
-        level=env.level,
-        seed=seed,
-        domain=env.domain,
-        assets=env.assets,
-        compat=env.compat,
-        **env.task_options,
-    )
+    return sample_episode(env.task, seed=seed, **settings_of(env))
+
+
+def settings_of(env: TabletopEnv) -> dict[str, Any]:
+    """Return what decides an environment's episodes, but for task, prompts and seed."""
+    own = {"level": env.level, "domain": env.domain, "assets": env.assets, "compat": env.compat}
+    return own | env.task_options
 
 
 def _kinds(images: tuple[tuple[str, object], ...]) -> dict[str, type]:
@@ -216,15 +215,7 @@ def demonstrated(env: TabletopEnv) -> RenderedPrompt:
     Args:
         env: The environment; it is left as it is.
     """
-    own = TabletopEnv(
-        env.task,
-        level=env.level,
-        domain=env.domain,
-        assets=env.assets,
-        compat=env.compat,
-        hide_arm=env.hide_arm,
-        **env.task_options,
-    )
+    own = TabletopEnv(env.task, hide_arm=env.hide_arm, **settings_of(env))
     seen = [own.reset(seed=env.episode.seed)[0]]
     while not own.outcome.is_over and len(seen) <= own.episode.oracle_max_steps:
         try:

@@ -1,7 +1,6 @@
 """Episodes as videos and images, and online evaluation of checkpoints during training."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,7 @@ from openvima.evaluation.rollout_policies import (
     OracleRolloutPolicy,
     PromptedRolloutPolicy,
     RolloutPolicy,
-    explains,
-    explanation_of,
+    explainer_of,
 )
 from openvima.input_files import as_path
 from openvima.policies.base import POLICIES_THAT_EXPLAIN
@@ -61,9 +59,9 @@ def record_episode(
     Raises:
         PolicyError: The policy explains nothing.
     """
-    if explain and not explains(policy):
+    explainer = explainer_of(policy) if explain else None
+    if explain and explainer is None:
         raise PolicyError(f"the policy has no explain(). {POLICIES_THAT_EXPLAIN}")
-    explainer = partial(explanation_of, policy) if explain else None
     begin_episode(env, start)
     with EpisodeRecorder(env, path, title=title, with_prompt=with_prompt, explain=explainer) as recorder:
         (outcome,) = play([env], [start], policy, after_step=recorder.record_step, may_fail=may_fail)
@@ -91,19 +89,21 @@ def save_episode_image(
     start = renderer.draw(env.scene, joints=None)
     (outcome,) = play([env], [seed], policy or OracleRolloutPolicy())
     end = renderer.draw(env.scene, joints=None)
-    gap = np.full((start.shape[0] + 26, _GAP, 3), 255, np.uint8)
     ended = "after: solved" if outcome.success else "after: not solved"
-    scenes = np.concatenate([gap, _titled(start, "before"), gap, _titled(end, ended), gap], axis=1)
-    strip = draw_prompt_strip(env.prompt, width=scenes.shape[1])
-    image = np.concatenate([strip, scenes, np.full((_GAP, scenes.shape[1], 3), 255, np.uint8)])
+    scenes = np.concatenate([_titled(start, "before"), _titled(end, ended)], axis=1)
+    scenes = np.pad(scenes, ((0, 0), (0, _GAP), (0, 0)), constant_values=255)
+    image = np.concatenate([draw_prompt_strip(env.prompt, width=scenes.shape[1]), scenes])
     atomic_write_file(as_path(path), png(Image.fromarray(image)))
     return outcome
 
 
 def _titled(image: np.ndarray, title: str) -> np.ndarray:
-    line = Image.new("RGB", (image.shape[1], 26), PAPER)
-    ImageDraw.Draw(line).text((0, 13), title, font=font(14), fill=MUTED, anchor="lm")
-    return np.concatenate([np.asarray(line), image])
+    """Put a title above an image, and a gap to the left and below."""
+    height, width, _ = image.shape
+    framed = Image.new("RGB", (_GAP + width, 26 + height + _GAP), PAPER)
+    ImageDraw.Draw(framed).text((_GAP, 13), title, font=font(14), fill=MUTED, anchor="lm")
+    framed.paste(Image.fromarray(image), (_GAP, 26))
+    return np.asarray(framed)
 
 
 ONLINE_EVAL_LEVEL = "L1"
@@ -120,23 +120,21 @@ class OnlineEval:
         tasks: Names of the tasks.
         episodes: Episodes of each task, at level L1; none of them occurs in training or evaluation.
         env_config: Settings of the environments.
-        device: Where the policy computes.
     """
 
     tasks: tuple[str, ...]
     episodes: int
     env_config: EnvConfig = DEFAULT_ENV_CONFIG
-    device: str = "cpu"
 
     def __call__(self, checkpoint: Path) -> dict[str, float]:
         """Return the success rate of each task, and their mean as "success"."""
-        policy = load_policy(str(checkpoint), device=self.device, trust_code=True)  # the training runs it
+        policy = load_policy(str(checkpoint), trust_code=True)  # the training runs it
         rates = {task: self._rate(task, policy) for task in self.tasks}
         return {"success": sum(rates.values()) / len(rates), **rates}
 
     def animate(self, checkpoint: Path) -> list[Animation]:
         """Roll out the first episode of each task, and return it with the picture of its prompt."""
-        policy = load_policy(str(checkpoint), device=self.device, trust_code=True)
+        policy = load_policy(str(checkpoint), trust_code=True)
         return [self._animation(task, policy) for task in self.tasks]
 
     def _animation(self, task: str, policy: object) -> Animation:
@@ -146,8 +144,8 @@ class OnlineEval:
         frames = [renderer.draw(env.scene)]
 
         def record(env: TabletopEnv) -> None:
-            frames.extend(renderer.draw(frame.scene, frame.joints) for frame in env.frames[::_FRAME_STRIDE])
-            frames.append(renderer.draw(env.frames[-1].scene, env.frames[-1].joints))
+            shown = (*env.frames[::_FRAME_STRIDE], env.frames[-1])
+            frames.extend(renderer.draw(frame.scene, frame.joints) for frame in shown)
 
         (outcome,) = play([env], [0], PromptedRolloutPolicy(policy), after_step=record)
         caption = f"solved (steps: {outcome.steps})" if outcome.success else outcome.reason

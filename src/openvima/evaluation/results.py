@@ -192,19 +192,19 @@ class Results:
 
     def level_means(self) -> list[LevelMean]:
         """Mean over the tasks of each level, for each policy, plain and under each ablation."""
-        cells: dict[tuple[str, str, str], list[Row]] = {}
-        for row in self.rows:
-            cells.setdefault((row.policy, row.ablation, row.level), []).append(row)
-        means = []
-        for (policy, ablation, level), rows in cells.items():
-            mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
-            tasks = tuple(row.task for row in rows)
-            means.append(LevelMean(policy, level, mean, interval, tasks, ablation))
-        return means
+        return list(self.means().values())
 
     def means(self) -> dict[tuple[str, str, str], LevelMean]:
         """The same means by policy, ablation and level; the ablation is empty for the plain score."""
-        return {(mean.policy, mean.ablation, mean.level): mean for mean in self.level_means()}
+        cells: dict[tuple[str, str, str], list[Row]] = {}
+        for row in self.rows:
+            cells.setdefault((row.policy, row.ablation, row.level), []).append(row)
+        means = {}
+        for (policy, ablation, level), rows in cells.items():
+            mean = mean_of_rates([(row.successes, row.episodes) for row in rows])
+            tasks = tuple(row.task for row in rows)
+            means[policy, ablation, level] = LevelMean(policy, level, *mean, tasks, ablation)
+        return means
 
     def invalid_actions(self) -> list[dict[str, Any]]:
         """Count invalid actions by policy, for the policies that have any, as JSON values."""
@@ -263,55 +263,37 @@ class Results:
         Raises:
             DatasetError: The file is missing, damaged or of another schema.
         """
-        return ResultsFile.read(as_path(path)).results
+        return read_results(as_path(path))[0]
 
 
-@dataclass(frozen=True, slots=True)
-class ResultsFile:
-    """A `results.json` as it was read.
+def read_results(path: Path) -> tuple[Results, str]:
+    """Read a `results.json`, or the one of an evaluation's folder.
 
-    Args:
-        results: What its outcomes say.
-        text: Its text.
-        content: Its content, with the counts, means and digest that it states.
+    Returns:
+        What its outcomes say, and its text.
+
+    Raises:
+        DatasetError: The file is missing, damaged, too large or of another schema.
     """
-
-    results: Results
-    text: str
-    content: dict[str, Any]  # plain JSON values
-
-    @staticmethod
-    def read(path: Path) -> "ResultsFile":
-        """Read a `results.json`, or the one of an evaluation's folder.
-
-        Raises:
-            DatasetError: The file is missing, damaged, too large or of another schema.
-        """
-        path = path / FILE_NAME if path.is_dir() else path
-        if not path.is_file():
-            raise DatasetError(f"there is no {path}; `openvima evaluate --out FOLDER` writes one.")
-        try:
-            text = read_text(path, max_bytes=_MAX_BYTES)
-            content = json.loads(text)
-            schema = content["schema"]
-            if schema == SCHEMA:
-                rows = tuple(_row_from_record(record) for record in content["rows"])
-                described = (content["config"], content["versions"], content["policies"])
-                results = Results(rows, *described, content.get("actions_sha256", ""))
-                return ResultsFile(results, text, content)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise DatasetError(
-                f"{path} is damaged ({echo(repr(error))}); evaluate again with --force."
-            ) from error
+    path = path / FILE_NAME if path.is_dir() else path
+    if not path.is_file():
+        raise DatasetError(f"there is no {path}; `openvima evaluate --out FOLDER` writes one.")
+    try:
+        text = read_text(path, max_bytes=_MAX_BYTES)
+        content = json.loads(text)
+        schema = content["schema"]
+        if schema == SCHEMA:
+            rows = tuple(_row_from_record(record) for record in content["rows"])
+            described = (content["config"], content["versions"], content["policies"])
+            return Results(rows, *described, content.get("actions_sha256", "")), text
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DatasetError(
-            f"{path} has schema {echo(repr(schema))}; this version reads schema {SCHEMA}. Evaluate again, or "
-            "read it with the version of openvima that wrote it."
-        )
-
-    @property
-    def sha256(self) -> str:
-        """The digest that it states; empty without one."""
-        return str(self.content.get("sha256", ""))
+            f"{path} is damaged ({echo(repr(error))}); evaluate again with --force."
+        ) from error
+    raise DatasetError(
+        f"{path} has schema {echo(repr(schema))}; this version reads schema {SCHEMA}. Evaluate again, or "
+        "read it with the version of openvima that wrote it."
+    )
 
 
 def _json_text(content: Mapping[str, object]) -> str:
@@ -356,10 +338,8 @@ def _row_from_record(record: Mapping[str, Any]) -> Row:
 
 
 def _level_record(mean: LevelMean) -> dict[str, object]:
-    record = asdict(mean)
-    record["mean"] = _rounded(mean.mean)
-    record["interval"] = [_rounded(end) for end in mean.interval]
-    return record
+    interval = [_rounded(end) for end in mean.interval]
+    return asdict(mean) | {"mean": _rounded(mean.mean), "interval": interval}
 
 
 def _rounded(value: float) -> float:

@@ -1,6 +1,7 @@
 """Rollouts of a batch of episodes: environments step together, with batched inference."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from openvima.env.tabletop import TabletopEnv
@@ -14,6 +15,8 @@ from openvima.errors import (
     PromptError,
     ShapeError,
 )
+from openvima.evaluation.actions import Steps, numbers_of
+from openvima.evaluation.chat import Said
 from openvima.evaluation.results import BAD_ACTION, POLICY_ERROR, EpisodeOutcome, failure_kind
 from openvima.evaluation.rollout_policies import Decision, RolloutPolicy
 from openvima.imports import lacks_memory
@@ -29,17 +32,33 @@ NO_ORACLE_ACTION = "the oracle has no action"
 _OF_EPISODES = (PolicyError, PromptError, ShapeError, ActionError)
 
 
+@dataclass(frozen=True, slots=True)
+class PlayedEpisode:
+    """How an episode ended, its executed actions, and what a language model said in each step."""
+
+    outcome: EpisodeOutcome
+    actions: Steps
+    said: Said | None = None
+
+
 class EpisodeSlot:
     """One environment of a batch and the state of its episode.
 
     Args:
         env: The environment; it is reset.
         start: The episode, or its seed.
+        after_step: Called with the environment after each step.
     """
 
-    def __init__(self, env: TabletopEnv, start: int | Episode) -> None:
+    def __init__(
+        self,
+        env: TabletopEnv,
+        start: int | Episode,
+        after_step: Callable[[TabletopEnv], None] = lambda env: None,
+    ) -> None:
         self.env = env
-        self.steps = 0
+        self.after_step = after_step
+        self.actions: Steps = []
         self.grasped: set[int] = set()
         self.near_ties = 0
         self.outcome: EpisodeOutcome | None = None
@@ -57,7 +76,8 @@ class EpisodeSlot:
             _, terminated, truncated, info = self.env.advance(decision)
         except ActionError as error:
             return self.end(str(error), BAD_ACTION)
-        self.steps += 1
+        self.actions.append(numbers_of(decision, self.env.control))
+        self.after_step(self.env)
         self.grasped |= {info["grasped"]} - {0}
         if info["success"]:
             self.observation, self.outcome = None, self._outcome(True)
@@ -93,7 +113,7 @@ class EpisodeSlot:
         return EpisodeOutcome(
             self.seed,
             success,
-            self.steps,
+            len(self.actions),
             reason,
             kind,
             resamples=episode.num_redraws,
@@ -113,10 +133,20 @@ def play(
     envs: Sequence[TabletopEnv],
     starts: Sequence[int | Episode],
     policy: RolloutPolicy,
-    *,
-    after_step: Callable[[TabletopEnv], None] | None = None,
-    may_fail: bool = False,
+    **options: Any,
 ) -> list[EpisodeOutcome]:
+    """Play one episode in each environment, as `roll_out` does, and return how each ended."""
+    return [played.outcome for played in roll_out(envs, starts, policy, **options)]
+
+
+def roll_out(
+    envs: Sequence[TabletopEnv],
+    starts: Sequence[int | Episode],
+    policy: RolloutPolicy,
+    *,
+    after_step: Callable[[TabletopEnv], None] = lambda env: None,
+    may_fail: bool = False,
+) -> list[PlayedEpisode]:
     """Play one episode in each environment.
 
     Where the policy raises, the episodes that are not over are played again one by one, from their starts;
@@ -131,7 +161,7 @@ def play(
         may_fail: The policy may raise before the first action of every episode.
 
     Returns:
-        How each episode ended, in the order of `starts`.
+        The episodes, in the order of `starts`.
 
     Raises:
         PolicyError: The policy raised before the first action of every episode, or cannot act in so many
@@ -140,33 +170,32 @@ def play(
     if (modalities := getattr(policy, "modalities", None)) is not None:
         for env in envs:
             env.modalities = modalities
-    slots = [EpisodeSlot(env, start) for env, start in zip(envs, starts, strict=True)]
-    error = _play_together(slots, policy, after_step)
+    slots = [EpisodeSlot(env, start, after_step) for env, start in zip(envs, starts, strict=True)]
+    error = _play_together(slots, policy)
     if error is None:
-        return _outcomes(slots)
+        return _played(slots)
     running = [index for index, slot in enumerate(slots) if slot.outcome is None]
     if len(running) == 1:
         slots[running[0]].end(str(error), POLICY_ERROR)
     else:
         for index in running:
-            slots[index] = EpisodeSlot(envs[index], starts[index])
-            if (own := _play_together([slots[index]], policy, after_step)) is not None:
+            slots[index] = EpisodeSlot(envs[index], starts[index], after_step)
+            if (own := _play_together([slots[index]], policy)) is not None:
                 slots[index].end(str(own), POLICY_ERROR)
-    outcomes = _outcomes(slots)
-    is_of_batch = not isinstance(error, PolicyRaisedError) and all(o.kind != POLICY_ERROR for o in outcomes)
-    never_acts = all(outcome.kind == POLICY_ERROR and not outcome.steps for outcome in outcomes)
+    played = _played(slots)
+    failed = [episode for episode in played if episode.outcome.kind == POLICY_ERROR]
+    is_of_batch = not isinstance(error, PolicyRaisedError) and not failed
+    never_acts = len(failed) == len(played) and not any(episode.actions for episode in failed)
     if is_of_batch or (never_acts and not may_fail):
         raise error
-    return outcomes
+    return played
 
 
-def _outcomes(slots: Sequence[EpisodeSlot]) -> list[EpisodeOutcome]:
-    return [slot.outcome for slot in slots if slot.outcome is not None]
+def _played(slots: Sequence[EpisodeSlot]) -> list[PlayedEpisode]:
+    return [PlayedEpisode(slot.outcome, slot.actions) for slot in slots if slot.outcome is not None]
 
 
-def _play_together(
-    slots: Sequence[EpisodeSlot], policy: RolloutPolicy, after_step: Callable[[TabletopEnv], None] | None
-) -> OpenVimaError | None:
+def _play_together(slots: Sequence[EpisodeSlot], policy: RolloutPolicy) -> OpenVimaError | None:
     """Step all environments until every episode is over; return the error of the policy before that."""
     has_begun = False
     while any(slot.outcome is None for slot in slots):
@@ -183,8 +212,5 @@ def _play_together(
         for slot, decision, is_near_tie in zip(slots, decisions, near_ties, strict=True):
             if slot.outcome is None:
                 slot.near_ties += is_near_tie
-                steps = slot.steps
                 slot.step(decision)
-                if after_step is not None and slot.steps > steps:
-                    after_step(slot.env)
     return None

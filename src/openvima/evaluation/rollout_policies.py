@@ -4,7 +4,7 @@ import importlib.util
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -74,18 +74,17 @@ class OracleRolloutPolicy:
         return [None if observation is None else _oracle(env) for env, observation in pairs]
 
 
-def explains(policy: RolloutPolicy) -> bool:
-    """Whether a rollout policy explains its actions."""
-    return getattr(policy, "explain", None) is not None
+def explainer_of(policy: RolloutPolicy) -> Callable[[], Explanation] | None:
+    """Return what gives the explanation of a policy's last action in its only episode, if it explains any.
 
-
-def explanation_of(policy: Any) -> Explanation:
-    """Return what a rollout policy that explains considered for its last action in its only episode.
-
-    Raises:
-        PolicyError: It returned something else.
+    It raises a `PolicyError` where the policy returns something else.
     """
-    found = policy.explain()
+    explain = getattr(policy, "explain", None)
+    return None if explain is None else partial(_explanation, explain)
+
+
+def _explanation(explain: Callable[[], Any]) -> Explanation:
+    found = explain()
     if not (isinstance(found, list | tuple) and len(found) == 1 and isinstance(found[0], Explanation)):
         raise PolicyError(
             f"explain() returned {echo(repr(found))}; give a list of an Explanation for each episode that "
@@ -105,7 +104,7 @@ def _read(action: object) -> None:
 
 
 class PromptedRolloutPolicy:
-    """A policy, which reads prompts and observations only.
+    """A policy, which reads prompts and observations only; its `modalities` and `explain` are the policy's.
 
     Args:
         policy: Follows the `Policy` protocol of `openvima.policies`.
@@ -113,23 +112,14 @@ class PromptedRolloutPolicy:
         name: Name of the policy, for errors.
     """
 
-    def __init__(
-        self,
-        policy: Any,
-        ablation: str = "",
-        *,
-        name: str = "policy",
-    ) -> None:
+    def __init__(self, policy: Any, ablation: str = "", *, name: str = "policy") -> None:
         self._policy = checked_policy(policy, f"{name} is")
+        self.modalities: tuple[str, ...] = getattr(policy, "modalities", DEFAULT_MODALITIES)
+        self.explain: Callable[[], Any] | None = getattr(policy, "explain", None)
         self._name = name
         self._envs: Sequence[TabletopEnv] = ()
         self._ablation = ablation
         self._inputs: list[AblatedInput] = []
-
-    @property
-    def modalities(self) -> tuple[str, ...]:
-        """What the policy asks observations to hold, as `TabletopEnv` takes it."""
-        return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Reset the policy with the prompts.
@@ -194,11 +184,6 @@ class PromptedRolloutPolicy:
             ) from error
 
     @property
-    def explain(self) -> Callable[[], Any] | None:
-        """The method with which the policy explains its last actions, if it has one."""
-        return getattr(self._policy, "explain", None)
-
-    @property
     def near_ties(self) -> Sequence[bool]:
         """Those of the policy, if it reports any, as `NetworkPolicy` does."""
         return getattr(self._policy, "near_ties", ())
@@ -231,13 +216,8 @@ class VlmRolloutPolicy(PromptedRolloutPolicy):
         return decisions
 
 
-def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
-    """Load the policy of a batch of episodes.
-
-    Args:
-        batch: The episodes.
-        fingerprint: Text that stands for the policy's weights; a policy that was loaded before is used again
-            only if it is the same.
+def load_rollout_policy(batch: Batch) -> RolloutPolicy:
+    """Load the policy of a batch of episodes, or the one of the batch before if it has the same fingerprint.
 
     Raises:
         UnknownPolicyError: There is no such policy or run folder.
@@ -245,11 +225,9 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
         ConfigError: There is no such detector.
         ServerError: No policy server answers at the address.
     """
-    if batch.source == ORACLE:
-        return OracleRolloutPolicy()
     policy = _load_policy(
         batch.source,
-        fingerprint,
+        batch.fingerprint,
         device=batch.device,
         precision=batch.precision,
         boxes=batch.boxes,
@@ -287,7 +265,6 @@ def load_own_rollout_policy(
     *,
     ablation: str = "",
     name: str = "",
-    boxes: str = "",
     trust_code: bool = False,
     **options: Any,
 ) -> RolloutPolicy:
@@ -297,17 +274,14 @@ def load_own_rollout_policy(
         source: As for `openvima evaluate --policy`.
         ablation: Input ablation; empty for none.
         name: Name of the policy, for errors; by default the source.
-        boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
         trust_code: Run the code that a run folder names.
-        **options: `device`, `precision` and `vlm`, as in `Batch`.
+        **options: `boxes`, `device`, `precision` and `vlm`, as in `Batch`.
 
     Raises:
         UnknownPolicyError, InputFileError, ConfigError, ServerError: As for `load_rollout_policy`.
     """
-    PolicySource(source, source, trust_code).check()
-    if source == ORACLE:
-        return OracleRolloutPolicy()
-    policy = build_policy(source, boxes=boxes, trust_code=trust_code, **options)
+    PolicySource(source, source).check(trust_code=trust_code)
+    policy = build_policy(source, trust_code=trust_code, **options)
     return _rollout_policy(policy, ablation, name or source)
 
 
@@ -319,12 +293,14 @@ def _load_policy(source: str, fingerprint: str, **options: Any) -> Any:
 
 
 def build_policy(
-    source: str, *, boxes: str, precision: str = "", vlm: VlmConfig = DEFAULT_VLM, **options: Any
+    source: str, *, boxes: str = "", precision: str = "", vlm: VlmConfig = DEFAULT_VLM, **options: Any
 ) -> Any:
     """Load a policy anew, with the options of a `Batch`; the errors are those of `load_rollout_policy`."""
     from openvima.policies import load_policy
 
     ref = PolicyRef.parse(source)
+    if ref.kind == ORACLE:
+        return OracleRolloutPolicy()
     if ref.kind == "remote":
         return RemotePolicy(source)
     if ref.kind == "vlm":

@@ -8,7 +8,9 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +20,11 @@ from openvima.detector.plugins import plugged_boxes
 from openvima.env.config import EnvConfig
 from openvima.errors import ConfigError, differences, echo, one_word_warning
 from openvima.evaluation.ablations import NOISY_BOXES
-from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
+from openvima.evaluation.actions import write_actions
 from openvima.evaluation.chat import Said, summarise, write_answers
-from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
-from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, versions
-from openvima.evaluation.rollout import play
+from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan
+from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, Row, versions
+from openvima.evaluation.rollout import PlayedEpisode, roll_out
 from openvima.evaluation.rollout_policies import (
     PromptedRolloutPolicy,
     VlmRolloutPolicy,
@@ -35,8 +37,9 @@ from openvima.input_files import names_of
 from openvima.multiprocess import Report, imap_with_engine
 from openvima.policies.base import Policy
 from openvima.policies.naming import PolicyRef
-from openvima.scene.action import PRIMITIVES
+from openvima.scene.action import PRIMITIVES, steps_per_primitive
 from openvima.serving.chat import VlmPolicy
+from openvima.tasks.registry import task_spec
 from openvima.user_code import is_code, source_hash
 from openvima.video.encoder import FOLDER
 
@@ -52,50 +55,15 @@ class PreparedEvaluation:
     Args:
         config: What to evaluate.
         batches: The batches of episodes.
-        policies: What each policy is, by name.
-        versions: Versions of the packages that decide the results.
-        boxes: Name and hash of the detector; empty for none.
+        results: Results without rows: settings, versions, and what each policy is.
     """
 
     config: EvaluationConfig
     batches: tuple[Batch, ...]
-    policies: dict[str, dict[str, Any]]
-    versions: dict[str, str]
-    boxes: str = ""
-
-    def record(self) -> dict[str, object]:
-        """Settings that the results depend on, as plain JSON values."""
-        return {**self.config.record(), **({"boxes_code": self.boxes} if self.boxes else {})}
+    results: Results
 
 
-@dataclass(frozen=True, slots=True)
-class Rollouts:
-    """The episodes of a batch: how each ended, its valid actions, and what a language model said in it."""
-
-    outcomes: tuple[EpisodeOutcome, ...]
-    actions: tuple[Steps, ...]
-    said: tuple[Said, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """A batch, a fingerprint of what its outcomes also need, and whether its policy may raise throughout.
-
-    A policy that raises in all of its first batch is an error, not a result.
-    """
-
-    batch: Batch
-    fingerprint: str
-    may_fail: bool = False
-
-    @property
-    def episode(self) -> tuple[str, str, str, int]:
-        """Policy, task, level and seed of the first episode."""
-        return self.batch.policy, self.batch.task, self.batch.level, self.batch.first_seed
-
-    def part(self, folder: Path) -> Path:
-        """Where the outcomes are kept until all are there."""
-        return folder / _PARTS / f"{self.batch.key(self.fingerprint)}.json"
+Played = dict[Batch, list[PlayedEpisode]]
 
 
 def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
@@ -146,11 +114,12 @@ def evaluate_range(config: EvaluationConfig, shards: Part, report: Report | None
         )
     with config.served() as served:
         prepared = prepare(served)
-        own, path = tuple(parts_in_range(prepared.batches, shards)), config.out / FILE_NAME
+        own = replace(prepared, batches=tuple(parts_in_range(prepared.batches, shards)))
+        path = config.out / FILE_NAME
         with folder_lock(config.out, shards):
             if _earlier(path, prepared) is None:
-                _play_all(replace(prepared, batches=own), report)
-        if any(_kept(job, config.out) is None for job in _jobs(prepared)):
+                _play_all(own, report)
+        if len(_finished(prepared)) < len(prepared.batches):
             return False
         with folder_lock(config.out, timeout_s=FINISH_S):  # others may have come to the same conclusion
             if path.exists():
@@ -166,14 +135,20 @@ def prepare(config: EvaluationConfig) -> PreparedEvaluation:
         OpenVimaError: As for `evaluate`.
     """
     for source in config.sources:
-        source.check()
+        source.check(trust_code=config.trust_code)
     boxes = "" if config.boxes is None else plugged_boxes(config.boxes).name
-    batches = plan(config)
-    policies = {source.name: source.record() for source in config.sources}
+    batches, assets = plan(config), config.env_config.assets
+    policies = {source.name: source.record(config.vlm) for source in config.sources}
     found = versions(
         with_torch=any(what["kind"] in ("run", "untrained", "code") for what in policies.values())
     )
-    return PreparedEvaluation(config, tuple(batches), policies, found, boxes)
+    code = [found, source_hash(assets, what="assets") if is_code(assets) else ""]
+    prints = {name: json.dumps([what, *code], sort_keys=True) for name, what in policies.items()}
+    known = (
+        replace(batch, fingerprint=prints[batch.policy] + (boxes if batch.boxes else "")) for batch in batches
+    )
+    record = config.record() | ({"boxes_code": boxes} if boxes else {})
+    return PreparedEvaluation(config, tuple(known), Results((), record, found, policies))
 
 
 def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None) -> Path:
@@ -185,15 +160,13 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         played = _play_all(prepared, report)
-        rows = rows_of({batch: played[batch].outcomes for batch in prepared.batches})
+        rows = _rows({batch: played[batch] for batch in prepared.batches})
         episodes = (  # in the order of the rows
-            episode
-            for batch in prepared.batches
-            for episode in zip(batch.seeds, played[batch].actions, strict=True)
+            (episode.outcome.seed, episode.actions) for batch in prepared.batches for episode in played[batch]
         )
         digest = write_actions(config.out, episodes, control=config.env_config.control)
         policies, median_s = _answered(prepared, played)
-        results = Results(rows, prepared.record(), prepared.versions, policies, digest)
+        results = replace(prepared.results, rows=rows, policies=policies, actions_sha256=digest)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started, median_s)
     shutil.rmtree(config.out / _PARTS, ignore_errors=True)
@@ -203,26 +176,34 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
 def finished_part(config: EvaluationConfig) -> Results | None:
     """Return the results of the tasks and levels whose episodes are all finished; None without any."""
     prepared = prepare(config)
-    kept = {job.batch: _kept(job, config.out) for job in _jobs(prepared)}
-    unfinished = {batch.cell for batch, played in kept.items() if played is None}
-    rows = rows_of(
-        {b: played.outcomes for b, played in kept.items() if played is not None and b.cell not in unfinished}
-    )
-    return Results(rows, prepared.record(), prepared.versions, prepared.policies) if rows else None
+    finished = _finished(prepared)
+    unfinished = {batch.cell for batch in prepared.batches if batch not in finished}
+    rows = _rows({batch: played for batch, played in finished.items() if batch.cell not in unfinished})
+    return replace(prepared.results, rows=rows) if rows else None
 
 
-def _answered(
-    prepared: PreparedEvaluation, played: Mapping[Batch, Rollouts]
-) -> tuple[dict[str, dict[str, Any]], float | None]:
+def _rows(played: Played) -> tuple[Row, ...]:
+    """Join the batches of each policy, ablation, task and level; they are given in their order."""
+    rows = []
+    for (policy, ablation, task, level), group in groupby(played, key=lambda batch: batch.cell):
+        batches = list(group)
+        max_steps = task_spec(task).oracle_max_steps * steps_per_primitive(batches[0].env_config.control)
+        outcomes = tuple(episode.outcome for batch in batches for episode in played[batch])
+        rows.append(Row(policy, task, level, max_steps, outcomes, ablation))
+    return tuple(rows)
+
+
+def _answered(prepared: PreparedEvaluation, played: Played) -> tuple[dict[str, dict[str, Any]], float | None]:
     """Write what models said; return the records of the policies with its summary, and a median time."""
-    policies, steps = dict(prepared.policies), []
+    policies, steps = dict(prepared.results.policies), []
     episodes: dict[str, list[tuple[EpisodeOutcome, Said]]] = {}
     for batch in prepared.batches:
-        rollouts = played[batch]
         where = {name: getattr(batch, name) for name in ("policy", "task", "level", "ablation")}
-        for outcome, said in zip(rollouts.outcomes, rollouts.said, strict=False):  # of others nothing is said
-            episodes.setdefault(batch.policy, []).append((outcome, said))
-            steps += [where | {"seed": outcome.seed, "step": n} | step for n, step in enumerate(said)]
+        for episode in played[batch]:
+            if episode.said is not None:
+                at = where | {"seed": episode.outcome.seed}
+                episodes.setdefault(batch.policy, []).append((episode.outcome, episode.said))
+                steps += [at | {"step": n} | step for n, step in enumerate(episode.said)]
     for name, of_policy in episodes.items():
         policies[name] = {**policies[name], _ANSWERS: summarise(of_policy)}
     return policies, write_answers(prepared.config.out, steps)
@@ -233,13 +214,7 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     if not path.exists() or prepared.config.force:
         return None
     earlier = Results.read(path)
-    policies = {
-        name: {key: value for key, value in what.items() if key != _ANSWERS}
-        for name, what in earlier.policies.items()
-    }
-    old = earlier.config | {"policies": policies, "versions": earlier.versions}
-    new = prepared.record() | {"policies": prepared.policies, "versions": prepared.versions}
-    differing = differences(old, new)
+    differing = differences(_settings(earlier), _settings(prepared.results))
     if not differing:
         return earlier
     raise ConfigError(
@@ -248,73 +223,87 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     )
 
 
-def _play_all(prepared: PreparedEvaluation, report: Report | None) -> dict[Batch, Rollouts]:
+def _settings(results: Results) -> dict[str, object]:
+    """Return what the outcomes depend on."""
+    policies = {
+        name: {key: value for key, value in what.items() if key != _ANSWERS}
+        for name, what in results.policies.items()
+    }
+    return results.config | {"policies": policies, "versions": results.versions}
+
+
+def _play_all(prepared: PreparedEvaluation, report: Report | None) -> Played:
     """Run the batches that are not finished yet."""
-    config, jobs = prepared.config, _jobs(prepared)
+    config, batches = prepared.config, prepared.batches
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
-    kept = {job.batch: _kept(job, config.out) for job in jobs}
-    finished = {batch: played for batch, played in kept.items() if played is not None}
-    total, done = sum(job.batch.episodes for job in jobs), sum(batch.episodes for batch in finished)
+    finished = _finished(prepared)
+    total, done = sum(batch.episodes for batch in batches), sum(batch.episodes for batch in finished)
     if report is not None:
         report(done, total, "")
-    for job, played in _played(config, [job for job in jobs if job.batch not in finished]):
-        atomic_write_file(job.part(config.out), json.dumps(asdict(played), ensure_ascii=False) + "\n")
-        finished[job.batch] = played
-        done += job.batch.episodes
+    first = {batch.policy: batch for batch in reversed(batches)}
+    missing = [
+        replace(batch, may_fail=batch is not first[batch.policy])
+        for batch in batches
+        if batch not in finished
+    ]
+    for batch, played in _played(config, missing):
+        content = {"episodes": [asdict(episode) for episode in played]}
+        atomic_write_file(_part(batch, config), json.dumps(content, ensure_ascii=False) + "\n")
+        finished[batch] = played
+        done += batch.episodes
         if report is not None:
-            report(done, total, " ".join(filter(None, job.batch.cell)))
+            report(done, total, " ".join(filter(None, batch.cell)))
     return finished
 
 
-def _jobs(prepared: PreparedEvaluation) -> list[Job]:
-    """Return the batches, each with what its outcomes depend on."""
-    assets = prepared.config.env_config.assets
-    source = source_hash(assets, what="assets") if is_code(assets) else ""
-    code = [prepared.versions, source]
-    prints = {name: json.dumps([what, *code], sort_keys=True) for name, what in prepared.policies.items()}
-    first = {batch.policy: batch for batch in reversed(prepared.batches)}
-    return [
-        Job(
-            batch,
-            prints[batch.policy] + (prepared.boxes if batch.boxes else ""),
-            batch is not first[batch.policy],
-        )
-        for batch in prepared.batches
-    ]
+def _part(batch: Batch, config: EvaluationConfig) -> Path:
+    """Where the episodes of a batch are kept until all are there."""
+    return config.out / _PARTS / f"{batch.key}.json"
 
 
-def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Rollouts]]:
+def _finished(prepared: PreparedEvaluation) -> Played:
+    """Return the batches of an interrupted run; parts that cannot be used are left out."""
+    finished: Played = {}
+    for batch in prepared.batches:
+        with suppress(OSError, ValueError, TypeError, LookupError):
+            record = json.loads(_part(batch, prepared.config).read_text(encoding="utf-8"))
+            finished[batch] = [
+                PlayedEpisode(EpisodeOutcome(**episode["outcome"]), episode["actions"], episode["said"])
+                for episode in record["episodes"]
+            ]
+    return finished
+
+
+def _played(config: EvaluationConfig, batches: list[Batch]) -> Iterator[tuple[Batch, list[PlayedEpisode]]]:
     """Run batches on the configured engine and yield them as they finish."""
-    chats = [job for job in jobs if PolicyRef.parse(job.batch.source).kind == "vlm"]
+    chats = [batch for batch in batches if PolicyRef.parse(batch.source).kind == "vlm"]
     if chats:
         yield from _play_chats(chats, config.vlm.options.concurrency)
-        jobs = [job for job in jobs if job not in chats]
-        if not jobs:
+        batches = [batch for batch in batches if batch not in chats]
+        if not batches:
             return
-    yield from imap_with_engine(config.engine, play_batch, jobs, config.workers, address=config.address)
+    yield from imap_with_engine(config.engine, play_batch, batches, config.workers, address=config.address)
 
 
-def _play_chats(jobs: Sequence[Job], num_threads: int) -> Iterator[tuple[Job, Rollouts]]:
+def _play_chats(batches: Sequence[Batch], num_threads: int) -> Iterator[tuple[Batch, list[PlayedEpisode]]]:
     """Play the episodes of vision-language models in threads of this process: they wait for a server.
 
     Episodes of all batches overlap, so that the end of one leaves no request unused. Where it is stopped, the
     answers that are on their way are waited for, and kept.
     """
-    batches = {job.batch.source: job.batch for job in jobs}
-    policies = {source: build_policy(source, boxes=one.boxes, vlm=one.vlm) for source, one in batches.items()}
+    by_source = {batch.source: batch for batch in batches}
+    policies = {
+        source: build_policy(source, boxes=one.boxes, vlm=one.vlm) for source, one in by_source.items()
+    }
     with ThreadPoolExecutor(num_threads) as pool:
         playing = [
-            (
-                job,
-                [pool.submit(_play_chat, job, policies[job.batch.source], seed) for seed in job.batch.seeds],
-            )
-            for job in jobs
+            (batch, [pool.submit(_play_chat, batch, policies[batch.source], seed) for seed in batch.seeds])
+            for batch in batches
         ]
         try:
-            for job, episodes in playing:
-                outcomes, actions, said = zip(*(episode.result() for episode in episodes), strict=True)
-                yield job, Rollouts(outcomes, actions, said)
+            for batch, episodes in playing:
+                yield batch, [episode.result() for episode in episodes]
         except BaseException:
             for policy in policies.values():
                 policy.client.is_stopped = True
@@ -322,35 +311,21 @@ def _play_chats(jobs: Sequence[Job], num_threads: int) -> Iterator[tuple[Job, Ro
             raise
 
 
-def _play_chat(job: Job, policy: VlmPolicy, seed: int) -> tuple[EpisodeOutcome, Steps, Said]:
-    batch = job.batch
+def _play_chat(batch: Batch, policy: VlmPolicy, seed: int) -> PlayedEpisode:
     chat = VlmRolloutPolicy(policy.new_session(), batch.ablation, name=batch.policy)
-    recorder = ActionRecorder(chat)
     with policy.client.turn:
         env = batch.env_config.make(batch.task, batch.level, domain="eval")
-        (outcome,) = play([env], [seed], recorder, may_fail=job.may_fail)
-    return outcome, recorder.steps[0], chat.said[0]
+        (played,) = roll_out([env], [seed], chat, may_fail=batch.may_fail)
+    return replace(played, said=chat.said[0])
 
 
-def play_batch(job: Job, count: Callable[[int], None]) -> Rollouts:
+def play_batch(batch: Batch, count: Callable[[int], None]) -> list[PlayedEpisode]:
     """Run one batch in a worker process, possibly on another machine."""
-    batch = job.batch
     with one_thread(batch):
-        recorder = ActionRecorder(load_rollout_policy(batch, job.fingerprint))
         envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
-        outcomes = tuple(play(envs, batch.seeds, recorder, may_fail=job.may_fail))
-    count(len(outcomes))
-    return Rollouts(outcomes, tuple(recorder.steps))
-
-
-def _kept(job: Job, folder: Path) -> Rollouts | None:
-    """Episodes of a batch from an interrupted run; None if there are none, or no usable ones."""
-    try:
-        record = json.loads(job.part(folder).read_text(encoding="utf-8"))
-        outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
-        return Rollouts(outcomes, tuple(record["actions"]), tuple(record["said"]))
-    except (OSError, ValueError, TypeError, LookupError):
-        return None
+        played = roll_out(envs, batch.seeds, load_rollout_policy(batch), may_fail=batch.may_fail)
+    count(len(played))
+    return played
 
 
 def _write_log(
@@ -430,7 +405,7 @@ def score(
             f"policy {', '.join(own)} extracts objects by code of its own, which the ablation {NOISY_BOXES} "
             "does not reach; leave it out."
         )
-    outcomes: dict[Batch, list[EpisodeOutcome]] = {}
+    played: Played = {}
     begun: set[str] = set()
     with one_word_warning():
         for batch in plan(config):
@@ -442,7 +417,7 @@ def score(
                 else PromptedRolloutPolicy(given, batch.ablation, name=batch.policy)
             )
             may_fail = batch.policy in begun  # a policy that fails from the start is an error, no result
-            outcomes[batch] = play(envs, batch.seeds, rollout_policy, may_fail=may_fail)
+            played[batch] = roll_out(envs, batch.seeds, rollout_policy, may_fail=may_fail)
             begun.add(batch.policy)
     kinds = {
         source.name: {"kind": "object", **object_record(policies[source.name])}
@@ -450,4 +425,4 @@ def score(
         else source.record()
         for source in config.sources
     }
-    return Results(rows_of(outcomes), config.record(), versions(with_torch=True), kinds)
+    return Results(_rows(played), config.record(), versions(with_torch=True), kinds)

@@ -1,7 +1,8 @@
 """Episodes that are stepped, taken back and inspected; the studio and `play` are made of them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ from openvima.catalog import Assets
 from openvima.env.episode_file import load_episode
 from openvima.env.tabletop import TabletopEnv, VideoFrame
 from openvima.errors import (
-    ActionError,
     AnswerError,
     ConfigError,
     EpisodeError,
@@ -28,8 +28,7 @@ from openvima.evaluation.rollout_policies import (
     Decision,
     PromptedRolloutPolicy,
     RolloutPolicy,
-    explains,
-    explanation_of,
+    explainer_of,
     load_own_rollout_policy,
 )
 from openvima.evaluation.sources import ORACLE
@@ -53,11 +52,13 @@ class Proposal:
         action: Its action; None if there is no policy, or it gave none.
         explanation: What it considered, for policies that explain.
         error: Why there is no action, or no explanation.
+        decision: What the policy gave, also where it is no valid action.
     """
 
     action: Action | None = None
     explanation: Explanation | None = None
     error: OpenVimaError | None = None
+    decision: Decision = field(default=None, repr=False)
 
     __repr__ = brief_repr
 
@@ -69,14 +70,12 @@ class SessionStep:
     Args:
         action: The action.
         proposal: What the policy proposed; its action is another one where a user acted.
-        before: The scene before the step.
-        scene: The scene after it.
+        scene: The scene after the step.
         frames: Scenes and joint angles while it ran, 30 a second, if the session records them.
     """
 
     action: Action
     proposal: Proposal
-    before: Scene
     scene: Scene
     frames: tuple[VideoFrame, ...] = field(repr=False)
 
@@ -192,24 +191,23 @@ class EpisodeSession:
             raise EpisodeError(f"the episode ended at step {self.num_steps}; go back, or start another.")
         checked = None if action is None else Action.from_arrays(action.to_arrays())
         proposal = self.propose()
-        decision = checked or self._decision
+        decision = checked or proposal.decision
         if decision is None:
             return None
-        before = self.scene
         self._slot.step(decision)
-        if self._slot.steps == self.num_steps:  # not executed: the policy's action is invalid
+        if len(self._slot.actions) == self.num_steps:  # not executed: the policy's action is invalid
             return None
         done = checked or proposal.action
         assert done is not None  # as executed
-        step = SessionStep(done, proposal, before, self.scene, self.env.frames)
+        step = SessionStep(done, proposal, self.scene, self.env.frames)
         self.steps.append(step)
         self._proposal = None
         return step
 
-    def run(self) -> EpisodeOutcome | None:
-        """Step until the episode is over, or the policy gives no action."""
+    def run(self, after_step: Callable[[TabletopEnv], None] = lambda env: None) -> EpisodeOutcome | None:
+        """Step until the episode is over, or the policy gives no action; call a function after each step."""
         while self.outcome is None and self.step() is not None:
-            pass
+            after_step(self.env)
         return self.outcome
 
     def back(self, num_steps: int) -> None:
@@ -242,32 +240,29 @@ class EpisodeSession:
         self._slot = EpisodeSlot(self.env, self.episode)
         self.steps = []
         self._proposal: Proposal | None = None
-        self._decision: Decision = None
         self._begun = False
 
     def _ask(self, *, explain: bool) -> Proposal:
-        """Ask the policy, and keep what it decided."""
-        self._decision = None
+        """Ask the policy."""
         if self._policy is None or self.outcome is not None:
             return Proposal()
-        action = None
+        action, decision = None, None
         try:
             if not self._begun:
                 self._policy.begin([self.env])
                 self._begun = True
-            (self._decision,) = self._policy.decide([self._slot.observation])
-            if isinstance(self._decision, OracleError | AnswerError):
-                return Proposal(error=self._decision)
-            assert self._decision is not None  # rollout policies have checked it
-            given = self._decision
-            arrays: Any = given  # of an action: a policy of the other control is refused
-            action = given if isinstance(given, Action) else Action.from_arrays(arrays)
-            explains_it = explain and explains(self._policy)
-            return Proposal(action, explanation_of(self._policy) if explains_it else None)
+            (decision,) = self._policy.decide([self._slot.observation])
+            if isinstance(decision, OracleError | AnswerError):
+                return Proposal(error=decision, decision=decision)
+            given: Any = decision  # of an action: a policy of the other control is refused
+            action = given if isinstance(given, Action) else Action.from_arrays(given)
+            explainer = explainer_of(self._policy) if explain else None
+            return Proposal(action, explainer and explainer(), decision=decision)
         except OpenVimaError as error:
-            return Proposal(action, error=error)
+            return Proposal(action, error=error, decision=decision)
         except Exception as error:  # of the policy's own `explain`
-            return Proposal(action, error=PolicyError(f"the policy raised {described(error)}."))
+            raised = PolicyError(f"the policy raised {described(error)}.")
+            return Proposal(action, error=raised, decision=decision)
 
 
 def first_difference(first: Sequence[SessionStep], second: Sequence[SessionStep]) -> int | None:
@@ -376,40 +371,29 @@ def play(
     video = None if video is None else as_path(video)
     if video is not None and video.suffix.lower() != ".mp4":
         raise ConfigError(f"video is {str(video)!r}; videos are MP4 files; give a name that ends in .mp4.")
-    name = policy if isinstance(policy, str) else type(policy).__name__
-    player: Policy | RolloutPolicy = (
-        load_own_rollout_policy(policy, device=device, boxes=boxes, trust_code=trust_code)
-        if isinstance(policy, str)
-        else policy
-    )
+    if isinstance(policy, str):
+        name = policy
+        player = load_own_rollout_policy(policy, device=device, boxes=boxes, trust_code=trust_code)
+    else:
+        name, player = type(policy).__name__, policy
     session = EpisodeSession(
         episode, player, assets=assets, compat=compat, record=video is not None, explain=False
     )
-    if video is None:
-        outcome = _run(session)
-    else:
-        title = f"{episode.task} · {Path(name).name}"
-        with EpisodeRecorder(session.env, video, title=title) as recorder:
-            outcome = _run(session, recorder)
+    scenes, title = [session.scene], f"{episode.task} · {Path(name).name}"
+    with nullcontext() if video is None else EpisodeRecorder(session.env, video, title=title) as recorder:
+        outcome = session.run() if recorder is None else session.run(recorder.record_step)
+        if outcome is None:
+            error = session.propose().error
+            assert error is not None  # as there is a policy
+            raise error
+        if recorder is not None:
             recorder.record_outcome(outcome.success if episode.problem.goals else None, outcome.steps)
-    scenes = [*(step.before for step in session.steps), session.scene] if frames else []
+    scenes += [step.scene for step in session.steps]
     rasteriser = Rasteriser(session.env.assets)
     return PlayResult(
         episode,
         tuple(step.action for step in session.steps),
         Outcome(outcome.success, session.env.outcome.failure, outcome.reason),
         session.scene,
-        tuple(front_above_top(rasteriser.scene(scene)) for scene in scenes),
+        tuple(front_above_top(rasteriser.scene(scene)) for scene in scenes) if frames else (),
     )
-
-
-def _run(session: EpisodeSession, recorder: EpisodeRecorder | None = None) -> EpisodeOutcome:
-    """Step to the end, and raise what the policy raises."""
-    while session.outcome is None:
-        error = session.propose().error
-        ends = isinstance(error, ActionError | AnswerError | OracleError)  # the episode
-        if error is not None and not ends:
-            raise error
-        if session.step() is not None and recorder is not None:
-            recorder.record_step(session.env)
-    return session.outcome

@@ -50,14 +50,10 @@ class PolicySource:
         name: Name in the results.
         source: "oracle", "random", "untrained", "untrained:PRESET", the name of a bundled checkpoint,
             what else `load_policy` takes, or the address of a policy server.
-        trust_code: Whether to run the code that a run folder names.
-        vlm: How a vision-language model is asked.
     """
 
     name: str
     source: str
-    trust_code: bool = False
-    vlm: VlmConfig = DEFAULT_VLM
 
     @property
     def ref(self) -> PolicyRef:
@@ -78,8 +74,11 @@ class PolicySource:
         """The code of a learner of the user's own, if it is the run folder of one."""
         return learner_code(self.source) if self.kind == "run" and self.source not in BUNDLED else None
 
-    def check(self) -> None:
+    def check(self, *, trust_code: bool = False) -> None:
         """Check the name before any work is done for it: no weights are loaded, no server is asked.
+
+        Args:
+            trust_code: Whether to run the code that a run folder names.
 
         Raises:
             ConfigError: It looks like the address of a server and cannot be one, there is no such function,
@@ -87,26 +86,30 @@ class PolicySource:
             UnknownPolicyError: There is no such path or preset, and it is not like an id on the Hub; or it is
                 a preset, without weights.
         """
-        if self.kind == "lerobot":
+        kind = self.kind
+        if kind == "lerobot":
             raise ConfigError(
                 f"{echo(self.source)} runs in LeRobot's own environment: name its Python with `openvima "
                 f"evaluate --python`, or run PYTHON -m {SERVER_MODULE} PATH_OR_ID and give its address, ws://…."
             )
-        if self.kind == "vlm":
+        if kind == "vlm":
             require_extra()
-        elif self.kind == "remote":
+        elif kind == "remote":
             check_address(self.source)
-        elif self.kind == "code":
+        elif kind == "code":
             load_function(self.source, what="policy")
-        elif self.kind == UNTRAINED:
+        elif kind == UNTRAINED:
             _ = self.ref.preset  # raises
         elif code := self.learner:
-            code.check(trusted=self.trust_code)
-        elif self.kind == "run" and not self.ref.has_weights:
+            code.check(trusted=trust_code)
+        elif kind == "run" and not self.ref.has_weights:
             raise UnknownPolicyError(unknown_policy(self.source, NAMED_POLICIES))
 
-    def record(self) -> dict[str, Any]:
-        """What the policy is.
+    def record(self, vlm: VlmConfig = DEFAULT_VLM) -> dict[str, Any]:
+        """What the policy is, if `check` raises nothing.
+
+        Args:
+            vlm: How a vision-language model is asked.
 
         Returns:
             Plain values, "kind" first: for a remote policy what it says; for a vision-language model its name
@@ -118,21 +121,20 @@ class PolicySource:
             policy. Files that the source file imports are not hashed.
 
         Raises:
-            ConfigError: As for `check`, or a function raises.
-            UnknownPolicyError: As for `check`.
+            ConfigError: A function cannot be called.
             InputFileError: The run folder, or the package, holds no weights.
             PolicyError: A folder here is named like a bundled checkpoint and holds a checkpoint, too.
             ServerError: No policy server answers at the address.
         """
-        self.check()
-        if self.kind == "vlm":
-            return {"kind": "vlm", **self.vlm.record(self.ref.model)}
-        if self.kind == "remote":
+        kind = self.kind
+        if kind == "vlm":
+            return {"kind": "vlm", **vlm.record(self.ref.model)}
+        if kind == "remote":
             return {"kind": "remote", "metadata": describe(self.source)}
-        if self.kind == "code":
+        if kind == "code":
             policy = policy_of_code(self.source)
             return {"kind": "code", **_code_record(self.source), **object_record(policy)}
-        if self.kind == "run":
+        if kind == "run":
             if self.source in BUNDLED:
                 return {"kind": "run", "bundled": self.source, "sha256": weights_hash(self.source)}
             code = self.learner
@@ -144,19 +146,15 @@ class PolicySource:
             }
             known = {name: value for name, value in about.items() if value}
             return {"kind": "run", "sha256": weights_hash(self.source), **known}
-        is_preset = self.kind == UNTRAINED and self.source != UNTRAINED
-        return {"kind": self.kind} | ({"preset": self.ref.preset} if is_preset else {})
+        is_preset = kind == UNTRAINED and self.source != UNTRAINED
+        return {"kind": kind} | ({"preset": self.ref.preset} if is_preset else {})
 
 
-def policy_sources(
-    policies: Sequence[str], *, trust_code: bool = False, vlm: VlmConfig = DEFAULT_VLM
-) -> tuple[PolicySource, ...]:
+def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     """Read policies as given on the command line.
 
     Args:
         policies: Sources, or NAME=SOURCE; an existing path is a source, whatever it contains.
-        trust_code: As in `PolicySource`.
-        vlm: As in `PolicySource`.
 
     Raises:
         ConfigError: Two policies have the same name, a name is not fit for file names, or an address without
@@ -169,7 +167,7 @@ def policy_sources(
         name, equals, source = ("", "", given) if whole else given.partition("=")
         if not equals:
             name, source = _default_name(given), given
-        sources.append(PolicySource(name, source, trust_code, vlm))
+        sources.append(PolicySource(name, source))
     names = [source.name for source in sources]
     wrong = any(not s.source or re.fullmatch(r"\w[\w.+-]*", s.name) is None for s in sources)
     if wrong or len(set(names)) < len(names):

@@ -19,8 +19,8 @@ from openvima.evaluation.results import (
     FILE_NAME,
     EpisodeOutcome,
     Results,
-    ResultsFile,
     Row,
+    read_results,
     versions,
 )
 from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR, play
@@ -40,13 +40,11 @@ class VerifiedResults:
     """What a verification found.
 
     Args:
-        folder: Folder of the evaluation.
         episodes: Episodes that were played again.
         problems: What contradicts the file, one sentence each; empty if all is confirmed.
         sha256: Digest that the file names.
     """
 
-    folder: Path
     episodes: int
     problems: tuple[str, ...]
     sha256: str
@@ -62,7 +60,7 @@ class _Replay:
     """Some episodes of a row, with their recorded actions."""
 
     row: Row  # with the outcomes of these episodes only
-    actions: list[np.ndarray]
+    actions: Sequence[np.ndarray]
     env_config: EnvConfig
 
 
@@ -88,10 +86,10 @@ def verify_results(
         AssetError: The results name a function as their assets; pass it as `assets`.
     """
     path = folder / FILE_NAME
-    file = ResultsFile.read(path)
-    results = file.results
+    results, text = read_results(path)
     try:
-        problems = [*_text_problems(file), *_row_problems(results)]
+        stated, problems = _stated(results, text)
+        problems += _row_problems(results)
         _check_simulator(path, results.versions)
         env_config = recorded_env_config(results, assets)
         actions, sha256 = read_actions(folder, results.rows)
@@ -104,9 +102,9 @@ def verify_results(
     if not problems:
         problems += _replay_all(results, actions, env_config, workers, report)
     episodes = sum(row.episodes for row in results.rows)
-    found = VerifiedResults(folder, episodes, tuple(problems), file.sha256)
+    found = VerifiedResults(episodes, tuple(problems), stated)
     if found.is_verified:
-        record = {"sha256": file.sha256, "episodes": episodes, "versions": versions(with_torch=False)}
+        record = {"sha256": stated, "episodes": episodes, "versions": versions(with_torch=False)}
         atomic_write_file(folder / VERIFICATION_NAME, json.dumps(record, indent=1) + "\n")
     return found
 
@@ -122,25 +120,27 @@ def is_marked_verified(path: Path) -> bool:
     folder = path if path.is_dir() else path.parent
     try:
         mark = read_json(folder / VERIFICATION_NAME)["sha256"]
-        file = ResultsFile.read(path)
-        if mark != file.sha256 or next(_text_problems(file), None):
+        results, text = read_results(path)
+        if _stated(results, text) != (mark, []):
             return False
-        return read_actions(folder, file.results.rows)[1] == file.results.actions_sha256
+        return read_actions(folder, results.rows)[1] == results.actions_sha256
     except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         return False
 
 
-def _text_problems(file: ResultsFile) -> Iterator[str]:
-    """Compare the file with what its outcomes give: every count, mean, interval, and the digest."""
-    own_text = file.results.to_json()
-    if file.text == own_text:
-        return
-    own = json.loads(own_text)
-    differing = [key for key in own if file.content.get(key) != own[key] and key != "sha256"]
+def _stated(results: Results, text: str) -> tuple[str, list[str]]:
+    """Return the digest that a file states, and what in it does not follow from the outcomes.
+
+    That is any count, mean, interval, or the digest.
+    """
+    own_text, content = results.to_json(), json.loads(text)
+    sha256, own = str(content.get("sha256", "")), json.loads(own_text)
+    if text == own_text:
+        return sha256, []
+    differing = [key for key in own if content.get(key) != own[key] and key != "sha256"]
     if differing:
-        yield f"{', '.join(differing)} do not follow from the outcomes"
-    else:
-        yield "the file was edited after it was written: its digest differs"
+        return sha256, [f"{', '.join(differing)} do not follow from the outcomes"]
+    return sha256, ["the file was edited after it was written: its digest differs"]
 
 
 def _row_problems(results: Results) -> Iterator[str]:
@@ -199,7 +199,7 @@ def recorded_env_config(results: Results, assets: str | None) -> EnvConfig:
 
 def _replay_all(
     results: Results,
-    actions: Mapping[int, Sequence[np.ndarray]],
+    actions: Sequence[Sequence[np.ndarray]],
     env_config: EnvConfig,
     workers: int,
     report: Report | None,
@@ -207,16 +207,16 @@ def _replay_all(
     jobs = [
         _Replay(
             replace(row, outcomes=row.outcomes[first : first + _BATCH]),
-            list(actions[index][first : first + _BATCH]),
+            episodes[first : first + _BATCH],
             ablated_environment(row.ablation, env_config),
         )
-        for index, row in enumerate(results.rows)
+        for row, episodes in zip(results.rows, actions, strict=True)
         for first in range(0, row.episodes, _BATCH)
     ]
     total = sum(row.episodes for row in results.rows)
     watch = None if report is None else (lambda done: report(done, total, "replaying"))
-    problems = {id(job): found for job, found in imap_unordered(replay_episodes, jobs, workers, report=watch)}
-    return [problem for job in jobs for problem in problems[id(job)]]
+    problems = dict(imap_unordered(replay_episodes, jobs, workers, report=watch))
+    return [problem for job in jobs for problem in problems[job]]
 
 
 def replay_episodes(job: _Replay, count: Callable[[int], None]) -> list[str]:

@@ -62,13 +62,12 @@ def thumbnail_uri(rgb: np.ndarray, mask: np.ndarray | None = None, height: int =
     """
     from PIL import Image
 
-    pixels = rgb.transpose(1, 2, 0)
-    if mask is not None and mask.any():
-        rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-        pixels = pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    width = max(1, round(pixels.shape[1] * height / pixels.shape[0]))
+    image = Image.fromarray(rgb.transpose(1, 2, 0))
+    if mask is not None:
+        image = image.crop(Image.fromarray(mask).getbbox())  # all of it where the mask is empty
+    width = max(1, round(image.width * height / image.height))
     stream = io.BytesIO()
-    Image.fromarray(pixels.copy()).resize((width, height), Image.Resampling.LANCZOS).save(stream, "PNG")
+    image.resize((width, height), Image.Resampling.LANCZOS).save(stream, "PNG")
     return data_uri(stream.getvalue())
 
 

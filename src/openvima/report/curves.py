@@ -34,18 +34,6 @@ class Chart:
     percent: bool
 
 
-def find_metrics(run: Path) -> Path:
-    """The training record of a run folder; a file is one itself.
-
-    Raises:
-        DatasetError: There is none.
-    """
-    file = run / METRICS_FILE if run.is_dir() else run
-    if not file.is_file():
-        raise DatasetError(f"there is no {file}; give the folder of a training run or its {METRICS_FILE}.")
-    return file
-
-
 def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
     """Read the charts of training runs; those of several say in their titles whose they are.
 
@@ -59,7 +47,7 @@ def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
     return [
         replace(chart, title=label + chart.title)
         for label, run in zip(labels, runs, strict=True)
-        for chart in read_charts(find_metrics(run))
+        for chart in read_charts(run)
     ]
 
 
@@ -73,19 +61,23 @@ def run_labels(folders: Sequence[Path]) -> list[str]:
     return [f"{part[-1]} {number}" for number, part in enumerate(parts, start=1)]
 
 
-def read_charts(metrics: Path) -> list[Chart]:
+def read_charts(run: Path) -> list[Chart]:
     """Read the charts of a training run: losses and accuracies over the steps of each stage.
 
     Args:
-        metrics: A file with one JSON object a line: its "step", perhaps the "name" of its stage, and numbers.
-            Those with "loss" or "accuracy" in their names are charted; "validation_" means held out.
+        run: A run folder or its training record: a file with one JSON object a line, its "step", perhaps the
+            "name" of its stage, and numbers. Those with "loss" or "accuracy" in their names are charted;
+            "validation_" means held out.
 
     Returns:
         The charts.
 
     Raises:
-        DatasetError: The file is not of that form.
+        DatasetError: There is no file, or it is not of that form.
     """
+    metrics = run / METRICS_FILE if run.is_dir() else run
+    if not metrics.is_file():
+        raise DatasetError(f"there is no {metrics}; give the folder of a training run or its {METRICS_FILE}.")
     stages: dict[str, dict[str, list[tuple[float, float]]]] = {}
     try:
         lines = metrics.read_text(encoding="utf-8").splitlines()

@@ -80,7 +80,6 @@ class PublishedModel:
         return f"~{rate:.1f}" if mark == "~" else f"{rate:.1f}{mark}"
 
 
-@cache
 def published_models() -> tuple[PublishedModel, ...]:
     """All models whose level means were published."""
     return tuple(PublishedModel(**record) for record in _content()["levels"])
@@ -136,11 +135,10 @@ def is_comparable(results: Results) -> bool:
 
 def unusual_settings(results: Results, usual: Mapping[str, object] = PUBLISHED_SETTINGS) -> str:
     """Name settings in sentences that are not the usual ones, by default those that were published."""
-    found = {name: results.config.get(name, value) for name, value in usual.items()}
     return "".join(
-        f" {name.replace('_', ' ').capitalize()}: {value}."
-        for name, value in found.items()
-        if value != usual[name]
+        f" {name.replace('_', ' ').capitalize()}: {found}."
+        for name, value in usual.items()
+        if (found := results.config.get(name, value)) != value
     )
 
 
@@ -160,7 +158,6 @@ def published_rows(results: Results, models: Sequence[PublishedModel]) -> list[t
     return rows
 
 
-@cache
 def _by_task() -> dict[tuple[str, str, str], dict]:
     """Records by model, size and level."""
     return {(each["model"], each["size"], each["level"]): each for each in _content()["tasks"]}

@@ -1,5 +1,6 @@
 """Tables as records, and written in Markdown and in LaTeX."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -102,7 +103,7 @@ def latex_text(text: str) -> str:
         >>> print(latex_text("follow_order: 50 %"))
         follow\_order: 50 \%
     """
-    return "".join(_LATEX_TEXT.get(letter, letter) for letter in text)
+    return text.translate(str.maketrans(_LATEX_TEXT))
 
 
 def _markdown_table(table: Table) -> str:
@@ -122,9 +123,7 @@ def _markdown_cell(cell: Estimate | str) -> str:
 
 
 def _markdown_text(text: str) -> str:
-    for letter in "\\|_*<`[]":
-        text = text.replace(letter, f"\\{letter}")
-    return text
+    return re.sub(r"[\\|_*<`\[\]]", r"\\\g<0>", text)
 
 
 def _latex_table(table: Table) -> str:
@@ -151,4 +150,4 @@ def _latex_cell(cell: Estimate | str) -> str:
 
 def _label(text: str) -> str:
     """A name that LaTeX takes as a label: other letters become hyphens."""
-    return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text)
+    return re.sub("[^0-9A-Za-z]", "-", text)

@@ -175,8 +175,7 @@ def result_table(results: Results, *, published: bool = False) -> Table:
     for level in results.levels():
         tasks = results.tasks(level)
         for task in tasks:
-            rows = [results.row(policy, task, level) for policy in policies]
-            own = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
+            own = [_mean(results, policy, level, tasks=(task,)) for policy in policies]
             elsewhere = [task_rate(model, level, task) for model in models]
             starts = bool(lines) and task == tasks[0]
             lines.append(Line(task, (level, *own, *elsewhere), starts_group=starts))
@@ -218,14 +217,16 @@ def ablation_tables(results: Results) -> list[Table]:
 
 
 def _task_table(results: Results, policy: str) -> Table:
-    rows = [row for row in results.rows if (row.policy, row.ablation) == (policy, "")]
-    levels = [level for level in results.levels() if any(row.level == level for row in rows)]
-    tasks = list(dict.fromkeys(row.task for row in rows))
-    cells = {(row.task, row.level): Estimate(row.rate, row.interval) for row in rows}
-    lines = [Line(task, tuple(cells.get((task, level), "–") for level in levels)) for task in tasks]
-    played = {level: [task for task in tasks if (task, level) in cells] for level in levels}
-    means = (_mean(results, policy, level, tasks=own) for level, own in played.items())
-    lines.append(Line("mean", tuple(means), starts_group=True))
+    own = replace(
+        results, rows=tuple(row for row in results.rows if (row.policy, row.ablation) == (policy, ""))
+    )
+    levels = own.levels()
+    lines = [
+        Line(task, tuple(_mean(own, policy, level, tasks=(task,)) for level in levels))
+        for task in own.tasks()
+    ]
+    means = tuple(_mean(own, policy, level) for level in levels)
+    lines.append(Line("mean", means, starts_group=True))
     caption = f"Success rates of {policy} (%), with 95 % intervals. {_made_of(results, policy)}"
     return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
 

@@ -1,6 +1,7 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
 from collections.abc import Iterable, Mapping
+from itertools import cycle
 from typing import Any
 
 from openvima.evaluation.ablations import INPUT_ABLATIONS, names_in
@@ -106,14 +107,11 @@ def answers(results: Results, policy: str) -> str:
 def series_colours(results: Results) -> dict[str, str]:
     """CSS variable of the colour that stands for each policy."""
     colours: dict[str, str] = {}
-    num_others = 0
+    others = cycle(f"--series-{number + 1}" for number in range(_NUM_COLOURS))
     for policy in results.policy_names():
         own = f"--series-{results.policies.get(policy, {}).get('kind', 'run')}"
-        if own in _OWN_COLOURS and own not in colours.values():
-            colours[policy] = own
-        else:
-            colours[policy] = f"--series-{num_others % _NUM_COLOURS + 1}"
-            num_others += 1
+        is_free = own in _OWN_COLOURS and own not in colours.values()
+        colours[policy] = own if is_free else next(others)
     return colours
 
 
@@ -201,9 +199,8 @@ def episodes_each(rows: Iterable[Row]) -> str:
     return f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
 
 
-def finding(comparison: Comparison, difference: Difference | None = None) -> str:
-    """One difference, by default the overall one, in a sentence."""
-    difference = difference or comparison.overall
+def finding(comparison: Comparison, difference: Difference) -> str:
+    """One of its differences in a sentence."""
     where = difference.level or "all levels together"
     a, b, value, (low, high) = comparison.a, comparison.b, difference.difference, difference.interval
     if value < 0 and difference.verdict != "noise":  # a reader expects the better one first

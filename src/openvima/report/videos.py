@@ -4,15 +4,15 @@ import importlib.util
 import re
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 from openvima.atomic_io import folder_lock
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.evaluation.config import EvaluationConfig, cells
-from openvima.evaluation.results import Results, Row
-from openvima.evaluation.runner import Job, evaluate_prepared, prepare
+from openvima.evaluation.config import Batch, EvaluationConfig, cells
+from openvima.evaluation.results import Results
+from openvima.evaluation.runner import evaluate
 from openvima.evaluation.sources import TRAINED_KINDS, PolicySource
 from openvima.evaluation.verification import is_marked_verified
 from openvima.multiprocess import Report, imap_unordered
@@ -65,10 +65,7 @@ def require_extra() -> None:
 
 
 def evaluate_and_report(
-    config: EvaluationConfig,
-    videos: VideoSelection = DEFAULT_VIDEOS,
-    progress: Report | None = None,
-    on_results: Callable[[Results], None] | None = None,
+    config: EvaluationConfig, videos: VideoSelection = DEFAULT_VIDEOS, progress: Report | None = None
 ) -> Path:
     """Evaluate policies, record some of the episodes and write `report.html`: `openvima evaluate`.
 
@@ -76,7 +73,6 @@ def evaluate_and_report(
         config: What to evaluate.
         videos: Which episodes to record.
         progress: As for `evaluate`.
-        on_results: Called with the results before any video is recorded.
 
     Returns:
         `results.json`; `report.html` and the folder `videos` are beside it.
@@ -85,39 +81,59 @@ def evaluate_and_report(
         ConfigError: An episode to record is not part of the evaluation, or as for `evaluate`.
         MissingExtraError: matplotlib, PyAV or Jinja is not installed, or as for `evaluate`.
     """
-    require_extra()
-    requested_episodes(config, videos)
+    check_report(config, videos)
     with config.served() as served:
-        prepared = prepare(served)
-        with folder_lock(config.out):
-            path = evaluate_prepared(prepared, progress)
-            results = Results.read(path)
-            if on_results is not None:
-                on_results(results)
-            episodes = sum(row.episodes for row in results.rows)
-            note = None if progress is None else lambda text: progress(episodes, episodes, text)
-            write_report(
-                results,
-                config.out / REPORT_NAME,
-                command=default_command(results, config.policies),
-                runs=find_metrics(served.sources),
-                clips=_recorded(recording_jobs(served, videos, results), served, note),
-                confirmations={"DIR": is_marked_verified(config.out)},
-            )
+        path = evaluate(served, progress)
+        report_on(served, videos, progress, policies=config.policies)
     return path
 
 
+def check_report(config: EvaluationConfig, videos: VideoSelection) -> None:
+    """Check before an evaluation that its report can be written; raises as `evaluate_and_report` does."""
+    require_extra()
+    requested_episodes(config, videos)
+
+
+def report_on(
+    config: EvaluationConfig,
+    videos: VideoSelection,
+    progress: Report | None = None,
+    *,
+    policies: Sequence[str] = (),
+) -> None:
+    """Record some of the episodes of a finished evaluation and write its `report.html`.
+
+    Args:
+        config: The evaluation.
+        videos: Which episodes to record.
+        progress: Called with episodes of the evaluation, twice, and a note on the videos.
+        policies: Policies as given, for the command in the report; as for `default_command`.
+    """
+    with folder_lock(config.out):
+        results = Results.read(config.out)
+        episodes = sum(row.episodes for row in results.rows)
+        note = None if progress is None else lambda text: progress(episodes, episodes, text)
+        write_report(
+            results,
+            config.out / REPORT_NAME,
+            command=default_command(results, policies),
+            runs=find_metrics(config.sources),
+            clips=_recorded(recordings(config, videos, results), config, note),
+            confirmations={"DIR": is_marked_verified(config.out)},
+        )
+
+
 def _recorded(
-    jobs: Sequence[Job], config: EvaluationConfig, note: Callable[[str], None] | None
+    batches: Sequence[Batch], config: EvaluationConfig, note: Callable[[str], None] | None
 ) -> list[Clip]:
     """Record the episodes that were not recorded before."""
     clips = {(clip.policy, clip.task, clip.level, clip.seed): clip for clip in load_clips(config.out)}
-    missing = [job for job in jobs if job.episode not in clips]
-    for number, (job, clip) in enumerate(imap_unordered(record_clip, missing, config.workers or 1), 1):
-        clips[job.episode] = clip
+    missing = [batch for batch in batches if batch.episode not in clips]
+    for number, (batch, clip) in enumerate(imap_unordered(record_clip, missing, config.workers or 1), 1):
+        clips[batch.episode] = clip
         if note is not None:
             note(f"recorded {number} of {len(missing)} (--videos 0: none)")
-    requested = [clips.pop(job.episode) for job in jobs]
+    requested = [clips.pop(batch.episode) for batch in batches]
     found = [*requested, *clips.values()]  # those of an earlier command stay
     if missing:
         save_clips(found, config.out)
@@ -145,8 +161,8 @@ def requested_episodes(config: EvaluationConfig, videos: VideoSelection) -> list
     return requested
 
 
-def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Results) -> list[Job]:
-    """Choose which episodes to record.
+def recordings(config: EvaluationConfig, videos: VideoSelection, results: Results) -> list[Batch]:
+    """Choose which episodes to record, each as a batch of one.
 
     Of each task and level: the first `videos.per_task` solved episodes and failures of every trained policy.
     Of the oracle the first solved ones of each task. Without trained policies and oracle, of all policies.
@@ -155,7 +171,7 @@ def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Re
     """
     sources, requested = config.sources, requested_episodes(config, videos)
     shown = [source for source in sources if source.kind in (*TRAINED_KINDS, ORACLE)] or list(sources)
-    jobs: list[Job] = []
+    chosen: list[tuple[PolicySource, str, str, int]] = []
     for success in (False, True):
         for task in results.tasks():
             levels = [level for level in results.levels() if task in results.tasks(level)]
@@ -164,17 +180,19 @@ def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Re
                 if row is None or (source.kind == ORACLE and not (success and level == levels[0])):
                     continue
                 seeds = [outcome.seed for outcome in row.outcomes if outcome.success == success]
-                jobs += [_job(config, results, source, row, seed) for seed in seeds[: videos.per_task]]
-    jobs = jobs[: MOST_VIDEOS * videos.per_task]
-    for source in sources:
-        for task, level, seed in requested:
-            row = results.row(source.name, task, level)
-            if row is not None:
-                jobs.append(_job(config, results, source, row, seed))
-    return list(dict.fromkeys(jobs))
+                chosen += [(source, task, level, seed) for seed in seeds[: videos.per_task]]
+    chosen = chosen[: MOST_VIDEOS * videos.per_task]
+    chosen += [(source, *e) for source in sources for e in requested if results.row(source.name, *e[:2])]
+    return [
+        replace(
+            config.batch_of(source, "", task, level, seed, 1),
+            fingerprint=str(results.policies.get(source.name)),
+        )
+        for source, task, level, seed in dict.fromkeys(chosen)
+    ]
 
 
-def record_clip(job: Job, count: Callable[[int], None]) -> Clip:
+def record_clip(batch: Batch, count: Callable[[int], None]) -> Clip:
     """Record one episode; runs in a worker process."""
     from PIL import Image
 
@@ -183,14 +201,13 @@ def record_clip(job: Job, count: Callable[[int], None]) -> Clip:
     from openvima.video.prompt_strip import thumbnail
     from openvima.video.recorder import SceneRenderer
 
-    batch = job.batch
     env = batch.env_config.make(batch.task, batch.level, domain="eval", realtime=True)
     env.reset(seed=batch.first_seed)
     poster = png(Image.fromarray(SceneRenderer(env, enlarge=2).draw(env.scene)))
     prompt = tuple(part if isinstance(part, str) else png(thumbnail(part)) for part in env.prompt.sequence())
     with tempfile.TemporaryDirectory() as folder, one_thread(batch):
         path = Path(folder, "video.mp4")
-        policy = load_rollout_policy(batch, job.fingerprint)
+        policy = load_rollout_policy(batch)
         speaks = PolicyRef.parse(batch.source).kind == "vlm"  # then its words are beside the table
         outcome = record_episode(
             env, policy, batch.first_seed, path, with_prompt=False, explain=speaks, may_fail=True
@@ -218,8 +235,3 @@ def find_metrics(sources: Sequence[PolicySource]) -> list[Path]:
     ]
     places = [place for folder in folders for place in (folder, folder.parent, folder.parent.parent)]
     return [place / METRICS_FILE for place in places if (place / METRICS_FILE).is_file()][:1]
-
-
-def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int) -> Job:
-    batch = config.batch_of(source, "", row.task, row.level, seed, 1)
-    return Job(batch, str(results.policies.get(source.name)))

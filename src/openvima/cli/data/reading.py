@@ -22,7 +22,7 @@ def info(
     *,
     details: bool = False,
     as_json: Json = False,
-) -> int:
+) -> None:
     """Print counts, sizes, histograms and provenance of a folder of demonstrations.
 
     Example: openvima data info demos --details
@@ -32,9 +32,6 @@ def info(
             of which without details only the index is fetched.
         details: Count objects, textures and prompt images too; reads every file.
         as_json: Print everything as JSON.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.summary import summarise_folder
 
@@ -47,7 +44,6 @@ def info(
             print(_printable(line)) if isinstance(line, str) else print_table(line)
         if not details:
             print("\n--details counts objects, textures and prompt images too.")
-    return 0
 
 
 def _shown_name(folder: Path, summary: "Summary") -> str:

@@ -10,6 +10,7 @@ import tyro
 from openvima.cli.options import Folder, Out, Repository
 from openvima.cli.terminal import parse_list, parse_tasks, print_files, progress_bar
 from openvima.data.chat_settings import DEFAULT_ENLARGE, ChatView, Points
+from openvima.errors import ConfigError
 
 
 def sample(
@@ -22,7 +23,7 @@ def sample(
     seed: int = 0,
     workers: int = 1,
     force: bool = False,
-) -> int:
+) -> None:
     """Sample a fraction, or a number, of the demonstrations of each task.
 
     Samples of one seed are nested: the 1 % sample is a subset of the 10 % sample. Nothing in a demonstration
@@ -39,9 +40,6 @@ def sample(
         seed: Seed of the sample.
         workers: Number of processes.
         force: Replace a data set in the folder.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.subsets import SubsetConfig
     from openvima.data.subsets import sample as write_sample
@@ -49,7 +47,6 @@ def sample(
     config = SubsetConfig(folder, out, parse_tasks(tasks), seed, workers, force)
     with progress_bar("demonstrations") as report:
         print(write_sample(config, fraction, episodes=episodes, report=report))
-    return 0
 
 
 def split(
@@ -61,7 +58,7 @@ def split(
     seed: int = 0,
     workers: int = 1,
     force: bool = False,
-) -> int:
+) -> None:
     """Divide demonstrations into splits, such as for training and validation.
 
     Each episode is assigned to one split by a hash and stays there when episodes are added. Sizes therefore
@@ -77,9 +74,6 @@ def split(
         seed: Seed of the assignment.
         workers: Number of processes.
         force: Replace data sets in the folder.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.subsets import SubsetConfig, parse_splits
     from openvima.data.subsets import split as write_split
@@ -90,7 +84,6 @@ def split(
         written = write_split(config, fractions, report=report)
     for name in fractions:
         print(written / name)
-    return 0
 
 
 def merge(
@@ -100,7 +93,7 @@ def merge(
     duplicates: Literal["refuse", "skip"] = "refuse",
     workers: int = 1,
     force: bool = False,
-) -> int:
+) -> None:
     """Merge data sets, whatever their tasks, levels, settings and versions.
 
     Example: openvima data merge rotations stacks all-demos
@@ -111,20 +104,15 @@ def merge(
         duplicates: Refuse episodes that several sources contain, or skip all but one.
         workers: Number of processes.
         force: Replace a data set in the folder.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.subsets import MergeConfig
     from openvima.data.subsets import merge as write_merged
-    from openvima.errors import ConfigError
 
     if len(folders) < 2:
         raise ConfigError("give at least two folders: what to merge, and last where to write it.")
     config = MergeConfig(folders[:-1], folders[-1], parse_tasks(tasks), duplicates, workers, force)
     with progress_bar("demonstrations") as report:
         print(write_merged(config, report=report))
-    return 0
 
 
 def import_published(
@@ -136,7 +124,7 @@ def import_published(
     compression: Literal["lz4", "zstd"] = "zstd",
     workers: int = 1,
     force: bool = False,
-) -> int:
+) -> None:
     """Convert the demonstrations that the benchmark's authors published; docs/published_data.md says how.
 
     The zip archive is read where it is, without unpacking it, and nothing in it is run. Broken episodes are
@@ -152,9 +140,6 @@ def import_published(
         compression: Codec of the files; lz4 takes twice the space and is read faster.
         workers: Number of processes.
         force: Delete the data set that is in OUT.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.manifest import BROKEN_NAME
     from openvima.data.published import ImportConfig
@@ -179,7 +164,6 @@ def import_published(
             file=sys.stderr,
         )
     print(folder)
-    return 0
 
 
 def export_lerobot(
@@ -189,7 +173,7 @@ def export_lerobot(
     tasks: str = "all",
     pixels: Literal["yuv444p", "yuv420p"] = "yuv444p",
     force: bool = False,
-) -> int:
+) -> None:
     """Export demonstrations to the LeRobotDataset v3.0 format; docs/lerobot.md says what is in it.
 
     Example: openvima data export-lerobot demos demos_lerobot --tasks rotate,twist
@@ -201,9 +185,6 @@ def export_lerobot(
         pixels: yuv444p keeps colours within 2 of 255 levels; yuv420p is what browsers and graphics cards
             play, at half the resolution of colours.
         force: Replace the export that is in OUT.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.lerobot import LerobotConfig, export_lerobot
 
@@ -218,7 +199,6 @@ def export_lerobot(
         export_lerobot(config, report)
     print(f'LeRobotDataset("local/{out.name}", root="{out}") opens it in LeRobot.', file=sys.stderr)
     print(out)
-    return 0
 
 
 def export_chat(
@@ -233,7 +213,7 @@ def export_chat(
     boxes: str = "",
     questions: int = 0,
     seed: int = 0,
-) -> int:
+) -> None:
     """Export demonstrations as conversations for the fine-tuning of a vision-language model.
 
     An example is a step: what `openvima evaluate --policy vlm:MODEL` asks before it, in the same words, and
@@ -254,9 +234,6 @@ def export_chat(
         questions: Auxiliary questions for each demonstration: where an object is, which there are, how two
             lie to each other, what was moved.
         seed: Of the choice of questions.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.chat import ChatFormat
     from openvima.data.chat_export import export_chat as write_export
@@ -275,7 +252,6 @@ def export_chat(
             report=report,
         )
     print(written)
-    return 0
 
 
 def preprocess(
@@ -287,7 +263,7 @@ def preprocess(
     rerendered: int | None = None,
     out: Path | None = None,
     workers: int = 1,
-) -> int:
+) -> None:
     """Write the object cache of a folder of demonstrations, or the shards that it lacks.
 
     The cache holds the inputs of policies: crops and boxes of all objects, or whole frames at half the size.
@@ -308,14 +284,10 @@ def preprocess(
             `openvima train --loader.rerendered-prob`. Default: as they are stored.
         out: Folder of the cache; default: "object_cache" in the folder of demonstrations.
         workers: Number of processes.
-
-    Returns:
-        Exit status.
     """
     from openvima.data.object_cache import open_object_cache
     from openvima.data.reader import Dataset
     from openvima.detector.plugins import detected_object_cache, plugged_boxes
-    from openvima.errors import ConfigError
 
     if rerendered is not None and (boxes is not None or rerendered < 0):
         raise ConfigError(f"rerendered is {rerendered}; it must be 0 or more, and without --boxes.")
@@ -333,7 +305,6 @@ def preprocess(
             cache = detected_object_cache(dataset, found, **options, report=report)
     print(f"the object cache of {len(cache):,} demonstrations is ready.", file=sys.stderr)
     print(cache.folder)
-    return 0
 
 
 def push_to_hub(
@@ -342,7 +313,7 @@ def push_to_hub(
     *,
     private: bool = False,
     dry_run: bool = False,
-) -> int:
+) -> None:
     """Push demonstrations to the Hugging Face Hub, with a generated dataset card.
 
     The token is that of `hf auth login` or HF_TOKEN. Failed episodes and object caches are not pushed.
@@ -354,9 +325,6 @@ def push_to_hub(
         name: The repository, as OWNER/NAME or OWNER/NAME@BRANCH; it is created if there is none.
         private: Make a new repository private.
         dry_run: Print the card and list the files; nothing is sent.
-
-    Returns:
-        Exit status.
     """
     from openvima.publishing.push import demonstrations_files, push_demonstrations
 
@@ -364,4 +332,3 @@ def push_to_hub(
         print_files(demonstrations_files(folder, name))
     else:
         print(f"hf://{push_demonstrations(folder, name, private=private)}")
-    return 0
