@@ -161,7 +161,7 @@ def push_to_hub(
     Returns:
         Exit status.
     """
-    from openvima.publishing.push import policy_files, push_policy
+    from openvima.publishing import policy_files, push_policy
 
     if dry_run:
         print_files(policy_files(source, name, results=results, licence=licence))

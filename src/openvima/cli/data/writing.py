@@ -358,7 +358,7 @@ def push_to_hub(
     Returns:
         Exit status.
     """
-    from openvima.publishing.push import demonstrations_files, push_demonstrations
+    from openvima.publishing import demonstrations_files, push_demonstrations
 
     if dry_run:
         print_files(demonstrations_files(folder, name))
