@@ -53,10 +53,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             sync_file(temporary)
             os.replace(temporary, path)
             sync_file(path.parent)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
+    finally:
+        _remove(temporary)
 
 
 @contextlib.contextmanager
@@ -107,7 +105,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     remove_stale(path.parent, path.name)
-    shutil.rmtree(temporary, ignore_errors=True)
+    _remove(temporary)
     try:
         with naming(path, temporary):
             temporary.mkdir()
@@ -122,7 +120,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
             shutil.rmtree(backup, ignore_errors=True)
     finally:
         restore_folder(path)
-        shutil.rmtree(temporary, ignore_errors=True)
+        _remove(temporary)
 
 
 def restore_folder(path: Path) -> None:
@@ -142,16 +140,19 @@ def remove_stale(folder: Path, name: str | None = None) -> None:
     """
     start = "." if name is None else f".{name}."
     for found in os.listdir(folder):
-        if not (found.startswith(start) and found.endswith(".tmp")):
-            continue
-        path, process = folder / found, found.split(".")[-2]
-        if not process.isdecimal() or process_runs(int(process)):
-            continue
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
+        if found.startswith(start) and found.endswith(".tmp"):
+            process = found.split(".")[-2]
+            if process.isdecimal() and not process_runs(int(process)):
+                _remove(folder / found)
+
+
+def _remove(path: Path) -> None:
+    """Delete a file or folder, if there is one and the system lets us."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def process_runs(process_id: int) -> bool:

@@ -77,10 +77,9 @@ def fetch(name: HubName, files: Sequence[str], *, kind: HubKind = "model", into:
         ServerError: There is no such repository, or it cannot be reached.
     """
     hub = _client(f"to fetch {name} from the Hugging Face Hub")
-    place = {} if into is None else {"local_dir": into}
     with _failures(f"the download of {name}"):
         found = hub.snapshot_download(
-            name.repo, repo_type=kind, revision=name.revision, allow_patterns=list(files), **place
+            name.repo, repo_type=kind, revision=name.revision, allow_patterns=list(files), local_dir=into
         )
     return Path(found)
 

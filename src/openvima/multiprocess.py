@@ -16,6 +16,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
@@ -128,16 +129,15 @@ def check_workers(num_workers: int) -> None:
 
 
 def _run_serially(job: Job, items: Sequence[Any], report: Callable[[int], None]) -> Iterator[tuple[Any, Any]]:
-    before = last = 0
+    counts: list[int] = []
 
     def count(number: int) -> None:
-        nonlocal last
-        last = number
-        report(before + number)
+        counts[-1] = number
+        report(sum(counts))
 
     for item in items:
+        counts.append(0)
         yield item, job(item, count)
-        before, last = before + last, 0
 
 
 @contextlib.contextmanager
@@ -200,12 +200,8 @@ def _start_worker(counters: Any) -> None:
 
 def _run_one(job: Job, item: Any, slot: int) -> tuple[Any, list[UnknownWordWarning]]:
     """Run a job in a worker; return its result, and the unknown words to warn of where all come together."""
-
-    def count(number: int) -> None:
-        _counters[slot] = number
-
     with unknown_words() as found:
-        return job(item, count), found
+        return job(item, partial(_counters.__setitem__, slot)), found
 
 
 def _warn(found: Sequence[UnknownWordWarning]) -> None:
@@ -284,17 +280,15 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
     if address is None and ray.is_initialized():
         yield
         return
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    options = {"address": address or "local", "log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options |= {
-            "address": "local",
             "num_cpus": num_workers or num_cpus(),
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
         }
     else:
         _check_answers(address)
-        options["address"] = address
     try:
         ray.init(**options)
     except (ConnectionError, RuntimeError, ValueError) as error:

@@ -43,9 +43,9 @@ def load_function(source: str, *, what: str) -> Callable[..., Any]:
     if not is_code(source):
         raise ConfigError(f"{what} is {source!r}; name a function as {FORM}.")
     module = load_file(Path(where), what=what) if _is_file(where) else _load_module(where, what)
-    if not hasattr(module, name):
+    function = getattr(module, name, None)
+    if function is None:
         raise ConfigError(f"{what} is {source!r}, but {where} has no function {name!r}.")
-    function = getattr(module, name)
     if not callable(function):
         raise ConfigError(f"{what} is {source!r}, which is a {type(function).__name__}; name a function.")
     return function

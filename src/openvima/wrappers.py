@@ -289,7 +289,9 @@ class ProgressReward(gymnasium.Wrapper):
         return observation, float(reward) + self._potential - before - cost, terminated, truncated, info
 
     def _potential_of(self, info: Mapping[str, Any]) -> float:
-        potential = _potential(info["progress"])
+        progress = info["progress"]
+        distance = progress["distance_m"] + LEVER_M * progress["angle_rad"]
+        potential = progress["goals_met"] - (distance if np.isfinite(distance) else 0.0)
         if self.reach_weight and self._base.control == END_EFFECTOR:
             potential -= self.reach_weight * self._reach(self._base.tool[:2])
         return potential
@@ -336,11 +338,6 @@ def _shrunk(image: np.ndarray) -> np.ndarray:
     channels, height, width = image.shape
     tiles = image.reshape(channels, height // 2, 2, width // 2, 2)
     return tiles.mean(axis=(2, 4)).astype(np.uint8)
-
-
-def _potential(progress: Mapping[str, float]) -> float:
-    distance = progress["distance_m"] + LEVER_M * progress["angle_rad"]
-    return progress["goals_met"] - (distance if np.isfinite(distance) else 0.0)
 
 
 def _patches(crops: np.ndarray) -> np.ndarray:

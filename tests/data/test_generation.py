@@ -52,13 +52,13 @@ def test_a_finished_folder_is_left_alone(whole: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"level": "L2"}, "level is train, asked for is L2"),
-        ({"start_seed": 5}, "first_seed is 0, asked for is 5"),
-        ({"env_config": EnvConfig(prompts="mixed")}, "prompts is multimodal, asked for is mixed"),
+        ({"level": "L2"}, "level is 'train' there and 'L2' here"),
+        ({"start_seed": 5}, "first_seed is 0 there and 5 here"),
+        ({"env_config": EnvConfig(prompts="mixed")}, "prompts is 'multimodal' there and 'mixed' here"),
         ({"episodes": 2}, "of its 1 episodes 0 are asked for"),
         ({"episodes": 1}, "of its 2 episodes 1 are asked for"),
         ({"tasks": ("rotate",)}, "of its 2 episodes 0 are asked for"),
-        ({"images": False}, "images is True, asked for is False"),
+        ({"images": False}, "images is True there and False here"),
     ],
 )
 def test_another_data_set_in_the_folder_is_not_touched(whole: Path, changes: dict, message: str) -> None:

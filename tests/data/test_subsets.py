@@ -145,7 +145,7 @@ def test_an_episode_stays_in_its_part_when_data_are_added() -> None:
 )
 def test_parts_that_make_no_sense_are_refused(text: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
-        parse_splits(text)
+        split(SubsetConfig(Path("source"), Path("out")), parse_splits(text))
 
 
 def test_a_sample_holds_the_records_unchanged_and_names_its_source_by_content(

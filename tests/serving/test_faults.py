@@ -21,7 +21,7 @@ from openvima.policies.base import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
 from openvima.serving.protocol import encode_observation, encode_prompt, pack
-from openvima.serving.server import Session
+from openvima.serving.server import ServerConfig, Session
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
 SETTINGS = {"max_message_bytes": 2**18}
@@ -157,7 +157,7 @@ class Untouched(Telltale):
 
 
 def refusal(message: Any, policy: Any = None) -> str:
-    session = Session(policy or Untouched(), 64)
+    session = Session(policy or Untouched(), ServerConfig())
     answer = session.answer(pack(message))
     assert isinstance(answer, str)
     return answer
@@ -174,7 +174,7 @@ def test_a_policy_that_reads_language_is_served_descriptions() -> None:
             self.prompts = prompts
 
     policy = Listener()
-    session = Session(policy, 64, "text")
+    session = Session(policy, ServerConfig(prompts="text"))
     request = pack({"type": "reset", "prompts": [encode_prompt(made_up_prompt(3))]})
     assert session.answer(request) == pack({"type": "reset"})
     (prompt,) = policy.prompts
@@ -231,7 +231,7 @@ def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCap
         def reset(self, prompts) -> None:
             raise KeyError(hostile)
 
-    session = Session(Failing(), 64)
+    session = Session(Failing(), ServerConfig())
     with caplog.at_level(logging.ERROR):
         answers = [session.answer(pack({"type": "reset", "prompts": [prompt_with()]}))]
     answers += [

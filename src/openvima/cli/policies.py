@@ -146,7 +146,7 @@ def push_to_hub(
         private: Make a new repository private.
         dry_run: Print the card and list the files; nothing is sent.
     """
-    from openvima.publishing.push import policy_files, push_policy
+    from openvima.publishing import policy_files, push_policy
 
     if dry_run:
         print_files(policy_files(source, name, results=results, licence=licence))

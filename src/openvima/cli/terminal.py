@@ -207,7 +207,7 @@ def print_table(table: "Table", *, num_heads: int = 1) -> None:
 
 def print_files(files: Mapping[str, Path | bytes]) -> None:
     """Print the card to stdout, and the names and sizes of all files to stderr."""
-    from openvima.publishing.push import CARD_NAME
+    from openvima.publishing import CARD_NAME
 
     for name, content in files.items():
         size = len(content) if isinstance(content, bytes) else content.stat().st_size

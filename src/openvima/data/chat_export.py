@@ -3,16 +3,16 @@
 An example is a step: what `openvima evaluate --policy vlm:MODEL` asks before it, and the oracle's answer.
 """
 
+import itertools
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from openvima.atomic_io import atomic_folder, folder_lock
 from openvima.data.chat import (
     DEFAULT_FORMAT,
     ChatFormat,
@@ -25,7 +25,7 @@ from openvima.data.chat import (
 )
 from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration
-from openvima.data.subsets import check_out
+from openvima.data.subsets import new_folder
 from openvima.input_files import as_path
 from openvima.multiprocess import Report
 from openvima.perception.objects import ObjectExtractor
@@ -69,8 +69,7 @@ def export_chat(
         DatasetError: A shard is damaged.
     """
     dataset, out = Dataset(data, tasks=tasks), as_path(out)
-    check_out(out, [dataset.path], force=False)
-    with folder_lock(out), atomic_folder(out) as folder:
+    with new_folder(out, [dataset.path], force=False) as folder:
         (folder / _IMAGES).mkdir()
         with (folder / EXAMPLES_NAME).open("w", encoding="utf-8") as lines:
             for number, demo in enumerate(dataset, 1):
@@ -99,7 +98,7 @@ def export_chat(
 def _save(folder: Path, name: str, turns: Sequence[Turn]) -> list[str]:
     """Save the images of a conversation; return their paths in the folder, in reading order."""
     paths = []
-    for part in (part for turn in turns for part in turn.parts):
+    for part in itertools.chain.from_iterable(turn.parts for turn in turns):
         if isinstance(part, bytes):
             paths.append(f"{_IMAGES}/{name}-{len(paths)}.png")
             (folder / paths[-1]).write_bytes(part)
@@ -108,18 +107,19 @@ def _save(folder: Path, name: str, turns: Sequence[Turn]) -> list[str]:
 
 def _line(format: ExportFormat, name: str, turns: Sequence[Turn], paths: Sequence[str]) -> str:
     """Write an example; `paths` are those of its images, and may go on."""
-    shown = paths[: sum(isinstance(part, bytes) for turn in turns for part in turn.parts)]
+    said: list[dict[str, Any]] = []
+    shown = 0
+    for turn in turns:
+        shown += sum(isinstance(part, bytes) for part in turn.parts)
+        if format == "messages":
+            said.append({"role": turn.role, "content": [_block(part) for part in turn.parts]})
+        else:
+            text = "\n".join(part if isinstance(part, str) else "<image>" for part in turn.parts)
+            said.append({"from": _SPEAKERS[turn.role], "value": text})
     if format == "messages":
-        said = [{"role": turn.role, "content": [_block(part) for part in turn.parts]} for turn in turns]
-        example = {"id": name, "messages": said, "images": shown}
+        example = {"id": name, "messages": said, "images": paths[:shown]}
     else:
-        texts = [
-            "\n".join(each if isinstance(each, str) else "<image>" for each in turn.parts) for turn in turns
-        ]
-        said = [
-            {"from": _SPEAKERS[turn.role], "value": text} for turn, text in zip(turns, texts, strict=True)
-        ]
-        example = {"id": name, "image": shown, "conversations": said}
+        example = {"id": name, "image": paths[:shown], "conversations": said}
     return json.dumps(example, ensure_ascii=False) + "\n"
 
 
@@ -134,12 +134,15 @@ def _questions(
     kinds = (_where, _which, _relation, _change) if demo.scenes else ()
     for _ in range(count if kinds else 0):
         kind = kinds[rng.integers(len(kinds))]
-        if found := kind(demo, int(rng.integers(demo.num_steps)), form, rng):
-            parts, answer = found
-            yield Turn("user", parts), Turn("assistant", (answer,))
+        step = int(rng.integers(demo.num_steps))
+        if found := kind(demo, step, form, rng):
+            asked, answer = found
+            steps = (step, step + 1) if kind is _change else (step,)
+            views = [encode_picture(demo.rgb[form.views[0]][each], form.enlarge) for each in steps]
+            yield Turn("user", (*views, asked)), Turn("assistant", (answer,))
 
 
-Asked = tuple[tuple[Part, ...], str] | None  # question and answer; None where the scene has no such thing
+Asked = tuple[str, str] | None  # question and answer; None where the scene has no such thing
 
 
 def _where(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
@@ -148,14 +151,13 @@ def _where(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Gene
         return None
     name = sorted(points)[rng.integers(len(points))]
     asked = f'Where is the {name}? Answer with JSON: {{"point": POINT}}. {point_meaning(form)}'
-    return (_view(demo, step, form), asked), json.dumps({"point": points[name]})
+    return asked, json.dumps({"point": points[name]})
 
 
 def _which(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
     points = _points(demo, step, form)
     asked = 'Which objects are on the table? Answer with JSON: {"objects": {NAME: POINT}}. '
-    asked += point_meaning(form)
-    return (_view(demo, step, form), asked), json.dumps({"objects": dict(sorted(points.items()))})
+    return asked + point_meaning(form), json.dumps({"objects": dict(sorted(points.items()))})
 
 
 def _relation(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
@@ -167,8 +169,7 @@ def _relation(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.G
     where = (
         ("left", "right")[int(across > 0)] if abs(across) > abs(down) else ("above", "below")[int(down > 0)]
     )
-    asked = f"Where in the picture is the {one}, from the {other}? Answer left, right, above or below."
-    return (_view(demo, step, form), asked), where
+    return f"Where in the picture is the {one}, from the {other}? Answer left, right, above or below.", where
 
 
 def _change(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Generator) -> Asked:
@@ -178,12 +179,7 @@ def _change(demo: Demonstration, step: int, form: ChatFormat, rng: np.random.Gen
         'What was moved between these pictures? Answer with JSON: {"moved": {NAME: [POINT, POINT]}}, from '
         f"and to. {point_meaning(form)}"
     )
-    answer = {"moved": {name: [before[name], after[name]] for name in moved}}
-    return (_view(demo, step, form), _view(demo, step + 1, form), asked), json.dumps(answer)
-
-
-def _view(demo: Demonstration, step: int, form: ChatFormat) -> bytes:
-    return encode_picture(demo.rgb[form.views[0]][step], form.enlarge)
+    return asked, json.dumps({"moved": {name: [before[name], after[name]] for name in moved}})
 
 
 def _points(demo: Demonstration, step: int, form: ChatFormat) -> dict[str, list[float]]:

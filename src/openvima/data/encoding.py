@@ -111,15 +111,10 @@ class ShardInfo:
         """Settings of the environments; assets by their recorded name."""
         return EnvConfig(**{name: getattr(self, name) for name in ENV_SETTINGS})
 
-    def differences(self, asked: "ShardInfo") -> list[str]:
-        """Say how the settings and versions of a data set differ from those asked for."""
-        there, here = ({**asdict(info), **info.versions} for info in (self, asked))
-        names = [name for name in here if name not in ("task", "number", "versions")]
-        return [
-            f"{name} is {there.get(name)}, asked for is {here[name]}"
-            for name in names
-            if there.get(name) != here[name]
-        ]
+    def of_data_set(self) -> dict[str, Any]:
+        """Return the settings and versions that all shards of a data set share."""
+        own = ("task", "number", "versions")
+        return {name: value for name, value in {**asdict(self), **self.versions}.items() if name not in own}
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""
@@ -188,8 +183,11 @@ def encode(
     images = {name: array if with_images else array[:0] for name, array in columns.images.items()}
     for name, rows in {**columns.numbers, **images}.items():
         dtype = _TYPES[name].value_type
-        paths = name == "joint_paths"
-        items = _make_paths(rows, columns.path_lengths, dtype) if paths else _make_rows(rows, dtype)
+        if name == "joint_paths":  # one for each step
+            waypoints = _make_rows(rows, dtype.value_type)
+            items = _make_lists(waypoints, [0, *itertools.accumulate(map(len, demo.joint_paths))], dtype)
+        else:
+            items = _make_rows(rows, dtype)
         cells[name] = _make_lists(items, [0, len(items)], _TYPES[name])
     return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=schema)
 
@@ -204,11 +202,6 @@ def _make_lists(items: pa.Array, ends: Sequence[int], dtype: pa.ListType) -> pa.
     """Lists of the items, each up to where the next begins."""
     offsets = pa.py_buffer(np.array(ends, np.int32))
     return pa.Array.from_buffers(dtype, len(ends) - 1, [None, offsets], null_count=0, children=[items])
-
-
-def _make_paths(waypoints: np.ndarray, lengths: Sequence[int], dtype: pa.ListType) -> pa.ListArray:
-    """Lists of the waypoints of the arm, one for each step."""
-    return _make_lists(_make_rows(waypoints, dtype.value_type), [0, *itertools.accumulate(lengths)], dtype)
 
 
 def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:

@@ -1,27 +1,12 @@
 """Generating demonstrations: what a folder holds already, the rollouts, the finished data set."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from openvima.atomic_io import FINISH_S, folder_lock, parts_in_range
 from openvima.data.encoding import SkipKind, Skipped
-from openvima.data.manifest import (
-    MANIFEST_NAME,
-    check_shards,
-    clear,
-    finish_folder,
-    is_finished,
-    remove_leftovers,
-    storage_error,
-)
-from openvima.data.planning import (
-    COMMAND,
-    DOMAIN,
-    Block,
-    GenerateConfig,
-    plan,
-)
+from openvima.data.manifest import fill_folder
+from openvima.data.planning import COMMAND, DOMAIN, GenerateConfig, OracleBlock, plan
 from openvima.data.records import Demonstration, make_env, rollout_oracle
 from openvima.data.shard import Shard, ShardWriter, remedy
 from openvima.env import TabletopEnv
@@ -29,7 +14,7 @@ from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.multiprocess import Report, imap_with_engine
 
 
-def is_done(block: Block) -> bool:
+def is_done(block: OracleBlock) -> bool:
     """Say whether a block's shard needs no work.
 
     A shard is whole if its name exists. It is written again if more episodes are asked for than when it was
@@ -38,7 +23,7 @@ def is_done(block: Block) -> bool:
     return block.path.is_file() and len(Shard(block.path)) == block.episodes
 
 
-def write_block(block: Block, count: Callable[[int], None]) -> None:
+def write_block(block: OracleBlock, count: Callable[[int], None]) -> None:
     """Write one shard; a smaller one that is there is continued.
 
     Args:
@@ -126,61 +111,17 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     if config.engine == "ray":  # its workers have other working directories
         config = replace(config, out=config.out.absolute())
     blocks = plan(config)
-    own = blocks if config.shard_range is None else parts_in_range(blocks, config.shard_range)
-    config.out.mkdir(parents=True, exist_ok=True)
-    try:
-        with folder_lock(config.out, config.shard_range):
-            if config.force:
-                clear(config.out)
-            wanted = {block.path.name: (block.info, block.episodes) for block in blocks}
-            check_shards(config.out, COMMAND, wanted)
-            try:
-                _write_missing(config, own, report)
-            finally:
-                remove_leftovers(block.path for block in own)
-        _finish(config, blocks)
-    except BrokenPipeError:  # of `report`
-        raise
-    except OSError as error:
-        raise storage_error(config.out, [block.path for block in blocks], error) from error
+    fill_folder(
+        config.out,
+        COMMAND,
+        blocks,
+        is_done=is_done,
+        write=lambda missing, count: imap_with_engine(
+            config.engine, write_block, missing, config.workers, address=config.address, report=count
+        ),
+        settings=config.record,
+        shard_range=config.shard_range,
+        force=config.force,
+        report=report,
+    )
     return config.out
-
-
-def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report | None) -> None:
-    """Write those shards of this run that are not there.
-
-    Raises:
-        DatasetError: A shard is not where it should be.
-    """
-    missing = [block for block in own if not is_done(block)]
-    missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
-    total, left = (sum(block.episodes for block in part) for part in (own, missing))
-
-    def count(done: int) -> None:
-        if report is not None:
-            report(total - left + done, total, "")
-
-    count(0)
-    if not missing:
-        return
-    (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
-    for _ in imap_with_engine(
-        config.engine, write_block, missing, config.workers, address=config.address, report=count
-    ):
-        pass  # a block's result is its file
-    lost = [block.path for block in own if not block.path.is_file()]
-    if lost:
-        raise DatasetError(
-            f"{lost[0]} was written on another machine and is not to be seen on this one. "
-            "Give an --out that all machines of the cluster share."
-        )
-
-
-def _finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
-    """Write index and manifest if all shards are there, those of other ranges, too."""
-    if is_finished(config.out) or not all(is_done(block) for block in blocks):
-        return
-    with folder_lock(config.out, timeout_s=FINISH_S):  # others may have come to the same conclusion
-        if not is_finished(config.out):
-            paths, versions = [block.path for block in blocks], blocks[0].info.versions
-            finish_folder(config.out, paths, command=COMMAND, config=config.record(), versions=versions)

@@ -7,33 +7,32 @@ Source: the format's documentation (huggingface.co/docs/lerobot/lerobot-dataset-
 
 import contextlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima import __version__
-from openvima.atomic_io import atomic_folder, folder_lock
+from openvima.catalog.packs import recorded_assets
 from openvima.data.lerobot_frames import (
     FrameLayout,
     Trajectory,
-    dense_settings,
     dense_trajectory,
     frame_layout,
     step_trajectory,
 )
 from openvima.data.reader import Dataset
 from openvima.data.schema import IMAGE_SHAPE
-from openvima.data.subsets import check_out
-from openvima.errors import ConfigError
+from openvima.data.subsets import new_folder
+from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import settle
 from openvima.multiprocess import Report
 from openvima.render import channels_last
-from openvima.scene.action import CONTROL_HZ, END_EFFECTOR, PRIMITIVES
+from openvima.scene.action import CONTROL_HZ, END_EFFECTOR
 from openvima.video.encoder import VideoWriter, import_av
 
 CODEBASE_VERSION = "v3.0"
@@ -164,127 +163,66 @@ ROBOT_TYPE = "ur5"
 
 
 class LerobotWriter:
-    """Writes a data set into an empty folder, which is one after `finish`.
-
-    Numbers of up to `EPISODES_PER_FILE` episodes are in memory, and the pictures of one.
+    """Writes a data set into an empty folder, file by file; `finish` then makes it whole.
 
     Args:
         folder: The folder.
-        closing: Closes the videos, also should something fail.
         frames: What a frame holds.
         fps: Frames a second.
         pixels: Pixel format of the videos.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        closing: contextlib.ExitStack,
-        frames: FrameLayout,
-        *,
-        fps: int,
-        pixels: PixelFormat,
-    ) -> None:
+    def __init__(self, folder: Path, frames: FrameLayout, *, fps: int, pixels: PixelFormat) -> None:
         self._folder, self._frames, self._fps, self._pixels = folder, frames, fps, pixels
         self._schema = _schema(frames)
         self._tasks: dict[str, int] = {}
         self._num_episodes = self._num_frames = 0
-        self._first_frame = 0  # of the present files
-        self._row_schema: pa.Schema | None = None  # of the list of episodes; its first row gives it
-        self._tables: list[pa.Table] = []  # frames of each episode of the present files
-        self._rows: list[dict[str, Any]] = []  # and its entry in the list of episodes
         self._pixel_counts = {key: np.zeros((3, 256), np.int64) for key in frames.video_keys}
-        self._closing = closing
-        self._videos: dict[str, VideoWriter] = {}
 
-    def write(self, demo: Trajectory) -> None:
-        """Append an episode.
+    def write_file(self, number: int, episodes: Iterable[Trajectory]) -> None:
+        """Write the next episodes as one file of each kind: videos, frames, and the list of episodes.
+
+        Their numbers are in memory, and the pictures of one.
 
         Args:
-            demo: At least one step, with no more prompt images than the layout has.
+            number: From 0.
+            episodes: Of at least one step, with no more prompt images than the layout has.
         """
-        number = self._num_episodes // EPISODES_PER_FILE
-        if not self._rows:
-            self._begin_files(number)
-        values = {**self._frames.values(demo), **self._counters(demo)}
-        self._tables.append(_table(values, self._schema))
-        statistics = {**self._write_pictures(demo), **{k: value_statistics(v) for k, v in values.items()}}
-        start, end = self._num_frames, self._num_frames + demo.num_steps
-        row = {
-            "episode_index": self._num_episodes,
-            "tasks": [demo.prompt.text],
-            "length": demo.num_steps,
-            **_place("data", number),
-            "dataset_from_index": start,
-            "dataset_to_index": end,
-            **_place("meta/episodes", number),
-        }
-        for key in self._frames.video_keys:
-            row |= _place(f"videos/{key}", number)
-            row[f"videos/{key}/from_timestamp"] = (start - self._first_frame) / self._fps
-            row[f"videos/{key}/to_timestamp"] = (end - self._first_frame) / self._fps
-        for name, entry in statistics.items():
-            row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in entry.items()}
-        self._rows.append(row)
-        self._num_episodes += 1
-        self._num_frames = end
-        if len(self._rows) == EPISODES_PER_FILE:
-            self._finish_files(number)
+        first_frame, tables, rows = self._num_frames, [], []
+        with contextlib.ExitStack() as closing:
+            videos = {key: closing.enter_context(self._video(key, number)) for key in self._pixel_counts}
+            for demo in episodes:
+                values = {**self._frames.values(demo), **self._counters(demo)}
+                tables.append(_table(values, self._schema))
+                statistics = self._write_pictures(demo, videos)
+                statistics |= {name: value_statistics(column) for name, column in values.items()}
+                start, end = self._num_frames, self._num_frames + demo.num_steps
+                row = {
+                    "episode_index": self._num_episodes,
+                    "tasks": [demo.prompt.text],
+                    "length": demo.num_steps,
+                    **_place("data", number),
+                    "dataset_from_index": start,
+                    "dataset_to_index": end,
+                    **_place("meta/episodes", number),
+                }
+                for key in videos:
+                    row |= _place(f"videos/{key}", number)
+                    row[f"videos/{key}/from_timestamp"] = (start - first_frame) / self._fps
+                    row[f"videos/{key}/to_timestamp"] = (end - first_frame) / self._fps
+                for name, entry in statistics.items():
+                    row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in entry.items()}
+                rows.append(row)
+                self._num_episodes += 1
+                self._num_frames = end
+        for pattern, table in (
+            (DATA_PATH, pa.concat_tables(tables)),
+            (EPISODES_PATH, pa.Table.from_pylist(rows)),
+        ):
+            pq.write_table(table, numbered_path(self._folder, pattern, number), compression=_COMPRESSION)
 
     def finish(self) -> None:
-        """Write what is left, and the metadata."""
-        if self._rows:
-            self._finish_files(self._num_episodes // EPISODES_PER_FILE)
-        self._write_metadata()
-
-    def _counters(self, demo: Trajectory) -> dict[str, np.ndarray]:
-        steps = np.arange(demo.num_steps)
-        task_index = self._tasks.setdefault(demo.prompt.text, len(self._tasks))
-        return {
-            "timestamp": (steps / self._fps).astype(np.float32),
-            "frame_index": steps,
-            "episode_index": np.full_like(steps, self._num_episodes),
-            "index": steps + self._num_frames,
-            "task_index": np.full_like(steps, task_index),
-        }
-
-    def _write_pictures(self, demo: Trajectory) -> dict[str, Statistics]:
-        statistics = {}
-        views = {view: images[: demo.num_steps] for view, images in demo.rgb.items()}
-        for key, pictures in self._frames.pictures(views, demo.prompt).items():
-            for index, picture in enumerate(pictures):
-                repeat = demo.num_steps // len(pictures)
-                self._videos[key].write(channels_last(picture), repeat=repeat, is_key=index == 0)
-            counts = count_pixels(pictures, demo.num_steps)
-            self._pixel_counts[key] += counts
-            statistics[key] = pixel_statistics(counts, demo.num_steps)
-        return statistics
-
-    def _begin_files(self, number: int) -> None:
-        self._first_frame = self._num_frames
-        height, width = IMAGE_SHAPE
-        for key in self._frames.video_keys:
-            video = VideoWriter(
-                numbered_path(self._folder, VIDEO_PATH, number, video_key=key),
-                width,
-                height,
-                frames_per_second=self._fps,
-                pixels=self._pixels,
-                options={**_ENCODING, **_QUALITY[self._pixels]},
-            )
-            self._videos[key] = self._closing.enter_context(video)
-
-    def _finish_files(self, number: int) -> None:
-        """Close the videos, and write the tables of their episodes."""
-        self._closing.close()
-        rows = pa.Table.from_pylist(self._rows, schema=self._row_schema)
-        self._row_schema = rows.schema
-        for pattern, table in ((DATA_PATH, pa.concat_tables(self._tables)), (EPISODES_PATH, rows)):
-            path = numbered_path(self._folder, pattern, number)
-            pq.write_table(table, path, compression=_COMPRESSION)
-        self._tables, self._rows = [], []
-
-    def _write_metadata(self) -> None:
+        """Write the metadata."""
         info = {
             "codebase_version": CODEBASE_VERSION,
             "robot_type": ROBOT_TYPE,
@@ -310,6 +248,40 @@ class LerobotWriter:
         write_json(self._folder / INFO_PATH, info)
         write_json(self._folder / STATISTICS_PATH, plain)
         write_tasks(self._folder / TASKS_PATH, list(self._tasks))
+
+    def _counters(self, demo: Trajectory) -> dict[str, np.ndarray]:
+        steps = np.arange(demo.num_steps)
+        task_index = self._tasks.setdefault(demo.prompt.text, len(self._tasks))
+        return {
+            "timestamp": (steps / self._fps).astype(np.float32),
+            "frame_index": steps,
+            "episode_index": np.full_like(steps, self._num_episodes),
+            "index": steps + self._num_frames,
+            "task_index": np.full_like(steps, task_index),
+        }
+
+    def _video(self, key: str, number: int) -> VideoWriter:
+        height, width = IMAGE_SHAPE
+        return VideoWriter(
+            numbered_path(self._folder, VIDEO_PATH, number, video_key=key),
+            width,
+            height,
+            frames_per_second=self._fps,
+            pixels=self._pixels,
+            options={**_ENCODING, **_QUALITY[self._pixels]},
+        )
+
+    def _write_pictures(self, demo: Trajectory, videos: Mapping[str, VideoWriter]) -> dict[str, Statistics]:
+        statistics = {}
+        views = {view: images[: demo.num_steps] for view, images in demo.rgb.items()}
+        for key, pictures in self._frames.pictures(views, demo.prompt).items():
+            for index, picture in enumerate(pictures):
+                repeat = demo.num_steps // len(pictures)
+                videos[key].write(channels_last(picture), repeat=repeat, is_key=index == 0)
+            counts = count_pixels(pictures, demo.num_steps)
+            self._pixel_counts[key] += counts
+            statistics[key] = pixel_statistics(counts, demo.num_steps)
+        return statistics
 
     def _overall(self, name: str) -> Statistics:
         """Statistics of a column over all frames, read back from the files."""
@@ -397,38 +369,50 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     """
     import_av()  # before the work begins
     dataset = Dataset(config.data, tasks=config.tasks)
-    check_out(config.out, [config.data], force=config.force, is_own=lambda out: (out / INFO_PATH).is_file())
-    settings = dense_settings(dataset)
-    fps = CONTROL_HZ if settings else 1  # a whole number of float32 seconds, by which LeRobot finds frames
-    layout = find_layout(dataset, END_EFFECTOR if settings else PRIMITIVES)
-    with folder_lock(config.out), atomic_folder(config.out) as folder, contextlib.ExitStack() as closing:
-        writer = LerobotWriter(folder, closing, layout, fps=fps, pixels=config.pixels)
-        for number, demo in enumerate(dataset, 1):
-            if settings:
-                writer.write(dense_trajectory(demo, settings[demo.task, demo.level]))
+    layout = find_layout(dataset)
+    is_dense = layout.control == END_EFFECTOR
+    fps = CONTROL_HZ if is_dense else 1  # a whole number of float32 seconds, by which LeRobot finds frames
+
+    def trajectories(first: int) -> Iterator[Trajectory]:
+        for index in range(first, min(first + EPISODES_PER_FILE, len(dataset))):
+            demo = dataset[index]
+            if is_dense:
+                info = dataset.shard(dataset.locate(index)[0]).info
+                yield dense_trajectory(demo, replace(info.env_config, assets=recorded_assets(info.assets)))
             else:
-                writer.write(step_trajectory(demo, has_joints=layout.has_joints))
+                yield step_trajectory(demo, has_joints=layout.has_joints)
             if report:
-                report(number, len(dataset), demo.task)
+                report(index + 1, len(dataset), demo.task)
+
+    with new_folder(
+        config.out, [config.data], force=config.force, is_own=lambda out: (out / INFO_PATH).is_file()
+    ) as folder:
+        writer = LerobotWriter(folder, layout, fps=fps, pixels=config.pixels)
+        for number, first in enumerate(range(0, len(dataset), EPISODES_PER_FILE)):
+            writer.write_file(number, trajectories(first))
         writer.finish()
         _write_source(folder, dataset, config, fps)
     return config.out
 
 
-def find_layout(dataset: Dataset, control: str) -> FrameLayout:
+def find_layout(dataset: Dataset) -> FrameLayout:
     """Find what the frames of all episodes have in common, without reading images.
 
-    Args:
-        dataset: The demonstrations.
-        control: "primitives" or "end_effector".
+    Raises:
+        DatasetError: Some of the demonstrations are of low-level control, and others are not.
     """
-    num_images, has_joints = 0, True
+    controls, num_images, has_joints = set(), 0, True
     for name in dataset.shard_names():
-        table = dataset.shard(name).table(["prompt_images", "joint_paths", "steps"])
+        shard = dataset.shard(name)
+        controls.add(shard.info.control)
+        table = shard.table(["prompt_images", "joint_paths", "steps"])
         images, paths, steps = (column.combine_chunks() for column in table.columns)
         num_images = max(num_images, *images.value_lengths().to_pylist())
         has_joints = has_joints and paths.value_lengths().equals(steps)
-    return frame_layout(control, num_images, has_joints)
+    if len(controls) > 1:
+        mixed = ", ".join(sorted(controls))
+        raise DatasetError(f"{dataset.path} mixes controls {mixed}; export each by itself.")
+    return frame_layout(controls.pop(), num_images, has_joints)
 
 
 def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig, fps: int) -> None:

@@ -1,14 +1,12 @@
 """What a frame of the export holds: one frame a step, showing what the policy saw before its action."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from openvima.catalog.packs import recorded_assets
-from openvima.data.reader import Dataset
 from openvima.data.records import Demonstration, action_arrays
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.env.config import EnvConfig
@@ -235,21 +233,6 @@ def step_trajectory(demo: Demonstration, *, has_joints: bool) -> Trajectory:
         np.concatenate([*action_arrays(demo).values()], axis=1),
         demo.outcome.success,
     )
-
-
-def dense_settings(dataset: Dataset) -> dict[tuple[str, str], EnvConfig]:
-    """Return the settings of each task and level of a data set of low-level control; else nothing.
-
-    Raises:
-        DatasetError: Some of the demonstrations are of low-level control, and others are not.
-    """
-    infos = [dataset.shard(name).info for name in dataset.shard_names()]
-    controls = sorted({info.control for info in infos})
-    if len(controls) > 1:
-        raise DatasetError(f"{dataset.path} mixes controls {', '.join(controls)}; export each by itself.")
-    if controls == [EnvConfig().control]:
-        return {}
-    return {(i.task, i.level): replace(i.env_config, assets=recorded_assets(i.assets)) for i in infos}
 
 
 def dense_trajectory(demo: Demonstration, env_config: EnvConfig) -> Trajectory:

@@ -1,26 +1,31 @@
-"""What lies beside the shards: the index of episodes, and the manifest with counts, checksums and origin."""
+"""What lies beside the shards: the index of episodes, and the manifest with counts, checksums and origin.
 
+Also how a folder is filled with shards: which are there already, whose they are, what is missing.
+"""
+
+import contextlib
 import hashlib
 import itertools
 import json
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from openvima.atomic_io import atomic_write_file
+from openvima.atomic_io import FINISH_S, Part, atomic_write_file, folder_lock, parts_in_range
 from openvima.data.encoding import ShardInfo
 from openvima.data.schema import SCHEMA_VERSION
 from openvima.data.shard import Shard, Span, measure, remedy
-from openvima.errors import DatasetError, StorageError
+from openvima.errors import DatasetError, StorageError, differences
+from openvima.multiprocess import Report
 
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
@@ -247,29 +252,114 @@ def is_finished(folder: Path) -> bool:
     return (folder / MANIFEST_NAME).is_file() and (folder / INDEX_NAME).is_file()
 
 
-def check_shards(folder: Path, command: str, wanted: Mapping[str, tuple[ShardInfo, int]]) -> None:
-    """Refuse a folder whose shards do not belong to the data set that is asked for.
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A shard to be written.
+
+    Args:
+        path: The file.
+        info: What all its rows have in common.
+        episodes: Number of episodes, or the most that it can have.
+    """
+
+    path: Path
+    info: ShardInfo
+    episodes: int
+
+
+B = TypeVar("B", bound=Block)
+
+
+def fill_folder(
+    folder: Path,
+    command: str,
+    blocks: Sequence[B],
+    *,
+    is_done: Callable[[B], bool],
+    write: Callable[[Sequence[B], Callable[[int], None]], Iterable[object]],
+    settings: Callable[[], Mapping[str, Any]],
+    licence: str = LICENCE,
+    shard_range: Part | None = None,
+    force: bool = False,
+    report: Report | None = None,
+) -> None:
+    """Write those shards of a data set that are not there, and finish it once all are.
 
     Args:
         folder: The folder.
         command: What makes it; shards of a sample say the same of themselves, with other episodes.
-        wanted: File name of each shard that is asked for, to what its rows have in common and their number.
+        blocks: All its shards.
+        is_done: Whether a shard needs no work.
+        write: Writes shards, of which it yields anything, and calls a function with the number of episodes
+            done.
+        settings: Returns what decides the content, for the manifest; called once all shards are there.
+        licence: Of the demonstrations.
+        shard_range: First and past-the-end number of the shards to write; None means all of them.
+        force: Delete a data set that is in the folder.
+        report: Called with episodes done, those that were there included, episodes in all, and "".
 
     Raises:
-        DatasetError: Another command made it, it holds shards of other settings or versions, or more episodes
-            than are asked for.
-        DatasetError: A shard is damaged.
+        DatasetError: The folder holds a data set of another command, of other settings or versions, or with
+            more episodes; a shard is damaged, or not where it should be.
+        StorageError: The disk is full, or the folder cannot be written to.
+        OSError: It cannot be a folder, as where a file has that name.
+        FolderLockedError: Another process writes to the folder, or to the same shards of it.
     """
+    own = blocks if shard_range is None else parts_in_range(blocks, shard_range)
+    folder.mkdir(parents=True, exist_ok=True)
+    with storage_errors(folder, [block.path for block in blocks]):
+        with folder_lock(folder, shard_range):
+            if force:
+                clear(folder)
+            _check_shards(folder, command, blocks)
+            # Small ones then fill the gaps at the end.
+            missing = sorted(itertools.filterfalse(is_done, own), key=lambda block: -block.episodes)
+            total, left = (sum(block.episodes for block in part) for part in (own, missing))
+
+            def count(done: int) -> None:
+                if report is not None:
+                    report(total - left + done, total, "")
+
+            count(0)
+            try:
+                if missing:
+                    (folder / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
+                    for _ in write(missing, count):
+                        pass  # a block's result is its file
+            finally:  # what killed writers, perhaps on other machines, left of these shards
+                for block in own:
+                    for file in folder.glob(f".{block.path.name}.*.tmp"):
+                        file.unlink(missing_ok=True)
+            if lost := [block.path for block in own if not block.path.is_file()]:
+                raise DatasetError(
+                    f"{lost[0]} was written on another machine and is not to be seen on this one. "
+                    "Give an --out that all machines of the cluster share."
+                )
+        if not is_finished(folder) and all(map(is_done, blocks)):
+            with folder_lock(folder, timeout_s=FINISH_S):  # others may have come to the same conclusion
+                if not is_finished(folder):
+                    finish_folder(
+                        folder,
+                        [block.path for block in blocks],
+                        command=command,
+                        config=settings(),
+                        versions=blocks[0].info.versions,
+                        licence=licence,
+                    )
+
+
+def _check_shards(folder: Path, command: str, blocks: Sequence[Block]) -> None:
+    """Refuse a folder whose shards do not belong to the data set that is asked for."""
     if (folder / MANIFEST_NAME).is_file() and (made_by := read_manifest(folder)["command"]) != command:
         raise DatasetError(
             f"{folder} belongs to another data set: `{made_by}` made it. "
             "Give another --out, or --force to delete it."
         )
-    (any_info, _), *_ = wanted.values()
+    wanted = {block.path.name: (block.info, block.episodes) for block in blocks}
     for path in sorted(folder.glob("*.arrow")):
         shard = Shard(path)
-        info, num_episodes = wanted.get(path.name, (any_info, 0))
-        problems = shard.info.differences(info)
+        info, num_episodes = wanted.get(path.name, (blocks[0].info, 0))
+        problems = differences(shard.info.of_data_set(), info.of_data_set())
         if not problems and len(shard) > num_episodes:
             problems = [f"of its {len(shard)} episodes {num_episodes} are asked for"]
         if problems:
@@ -285,23 +375,21 @@ def clear(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def remove_leftovers(shards: Iterable[Path]) -> None:
-    """Delete what killed writers, perhaps on other machines, left of shards that are locked."""
-    for path in shards:
-        for file in path.parent.glob(f".{path.name}.*.tmp"):
-            file.unlink(missing_ok=True)
-
-
-def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> StorageError:
-    """Return the error to raise where a folder cannot be written to; it says how much of the work is kept.
+@contextlib.contextmanager
+def storage_errors(folder: Path, shards: Sequence[Path]) -> Iterator[None]:
+    """Let errors of the system say that a folder cannot be written to, and how much of the work is kept.
 
     Args:
         folder: The data set's folder.
         shards: All its shards, written or not.
-        error: What the system said.
     """
-    num_there = sum(path.is_file() for path in shards)
-    return StorageError(
-        f"cannot write to {folder}: {error.strerror or error}. {num_there} of {len(shards)} shards are "
-        "whole and were kept; the same command goes on from there."
-    )
+    try:
+        yield
+    except BrokenPipeError:  # of a terminal
+        raise
+    except OSError as error:
+        num_there = sum(path.is_file() for path in shards)
+        raise StorageError(
+            f"cannot write to {folder}: {error.strerror or error}. {num_there} of {len(shards)} shards are "
+            "whole and were kept; the same command goes on from there."
+        ) from error

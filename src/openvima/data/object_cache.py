@@ -4,10 +4,11 @@ A derived folder, written when first needed and safe to delete. It has an Arrow 
 row per demonstration, uncompressed and memory-mapped: a demonstration that is read is a set of views into it.
 """
 
+import contextlib
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import prod
 from operator import attrgetter
 from pathlib import Path
@@ -103,10 +104,9 @@ class Variant:
     @property
     def name(self) -> str:
         """Part of the folder's name."""
-        names = []
-        if self.boxes:
-            part = f"-{self.boxes.fraction:g}" if self.boxes.fraction < 1 else ""
-            names.append(f"{self.boxes.name}{part}")
+        boxes, names = self.boxes, []
+        if boxes:
+            names.append(boxes.name if boxes.fraction == 1 else f"{boxes.name}-{boxes.fraction:g}")
         if self.appearance is not None:
             names.append(f"rerendered-v{RERENDERING_VERSION}-{self.appearance}")
         return "-".join(names)
@@ -138,7 +138,7 @@ class CacheFile:
             self._scalars = {name: rows.column(name).to_pylist() for name in _SCALARS}
             self._checksums = rows.column(_CHECKSUM).to_pylist()
         except DAMAGE_ERRORS as error:
-            raise DatasetError(_describe_damage(path, one_line(error))) from None
+            raise _damage(path, one_line(error)) from None
         self.kind: InputKind = about["kind"]
         self.source, self.variant = about["source"], about["variant"]
 
@@ -153,34 +153,26 @@ class CacheFile:
                 arrays[name] = flat[start:end]
         scalars = tuple([column[row] for column in self._scalars.values()])
         if _checksum(scalars, arrays.values()) != self._checksums[row]:
-            raise DatasetError(
-                _describe_damage(self.path, f"the checksum of row {row} of {len(self)} is wrong")
-            )
+            raise _damage(self.path, f"the checksum of row {row} of {len(self)} is wrong")
         task, seed, end_effector, text, descriptions = scalars
         in_prompt, objects, final = (
             ObjectTable(*(arrays[f"{path}.{name}"] for name in _OBJECT))
             for path in ("prompt.objects", "objects", "final")
         )
+        shown = arrays["prompt.objects_per_image"], arrays["prompt.is_scene"]
+        spurious = arrays["false_positives.crop_index"], arrays["false_positives.boxes"]
+        names = "objects_per_step", "pick_ids", "place_ids", "actions", "images"
+        described = zip(image_names(text), descriptions, strict=True)
         return PreprocessedEpisode(
             task=task,
             seed=seed,
             end_effector=end_effector,
-            prompt=PreprocessedPrompt(
-                text, in_prompt, arrays["prompt.objects_per_image"], arrays["prompt.is_scene"]
-            ),
+            prompt=PreprocessedPrompt(text, in_prompt, *shown),
             objects=objects,
-            objects_per_step=arrays["objects_per_step"],
-            pick_ids=arrays["pick_ids"],
-            place_ids=arrays["place_ids"],
-            false_positives=FalsePositives(
-                arrays["false_positives.crop_index"], arrays["false_positives.boxes"]
-            ),
+            false_positives=FalsePositives(*spurious),
             final=final,
-            actions=arrays["actions"],
-            images=arrays["images"],
-            descriptions={
-                name: texts for name, texts in zip(image_names(text), descriptions, strict=True) if texts
-            },
+            descriptions={name: texts for name, texts in described if texts},
+            **{name: arrays[name] for name in names},
         )
 
     def counts(self, column: str) -> np.ndarray:
@@ -277,9 +269,11 @@ def _checksum(scalars: tuple[object, ...], arrays: Iterable[np.ndarray]) -> int:
     return digest.intdigest()
 
 
-def _describe_damage(path: Path, reason: str) -> str:
-    remedy = "Delete it; `openvima data preprocess` makes it anew"
-    return f"{path} is no readable file of the object cache ({reason}). {remedy}."
+def _damage(path: Path, reason: str) -> DatasetError:
+    return DatasetError(
+        f"{path} is no readable file of the object cache ({reason}). Delete it; `openvima data preprocess` "
+        "makes it anew."
+    )
 
 
 class ObjectCache(Sequence[PreprocessedEpisode]):
@@ -312,13 +306,12 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     ) -> None:
         self.dataset, self.kind, self.variant, self._root = dataset, kind, variant, folder
         self.folder = _cache_folder(dataset, kind, folder, variant)
-        files = _open_files(self.folder, _index_by_shard(dataset), kind, variant)
-        if missing := [name for name, file in files.items() if file is None]:
+        self._files, missing = _open_files(self.folder, split_index(dataset.index), kind, variant)
+        if missing:
             raise DatasetError(
                 f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; `openvima data preprocess` "
                 "writes them."
             )
-        self._files = {name: file for name, file in files.items() if file is not None}
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -332,29 +325,12 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
 
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the visible objects of all of them, shape (N, 2), int64."""
-        return self._gather(lambda file: np.stack([file.counts("steps"), file.counts("objects")], axis=1))
+        counts = [[file.counts("steps"), file.counts("objects")] for file in self._files.values()]
+        return np.concatenate(counts, axis=1, dtype=np.int64).T
 
     def image_counts(self) -> np.ndarray:
         """Return the number of images of each episode, shape (N,), int64."""
-        return self._gather(lambda file: file.counts("images"))
-
-    def _gather(self, read: Callable[[CacheFile], np.ndarray]) -> np.ndarray:
-        """Read numbers of all rows of all files, and put them into the order of the episodes."""
-        of_file = {name: read(file) for name, file in self._files.items()}
-        places = self.dataset.locations(np.arange(len(self)))
-        return np.array([of_file[name][row] for name, row in places], np.int64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Work:
-    """A shard, with its part of the index, and the file to write for it."""
-
-    shard: Path
-    envelope: Envelope
-    index: pa.Table
-    path: Path
-    kind: InputKind
-    variant: Variant
+        return np.concatenate([file.counts("images") for file in self._files.values()], dtype=np.int64)
 
 
 def open_object_cache(
@@ -390,9 +366,23 @@ def open_object_cache(
         raise DatasetError(f"boxes are those of {boxes.name}, but whole frames have none; leave them out.")
     variant = Variant(boxes, appearance)
     if check_object_cache(dataset, kind, variant, folder=folder):
-        target = _cache_folder(dataset, kind, folder, variant.name)
+        target, indices = _cache_folder(dataset, kind, folder, variant.name), split_index(dataset.index)
         with folder_lock(target, timeout_s=timeout_s):
-            _write_missing(dataset, kind, variant, target, workers, report)
+            _, missing = _open_files(target, indices, kind, variant.name)
+            missing.sort(key=lambda name: -indices[name].num_rows)
+            total = sum(indices[name].num_rows for name in missing)
+            entries = dataset.manifest["shards"]
+            work = [
+                (dataset.path / name, Envelope.from_entry(entries[name]), indices[name], target / name)
+                for name in missing
+            ]
+            job = partial(_write, kind=kind, variant=variant)
+            watch = report and (lambda done: report(done, total, ""))
+            try:
+                for _ in imap_unordered(job, work, workers, report=watch):
+                    pass  # the result of a job is its file
+            finally:
+                _extractor.cache_clear()  # where it was made here
     return ObjectCache(dataset, kind, folder, variant.name)
 
 
@@ -411,7 +401,8 @@ def check_object_cache(
         DatasetError: The folder would have to be written to, and cannot be.
     """
     target = _cache_folder(dataset, kind, folder, variant.name)
-    if None not in _open_files(target, _index_by_shard(dataset), kind, variant.name).values():
+    _, missing = _open_files(target, split_index(dataset.index), kind, variant.name)
+    if not missing:
         return False
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -431,58 +422,35 @@ def _cache_folder(dataset: Dataset, kind: InputKind, folder: str | Path | None, 
     return (as_path(folder) if folder else dataset.path / CACHE_FOLDER) / "-".join(parts)
 
 
-def _index_by_shard(dataset: Dataset) -> dict[str, pa.Table]:
-    """Return the whole index of each shard that holds episodes of a data set."""
-    whole = dataset if dataset.tasks is None else Dataset(dataset.path)
-    wanted = set(dataset.shard_names())
-    return {name: part for name, part in split_index(whole.index).items() if name in wanted}
-
-
 def _open_files(
     folder: Path, indices: Mapping[str, pa.Table], kind: InputKind, variant: str
-) -> dict[str, CacheFile | None]:
-    """Open the file of each shard; None if it is missing, damaged, or of another version or content."""
-    files: dict[str, CacheFile | None] = {}
+) -> tuple[dict[str, CacheFile], list[str]]:
+    """Open the file of each shard; list those missing, damaged, or of another version or content.
+
+    A shard has one task, so that the data set has all of its rows or none.
+    """
+    files, missing = {}, []
     for name, index in indices.items():
-        try:
-            file = CacheFile(folder / name)
-        except DatasetError:
-            files[name] = None
-            continue
         asked = (joint_hash(index.column("content_hash").to_pylist()), kind, variant)
-        files[name] = file if (file.source, file.kind, file.variant) == asked else None
-    return files
+        with contextlib.suppress(DatasetError):
+            file = CacheFile(folder / name)
+            if (file.source, file.kind, file.variant) == asked:
+                files[name] = file
+        if name not in files:
+            missing.append(name)
+    return files, missing
 
 
-def _write_missing(
-    dataset: Dataset, kind: InputKind, variant: Variant, folder: Path, workers: int, report: Report | None
+def _write(
+    work: tuple[Path, Envelope, pa.Table, Path],
+    count: Callable[[int], None],
+    *,
+    kind: InputKind,
+    variant: Variant,
 ) -> None:
-    indices, entries = _index_by_shard(dataset), dataset.manifest["shards"]
-    work = [
-        _Work(
-            dataset.path / name,
-            Envelope.from_entry(entries[name]),
-            indices[name],
-            folder / name,
-            kind,
-            variant,
-        )
-        for name, file in _open_files(folder, indices, kind, variant.name).items()
-        if file is None
-    ]
-    work.sort(key=lambda item: -item.index.num_rows)
-    total = sum(item.index.num_rows for item in work)
-    try:
-        for _ in imap_unordered(
-            _write, work, workers, report=report and (lambda done: report(done, total, ""))
-        ):
-            pass  # the result of a job is its file
-    finally:
-        _extractor.cache_clear()  # where it was made here
-
-
-def _write(work: _Work, count: Callable[[int], None]) -> None:
-    shard, index, variant = Shard(work.shard, work.envelope), work.index, work.variant
+    """Write a file for a shard, given with its part of the index."""
+    path, envelope, index, target = work
+    shard = Shard(path, envelope)
     extractor = _extractor(variant.boxes) if variant.boxes else None
     kept = split_hashes(index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
     tasks, seeds = (index.column(name).to_pylist() for name in ("task", "seed"))
@@ -490,18 +458,18 @@ def _write(work: _Work, count: Callable[[int], None]) -> None:
     for row, span in enumerate(list_spans(index)):
         is_unknown = variant.appearance is not None and tasks[row] == COMPOSED  # its prompt is not sampled
         if is_unknown or not kept[row]:
-            episodes.append(empty_episode(tasks[row], seeds[row], work.kind))
+            episodes.append(empty_episode(tasks[row], seeds[row], kind))
         else:
             shard.check(row, span)
             demo = shard[row]
             if variant.appearance is not None:
                 demo = with_random_appearance(demo, shard.info, variant.appearance)
-            episode = preprocess(demo, work.kind, extractor)
+            episode = preprocess(demo, kind, extractor)
             # Random appearances have no names.
             episodes.append(episode if variant.appearance is None else replace(episode, descriptions={}))
         count(row + 1)
     source = joint_hash(index.column("content_hash").to_pylist())
-    write_cache_file(work.path, episodes, work.kind, source, variant.name)
+    write_cache_file(target, episodes, kind, source, variant.name)
 
 
 @lru_cache(maxsize=1)

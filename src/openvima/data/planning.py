@@ -14,6 +14,7 @@ from typing import Any, Literal
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import Block
 from openvima.data.records import package_versions
 from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
 from openvima.errors import ConfigError, brief_repr, unknown_name
@@ -165,25 +166,19 @@ def generate_command(out: Path, record: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
-    """One shard to be written: so many episodes out of a range of seeds of its own.
+class OracleBlock(Block):
+    """A shard with so many episodes out of a range of seeds of its own.
 
     Args:
-        path: The file.
-        info: What all its rows have in common.
-        episodes: Number of successful episodes.
         seeds: Seeds to try, in order.
         env_config: As in `GenerateConfig`.
     """
 
-    path: Path
-    info: ShardInfo
-    episodes: int
     seeds: range
     env_config: EnvConfig
 
 
-def plan(config: GenerateConfig) -> list[Block]:
+def plan(config: GenerateConfig) -> list[OracleBlock]:
     """Divide the work into blocks.
 
     Args:
@@ -208,7 +203,7 @@ def plan(config: GenerateConfig) -> list[Block]:
                 images=config.images,
                 **{**asdict(config.env_config), "assets": assets},
             )
-            blocks.append(Block(config.out / info.file_name, info, episodes, seeds, config.env_config))
+            blocks.append(OracleBlock(config.out / info.file_name, info, episodes, seeds, config.env_config))
     return blocks
 
 

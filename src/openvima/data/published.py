@@ -8,17 +8,12 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from openvima.atomic_io import NO_SPACE, atomic_write_file, folder_lock
+from openvima.atomic_io import atomic_write_file
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
     BROKEN_NAME,
-    MANIFEST_NAME,
-    check_shards,
-    clear,
-    finish_folder,
-    is_finished,
-    remove_leftovers,
-    storage_error,
+    Block,
+    fill_folder,
 )
 from openvima.data.published_episode import ASSETS, DOMAIN, LEVEL, package_versions, read_demonstration
 from openvima.data.published_sources import EpisodeFolders, ZipArchive
@@ -117,7 +112,12 @@ class PublishedData(Sequence[Demonstration]):
         self.source = open_source(self.path)
         places, self.broken_folders = _sort_places(self.source)
         if self.tasks is not None:
-            places = _select_tasks(places, self.tasks, self.path)
+            present = {place.key.task for place in places}
+            wanted = {current_task(task) or task_spec(task).name for task in self.tasks}
+            if missing := sorted(wanted - present):
+                there = ", ".join(sorted(present)) or "none"
+                raise DatasetError(f"{self.path} has no episodes of {missing[0]}; it has {there}.")
+            places = [place for place in places if place.key.task in wanted]
         self.places = tuple(places)
         if not self.places:
             raise DatasetError(
@@ -196,9 +196,19 @@ def open_source(path: Path) -> Source:
 
 
 def read_place(source: Source, place: EpisodePlace) -> Demonstration | Broken:
-    """Read one episode, or say what is wrong with it."""
+    """Read one episode, or say what is wrong with it.
+
+    Raises:
+        DatasetError: The source cannot be read any more.
+    """
     try:
-        return read_demonstration(source.files(place.place), task=place.key.task, folder=place.folder)
+        files = source.files(place.place)
+    except OSError as error:
+        raise DatasetError(f"{source.path} cannot be read: {error.strerror or error}.") from error
+    except DatasetError as error:
+        return Broken(place.folder, str(error))
+    try:
+        return read_demonstration(files, task=place.key.task, folder=place.folder)
     except DatasetError as error:
         return Broken(place.folder, str(error))
 
@@ -222,19 +232,6 @@ def _sort_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]
     strange = sorted(parent for parent, task in todays.items() if task is None)
     unknown = "there is no task of that name, so its episodes are left out."
     return [places[key][1] for key in sorted(places)], tuple(Broken(parent, unknown) for parent in strange)
-
-
-def _select_tasks(places: Sequence[EpisodePlace], tasks: Sequence[str], path: Path) -> list[EpisodePlace]:
-    present = {place.key.task for place in places}
-    wanted = set()
-    for task in tasks:
-        name = current_task(task) or task_spec(task).name
-        if name not in present:
-            raise DatasetError(
-                f"{path} has no episodes of {name}; it has {', '.join(sorted(present)) or 'none'}."
-            )
-        wanted.add(name)
-    return [place for place in places if place.key.task in wanted]
 
 
 COMMAND = "openvima data import"
@@ -275,18 +272,14 @@ class ImportConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
-    """One shard to be written.
+class ImportBlock(Block):
+    """A shard of the episodes that are not broken.
 
     Args:
-        path: The file.
-        info: What all its rows have in common.
         source: Archive or folder.
         places: The episodes to read.
     """
 
-    path: Path
-    info: ShardInfo
     source: Path
     places: tuple[EpisodePlace, ...]
 
@@ -313,31 +306,21 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
     tasks = None if config.tasks == ("all",) else config.tasks
     data = PublishedData(config.source, tasks=tasks)
     blocks = plan(config, data)
-    wanted = {block.path.name: (block.info, len(block.places)) for block in blocks}
-    with folder_lock(config.out):
-        if config.force:
-            clear(config.out)
-        check_shards(config.out, COMMAND, wanted)
-        missing = [block for block in blocks if _find_broken(block) is None]
-        try:
-            if missing:
-                (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
-            total, left = (sum(len(block.places) for block in part) for part in (blocks, missing))
-            watch = report and (lambda done: report(total - left + done, total, ""))
-            for _ in imap_unordered(write_block, missing, config.workers, report=watch):
-                pass  # a block's result is its file
-        except OSError as error:
-            if error.errno not in NO_SPACE:
-                raise
-            raise storage_error(config.out, [block.path for block in blocks], error) from error
-        finally:
-            remove_leftovers(block.path for block in blocks)
-        if not is_finished(config.out):
-            _finish(config, data, blocks)
+    fill_folder(
+        config.out,
+        COMMAND,
+        blocks,
+        is_done=lambda block: _find_broken(block) is not None,
+        write=lambda missing, count: imap_unordered(write_block, missing, config.workers, report=count),
+        settings=lambda: _settings(config, data, blocks),
+        licence=LICENCE,
+        force=config.force,
+        report=report,
+    )
     return config.out
 
 
-def plan(config: ImportConfig, data: PublishedData) -> list[Block]:
+def plan(config: ImportConfig, data: PublishedData) -> list[ImportBlock]:
     """Divide the episodes into blocks; the division depends on source and settings alone."""
     versions = {**package_versions(), "vima": data.source.digest()}
     blocks = []
@@ -357,11 +340,11 @@ def plan(config: ImportConfig, data: PublishedData) -> list[Block]:
                 compression=config.compression,
             )
             chunk = places[start : start + config.shard_size]
-            blocks.append(Block(config.out / info.file_name, info, data.path, chunk))
+            blocks.append(ImportBlock(config.out / info.file_name, info, len(chunk), data.path, chunk))
     return blocks
 
 
-def write_block(block: Block, count: Callable[[int], None]) -> None:
+def write_block(block: ImportBlock, count: Callable[[int], None]) -> None:
     """Write one shard of the episodes that are not broken.
 
     Args:
@@ -377,7 +360,7 @@ def write_block(block: Block, count: Callable[[int], None]) -> None:
             count(number)
 
 
-def _find_broken(block: Block) -> list[Broken] | None:
+def _find_broken(block: ImportBlock) -> list[Broken] | None:
     """The episodes that a finished shard lacks because they are broken; None if it is not finished."""
     if not block.path.is_file():
         return None
@@ -388,10 +371,16 @@ def _find_broken(block: Block) -> list[Broken] | None:
     return broken if len(broken) == len(found) else None
 
 
-def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block]) -> None:
+def _settings(config: ImportConfig, data: PublishedData, blocks: Sequence[ImportBlock]) -> dict[str, Any]:
+    """Return what the manifest holds of settings and source; broken episodes are written to a file."""
     broken = [entry for block in blocks for entry in _find_broken(block) or ()]
+    (config.out / BROKEN_NAME).unlink(missing_ok=True)
+    if broken or data.broken_folders:
+        entries = [asdict(entry) for entry in (*data.broken_folders, *broken)]
+        text = json.dumps(entries, indent=1, ensure_ascii=False)
+        atomic_write_file(config.out / BROKEN_NAME, text + "\n")
     info = blocks[0].info  # but for task and number, the same of all
-    settings = {
+    return {
         "tasks": sorted({block.info.task for block in blocks}),
         "level": info.level,
         "domain": info.domain,
@@ -402,21 +391,8 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block]) 
         "compat": info.compat,
         "source": {
             "digest": info.versions["vima"],
-            "episodes": sum(len(block.places) for block in blocks),
+            "episodes": sum(block.episodes for block in blocks),
             "broken": len(broken),
             "unknown_folders": [entry.member for entry in data.broken_folders],
         },
     }
-    (config.out / BROKEN_NAME).unlink(missing_ok=True)
-    if broken or data.broken_folders:
-        entries = [asdict(entry) for entry in (*data.broken_folders, *broken)]
-        text = json.dumps(entries, indent=1, ensure_ascii=False)
-        atomic_write_file(config.out / BROKEN_NAME, text + "\n")
-    finish_folder(
-        config.out,
-        [block.path for block in blocks],
-        command=COMMAND,
-        config=settings,
-        versions=info.versions,
-        licence=LICENCE,
-    )

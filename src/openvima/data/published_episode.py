@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 from openvima.catalog import OBJECTS
+from openvima.data.encoding import decode_actions
 from openvima.data.published_sources import FRAME_FOLDERS, PICKLES
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
@@ -161,7 +162,7 @@ def _describe(value: object) -> str:
 
 # The original oracle chooses from a finer image, so at an edge its pixel can be a neighbour here.
 _REACH_PX = range(-2, 3)
-_AROUND = sorted(product(_REACH_PX, _REACH_PX), key=lambda offset: (offset[0] ** 2 + offset[1] ** 2, offset))
+_AROUND = np.array(sorted(product(_REACH_PX, _REACH_PX), key=lambda at: (at[0] ** 2 + at[1] ** 2, at)))
 
 
 def infer_picks(segm: np.ndarray, actions: Sequence[Action], object_ids: Collection[int]) -> tuple[int, ...]:
@@ -176,20 +177,14 @@ def infer_picks(segm: np.ndarray, actions: Sequence[Action], object_ids: Collect
         T ids: of the pixel there, else of the nearest one within two pixels, else `schema.UNKNOWN_ID`.
     """
     points = np.array([(*action.pose0_position, 0.0) for action in actions])
-    pixels = np.rint(project(points, TOP)).astype(int)
-    return tuple(
-        _find_nearest(image, pixel, object_ids)
-        for image, pixel in zip(segm[: len(actions)], pixels, strict=True)
-    )
-
-
-def _find_nearest(image: np.ndarray, pixel: np.ndarray, object_ids: Collection[int]) -> int:
-    height, width = image.shape
-    for row_offset, column_offset in _AROUND:
-        row, column = int(pixel[1]) + row_offset, int(pixel[0]) + column_offset
-        if 0 <= row < height and 0 <= column < width and int(image[row, column]) in object_ids:
-            return int(image[row, column])
-    return UNKNOWN_ID
+    picks = []
+    for image, (column, row) in zip(segm, np.rint(project(points, TOP)).astype(int), strict=False):
+        places = np.add(_AROUND, (row, column))
+        places = places[((places >= 0) & (places < image.shape)).all(axis=1)]
+        seen = image[tuple(places.T)]
+        found = seen[np.isin(seen, list(object_ids))]
+        picks.append(int(found[0]) if len(found) else UNKNOWN_ID)
+    return tuple(picks)
 
 
 DOMAIN, LEVEL, ASSETS = "published", "train", "original"
@@ -297,13 +292,10 @@ def _actions(fields: Fields) -> tuple[Action, ...]:
                 f"{key} is {rows.tolist()!s:.80}; it must be of shape (T, {length}), within {bounds[0]} … "
                 f"{bounds[1]}."
             )
-        columns[key] = list(map(tuple, rows.tolist()))
-    steps = tuple(
-        Action(**dict(zip(columns, step, strict=True))) for step in zip(*columns.values(), strict=True)
-    )
-    if not steps:
-        raise DatasetError("it holds no actions.")
-    return steps
+        columns[key] = rows
+    if steps := decode_actions(columns):
+        return steps
+    raise DatasetError("it holds no actions.")
 
 
 def _object(object_id: object, entry: Fields, texture_key: str) -> ObjectRecord:

@@ -9,6 +9,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO
 
@@ -38,24 +39,25 @@ class EpisodeFolders:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._episodes: dict[str, str] | None = None
 
     def episodes(self) -> Mapping[str, str]:
         """Return the folders of all episodes, such as "vima_v6/rotate/000123", and their paths.
 
         The disk is searched once; what comes later is not seen.
         """
-        if self._episodes is None:
-            self._episodes = self._search()
         return self._episodes
 
-    def _search(self) -> dict[str, str]:
+    @cached_property
+    def _episodes(self) -> dict[str, str]:
         found = {}
-        for folder, names in _task_folders(self.path, MAX_DEPTH):
+        for folder, names, _ in os.walk(self.path, followlinks=True):
+            below = Path(folder).relative_to(self.path)
             # For a task's own folder the name of the task is not part of the relative path.
-            shown = folder.relative_to(self.path).as_posix() if folder != self.path else folder.resolve().name
-            for name in names:
-                found[f"{shown}/{name}"] = str(folder / name)
+            shown = below.as_posix() if below.parts else self.path.resolve().name
+            numbered = [name for name in names if name.isascii() and name.isdigit()]
+            found |= {f"{shown}/{name}": os.path.join(folder, name) for name in numbered}
+            is_task = numbered or len(below.parts) == MAX_DEPTH
+            names[:] = [] if is_task else sorted(name for name in names if not name.startswith("."))
         return found
 
     def digest(self) -> str:
@@ -74,11 +76,15 @@ class EpisodeFolders:
 
         Raises:
             DatasetError: A file cannot be read, or all are too large.
+            OSError: The folder cannot be read.
         """
-        contents, num_left = {}, MAX_EPISODE_BYTES
-        for name in _files(Path(place)):
+        episode, contents, num_left = Path(place), {}, MAX_EPISODE_BYTES
+        for path in sorted([*episode.iterdir(), *episode.glob("*/*")]):
+            name = path.relative_to(episode).as_posix()
+            if not (is_episode_file(name) and path.is_file()):
+                continue
             try:
-                with open(Path(place, name), "rb") as stream:
+                with open(path, "rb") as stream:
                     contents[name] = stream.read(num_left + 1)
             except OSError as error:
                 raise DatasetError(f"{name} cannot be read: {error.strerror}.") from None
@@ -90,30 +96,6 @@ class EpisodeFolders:
         return contents
 
 
-def _files(episode: Path) -> list[str]:
-    """The episode's files that exist, relative to its folder."""
-    names = [entry.name for entry in os.scandir(episode) if entry.is_file()]
-    for folder in FRAME_FOLDERS:
-        if (episode / folder).is_dir():
-            names += [f"{folder}/{entry.name}" for entry in os.scandir(episode / folder) if entry.is_file()]
-    return sorted(filter(is_episode_file, names))
-
-
-def _task_folders(folder: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
-    """Folders that hold numbered ones, in the order of their names, and the names of those."""
-    if names := _list_numbered(folder):
-        yield folder, names
-    elif depth > 0:
-        for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
-            if entry.is_dir() and not entry.name.startswith("."):
-                yield from _task_folders(folder / entry.name, depth - 1)
-
-
-def _list_numbered(folder: Path) -> list[str]:
-    with os.scandir(folder) as entries:
-        return [e.name for e in entries if e.name.isascii() and e.name.isdigit() and e.is_dir()]
-
-
 # Layouts from the specification of the format (APPNOTE 6.3.9): end record, its 64-bit form and the pointer to
 # that, and what a directory's entry has before its name.
 _END = struct.Struct("<4s4H2LH")
@@ -121,7 +103,7 @@ _END_64 = struct.Struct("<4sQ2H2L4Q")
 _POINTER_64 = struct.Struct("<4sLQL")
 _ENTRY_BYTES, _LENGTHS_AT = 46, 28
 _LENGTHS = struct.Struct("<3H")  # of name, extra fields and comment
-_LONGEST_COMMENT = 0xFFFF
+_LONGEST_END = _END_64.size + _POINTER_64.size + _END.size + 0xFFFF  # the last is that of a comment
 _MAX_TEXT = 200  # characters of a reason
 # What the standard library raises for damaged archives, and for members that it cannot read.
 _DAMAGE_ERRORS = (
@@ -271,31 +253,20 @@ class ZipArchive:
 def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int]:
     """Start and end of the directory."""
     size = file.seek(0, 2)
-    tail_start = max(0, size - _END.size - _LONGEST_COMMENT)
+    tail_start = max(0, size - _LONGEST_END)
     file.seek(tail_start)
     tail = file.read()
-    at = tail.rfind(b"PK\5\6")
-    if at < 0 or at + _END.size > len(tail):
+    end = tail.rfind(b"PK\5\6")
+    if end < 0 or end + _END.size > len(tail):
         raise DatasetError(f"{path} is no zip archive, or its end is missing (an interrupted download?).")
-    *_, num_bytes, offset, _ = _END.unpack_from(tail, at)
-    end = tail_start + at
-    end, num_bytes, offset = _find_end_64(file, end, path) or (end, num_bytes, offset)
+    *_, num_bytes, offset, _ = _END.unpack_from(tail, end)
+    pointer = end - _POINTER_64.size
+    if pointer >= 0 and tail.startswith(b"PK\6\7", pointer):
+        end = pointer - _END_64.size  # the 64-bit end record lies right before the pointer to it
+        if end < 0 or not tail.startswith(b"PK\6\6", end):
+            raise DatasetError(f"{path}: its end record is damaged.")
+        *_, num_bytes, offset = _END_64.unpack_from(tail, end)
+    end += tail_start
     if offset != end - num_bytes:
         raise DatasetError(f"{path} lacks bytes before its directory; copy or download it again.")
     return offset, end
-
-
-def _find_end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] | None:
-    """End, size and offset of the directory from the 64-bit end record; None if there is none."""
-    file.seek(max(0, end - _POINTER_64.size))
-    pointer = file.read(_POINTER_64.size)
-    if len(pointer) < _POINTER_64.size or not pointer.startswith(b"PK\6\7"):
-        return None
-    # It lies right before the pointer to it.
-    at = end - _POINTER_64.size - _END_64.size
-    file.seek(max(0, at))
-    record = file.read(_END_64.size)
-    if len(record) < _END_64.size or not record.startswith(b"PK\6\6"):
-        raise DatasetError(f"{path}: its end record is damaged.")
-    *_, num_bytes, offset = _END_64.unpack(record)
-    return at, num_bytes, offset

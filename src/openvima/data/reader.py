@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.catalog import LEVELS, OBJECTS, TEXTURES
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, read_index, read_manifest
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, read_index, read_manifest, split_index
 from openvima.data.records import Demonstration
 from openvima.data.shard import Envelope, Shard, Span, remedy
 from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
@@ -103,12 +103,6 @@ class Dataset:
     def locate(self, episode_index: int) -> tuple[str, int]:
         """Return the shard's file name and the row in it where an episode is."""
         return self._names[self._name_of[episode_index]], int(self._rows[episode_index])
-
-    def locations(self, indices: Sequence[int] | np.ndarray) -> list[tuple[str, int]]:
-        """Return where several episodes are, as `locate` does."""
-        rows = np.asarray(indices, np.int64)
-        names = [self._names[number] for number in self._name_of[rows].tolist()]
-        return list(zip(names, self._rows[rows].tolist(), strict=True))
 
     def shard_names(self) -> list[str]:
         """Return the file names of all shards that hold episodes of this data set."""
@@ -269,23 +263,21 @@ def find_demonstrations(dataset: Dataset, query: DemonstrationQuery) -> np.ndarr
     for field in ("task", "level"):
         if value := getattr(query, field):
             chosen &= index.column(field).to_numpy() == value
-    found = np.flatnonzero(chosen)
-    return _filter_by_appearance(dataset, found, query) if query.object or query.texture else found
+    end = 0
+    for name, part in split_index(index).items() if query.object or query.texture else ():
+        start, end = end, end + part.num_rows
+        if chosen[start:end].any():
+            chosen[start:end] &= _shows(dataset.shard(name), query)
+    return np.flatnonzero(chosen)
 
 
-def _filter_by_appearance(dataset: Dataset, candidates: np.ndarray, query: DemonstrationQuery) -> np.ndarray:
-    """Keep the demonstrations with an object that fits."""
-
-    @cache
-    def rows_showing(name: str) -> set[int]:
-        lists = dataset.shard(name).table(["objects"]).column("objects").combine_chunks()
-        objects: pa.StructArray = lists.flatten()
-        fits = np.ones(len(objects), bool)
-        for field in ("object", "texture"):
-            if value := getattr(query, field):
-                fits &= objects.field(field).to_numpy(zero_copy_only=False) == value
-        owners = np.repeat(np.arange(len(lists)), lists.value_lengths().to_numpy())
-        return set(owners[fits].tolist())
-
-    places = dataset.locations(candidates)
-    return candidates[np.array([row in rows_showing(name) for name, row in places], bool)]
+def _shows(shard: Shard, query: DemonstrationQuery) -> np.ndarray:
+    """Whether each demonstration of a shard has an object that fits, shape (N,), bool."""
+    lists = shard.table(["objects"]).column("objects").combine_chunks()
+    objects: pa.StructArray = lists.flatten()
+    fits = np.ones(len(objects), bool)
+    for field in ("object", "texture"):
+        if value := getattr(query, field):
+            fits &= objects.field(field).to_numpy(zero_copy_only=False) == value
+    owners = np.repeat(np.arange(len(lists)), lists.value_lengths().to_numpy())
+    return np.bincount(owners[fits], minlength=len(lists)) > 0

@@ -216,7 +216,6 @@ class Columns:
         records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
         numbers: Column name to numbers, shape (rows, width): poses, the four arrays of the actions, and the
             waypoints of all joint paths, one path after the other.
-        path_lengths: Waypoints of each joint path.
         images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
             and `segm_…` (N, 128, 256).
         content_hash: 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
@@ -224,7 +223,6 @@ class Columns:
 
     records: dict[str, Any]
     numbers: dict[str, np.ndarray]
-    path_lengths: list[int]
     images: dict[str, np.ndarray]
     content_hash: str
 
@@ -232,8 +230,8 @@ class Columns:
 def make_columns(demo: Demonstration) -> Columns:
     """Return the columns of a demonstration."""
     records, arrays = _records(demo), _arrays(demo)
-    path_lengths = [len(path) for path in demo.joint_paths]
-    described = {**records, "assets": demo.assets, "path_lengths": path_lengths}
+    lengths = [len(path) for path in demo.joint_paths]
+    described = {**records, "assets": demo.assets, "path_lengths": lengths}
     digest = xxhash.xxh3_128(_JSON.encode(described).encode())
     images = {}
     for name, array in itertools.chain(arrays.items(), _images(demo)):
@@ -242,7 +240,7 @@ def make_columns(demo: Demonstration) -> Columns:
         if name not in arrays:
             images[name] = array
     numbers = {name: array.reshape(-1, array.shape[-1]) for name, array in arrays.items()}
-    return Columns(records, numbers, path_lengths, images, digest.hexdigest())
+    return Columns(records, numbers, images, digest.hexdigest())
 
 
 def _records(demo: Demonstration) -> dict[str, Any]:

@@ -117,9 +117,10 @@ def sample_prompt(demo: Demonstration, info: ShardInfo, assets: Assets) -> Promp
     return episode.problem.prompt
 
 
-@lru_cache(maxsize=2)
-def _rasteriser(assets: str) -> Rasteriser:
-    return Rasteriser(load_assets(recorded_assets(assets)))
+@lru_cache(maxsize=4)
+def _rasteriser(assets: str, *, is_random: bool = False) -> Rasteriser:
+    pack = load_assets(recorded_assets(assets))
+    return Rasteriser(RandomAppearanceAssets(pack, _NUM_CACHED) if is_random else pack)
 
 
 def _explain_change(demo: Demonstration, info: ShardInfo, details: str = "") -> DatasetError:
@@ -144,7 +145,7 @@ def with_random_appearance(demo: Demonstration, info: ShardInfo, variant: int) -
     """
     if not demo.scenes:
         raise DatasetError(UNKNOWN_SCENES.format(f"the demonstration of {demo.task} with seed {demo.seed}"))
-    rasteriser = _random_rasteriser(info.assets)
+    rasteriser = _rasteriser(info.assets, is_random=True)
     prompt = sample_prompt(demo, info, rasteriser.assets)
     placements = [*demo.scenes[0].placements, *_shown(prompt)]
     rng = np.random.default_rng([variant, demo.seed, *demo.task.encode()])
@@ -260,8 +261,3 @@ def _shown(prompt: Prompt) -> Iterator[Placement]:
 
 def _height_m(vertices: np.ndarray) -> float:
     return float(np.ptp(vertices[..., 2]))
-
-
-@lru_cache(maxsize=2)
-def _random_rasteriser(assets: str) -> Rasteriser:
-    return Rasteriser(RandomAppearanceAssets(load_assets(recorded_assets(assets)), _NUM_CACHED))

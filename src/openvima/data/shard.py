@@ -37,11 +37,6 @@ class Span:
     num_bytes: int
     crc32: int
 
-    def fault_in(self, content: memoryview) -> str:
-        """Say what is wrong with the record in a file's content; nothing if it is as it was."""
-        record = content[self.offset : self.offset + self.num_bytes]
-        return "" if zlib.crc32(record) == self.crc32 else "its checksum is wrong"
-
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
@@ -134,21 +129,17 @@ class Shard:
         if envelope is not None and (fault := envelope.fault_in(self._content)):
             raise self._damage("it", fault)
         self._readers: dict[tuple[str, ...], pa.RecordBatchFileReader] = {}  # of some columns each
-        self._info: ShardInfo | None = None
-        if envelope is None:
-            _ = self.info
-
-    @property
-    def info(self) -> ShardInfo:
-        """What all rows have in common."""
-        if self._info is None:
-            self._open(COLUMNS.names)
-        assert self._info is not None  # opening sets it
-        return self._info
+        whole = self._open(COLUMNS.names)
+        self._num_rows = whole.num_record_batches
+        try:
+            self.info = ShardInfo.from_metadata(whole.schema.metadata)  # what all rows have in common
+        except DatasetError as error:
+            raise DatasetError(f"{path}: {error}") from None
+        if not whole.schema.equals(COLUMNS):
+            raise DatasetError(f"{path} has other columns than schema version {SCHEMA_VERSION} asks for.")
 
     def __len__(self) -> int:
-        reader = next(iter(self._readers.values()), None) or self._open(COLUMNS.names)
-        return reader.num_record_batches
+        return self._num_rows
 
     def __getitem__(self, row: int) -> Demonstration:
         batch = self.batch(row)
@@ -180,7 +171,7 @@ class Shard:
             DatasetError: There is no such column.
             DatasetError: The row is damaged.
         """
-        batch = self._read_batch(row, (*columns, "steps") if "poses" in columns else columns)
+        batch = self.batch(row, (*columns, "steps") if "poses" in columns else columns)
         try:
             values = decode_columns(batch)
         except DAMAGE_ERRORS as error:
@@ -190,14 +181,22 @@ class Shard:
             values |= make_columns(self[row]).images
         return {name: values[name] for name in columns}
 
-    def batch(self, row: int) -> pa.RecordBatch:
-        """Read one row as it is stored.
+    def batch(self, row: int, columns: Sequence[str] = COLUMNS.names) -> pa.RecordBatch:
+        """Read one row, or some columns of it, as it is stored.
 
         Raises:
             IndexError: There are fewer rows.
             DatasetError: It is damaged.
         """
-        return self._read_batch(row, COLUMNS.names)
+        reader = self._open(columns)
+        if not 0 <= row < len(self):  # which also ends loops over a shard
+            raise IndexError(f"record {row} of {len(self)} in {self.path}; count from 0 to {len(self) - 1}.")
+        try:
+            batch = reader.get_batch(row)
+            batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
+        except DAMAGE_ERRORS as error:
+            raise self._row_damage(row, error) from None
+        return batch
 
     def check(self, row: int, span: Span) -> None:
         """Compare the bytes of a row with their checksum, before anything is made of them.
@@ -209,8 +208,8 @@ class Shard:
         Raises:
             DatasetError: They are damaged.
         """
-        if fault := span.fault_in(self._content):
-            raise self._row_damage(row, fault)
+        if zlib.crc32(self._content[span.offset : span.offset + span.num_bytes]) != span.crc32:
+            raise self._row_damage(row, "its checksum is wrong")
 
     def table(self, names: Sequence[str]) -> pa.Table:
         """Read some columns of all rows, without touching the others.
@@ -225,45 +224,25 @@ class Shard:
             raise self._damage("its records", error) from None
         return table.select(list(names))
 
-    def _read_batch(self, row: int, columns: Sequence[str]) -> pa.RecordBatch:
-        reader = self._open(columns)
-        if not 0 <= row < len(self):  # which also ends loops over a shard
-            raise IndexError(f"record {row} of {len(self)} in {self.path}; count from 0 to {len(self) - 1}.")
-        try:
-            batch = reader.get_batch(row)
-            batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
-        except DAMAGE_ERRORS as error:
-            raise self._row_damage(row, error) from None
-        return batch
-
     def _open(self, columns: Sequence[str]) -> pa.RecordBatchFileReader:
         """Return a reader to which the other columns do not exist; to open one takes 0.2 ms.
 
         Raises:
             DatasetError: There is no such column.
-            DatasetError: The file is damaged, or has other columns.
+            DatasetError: The file is damaged.
         """
         key = tuple(dict.fromkeys(columns))
         if key not in self._readers:
             for name in key:
                 if name not in COLUMNS.names:
                     raise DatasetError(unknown_name("column", name, COLUMNS.names))
-            numbers = sorted(COLUMNS.get_field_index(name) for name in key)
+            numbers = sorted(map(COLUMNS.get_field_index, key))
             included = None if len(numbers) == len(COLUMNS) else numbers
             options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=included)
             try:
-                reader = pa.ipc.open_file(pa.py_buffer(self._content), options=options)
+                self._readers[key] = pa.ipc.open_file(pa.py_buffer(self._content), options=options)
             except DAMAGE_ERRORS as error:
                 raise self._damage("it", error) from None
-            try:
-                self._info = self._info or ShardInfo.from_metadata(reader.schema.metadata)
-            except DatasetError as error:
-                raise DatasetError(f"{self.path}: {error}") from None
-            if not reader.schema.equals(pa.schema([COLUMNS.field(number) for number in numbers])):
-                raise DatasetError(
-                    f"{self.path} has other columns than schema version {SCHEMA_VERSION} asks for."
-                )
-            self._readers[key] = reader
         return self._readers[key]
 
     def _row_damage(self, row: int, error: Exception | str) -> DatasetError:

@@ -4,10 +4,11 @@ Episodes are selected by a hash of their identity, never by their position: the 
 order of the episodes, on every machine, and with or without images.
 """
 
+import contextlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -49,20 +50,26 @@ def _holds_data_sets_only(folder: Path) -> bool:
     return all((entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in entries)
 
 
-def check_out(
+@contextlib.contextmanager
+def new_folder(
     out: Path,
     sources: Sequence[Path],
     *,
     force: bool,
     is_own: Callable[[Path], bool] = _holds_data_sets_only,
-) -> None:
-    """Refuse a folder that holds something, or that lies where it would harm a source.
+) -> Iterator[Path]:
+    """Fill a folder that appears whole, or not at all.
+
+    A folder that holds something is refused, and one that lies where it would harm a source.
 
     Args:
         out: The folder to write.
         sources: The data sets to read.
         force: Whether what an earlier command wrote there may be replaced.
         is_own: Whether such a command wrote a folder.
+
+    Yields:
+        The folder to fill.
 
     Raises:
         DatasetError: Another folder must be given.
@@ -72,32 +79,18 @@ def check_out(
         there = source.resolve()
         if place == there or place in there.parents or there in place.parents:
             raise DatasetError(f"{out} holds the source {source} or lies in it. Give another folder.")
-    if not out.exists() or (out.is_dir() and all(map(is_lock_file, out.iterdir()))):
-        return
-    if not force:
-        raise DatasetError(f"{out} is not empty. Give another folder, or --force to replace it.")
-    if not (out.is_dir() and is_own(out)):
-        raise DatasetError(f"{out} holds other things than --force would write, so it is not replaced.")
+    if out.exists() and not (out.is_dir() and all(map(is_lock_file, out.iterdir()))):
+        if not force:
+            raise DatasetError(f"{out} is not empty. Give another folder, or --force to replace it.")
+        if not (out.is_dir() and is_own(out)):
+            raise DatasetError(f"{out} holds other things than --force would write, so it is not replaced.")
+    with folder_lock(out), atomic_folder(out) as folder:
+        yield folder
 
 
 def identify_source(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return what identifies a source, wherever it lies: its content, and the settings that made it."""
     return {key: manifest[key] for key in ("content_hash", "command", "config", "versions")}
-
-
-def check_fractions(fractions: Mapping[str, float]) -> None:
-    """Check the splits of a data set: names, and fractions that add up to 1.
-
-    Raises:
-        ConfigError: They do not, or a name cannot be that of a folder.
-    """
-    are_sound = all(_SPLIT_NAME.fullmatch(name) and 0 < share < 1 for name, share in fractions.items())
-    if not are_sound or abs(sum(fractions.values()) - 1) > _ROUNDING:
-        given = ", ".join(f"{name}={fraction:g}" for name, fraction in fractions.items())
-        raise ConfigError(
-            f"splits are {given}; give names of letters, digits, '_' and '-', and fractions between 0 and 1 "
-            "that add up to 1."
-        )
 
 
 def parse_splits(text: str) -> dict[str, float]:
@@ -107,7 +100,7 @@ def parse_splits(text: str) -> dict[str, float]:
         text: Such as "training=0.923,validation=0.077".
 
     Raises:
-        ConfigError: It is not of that form, or the fractions do not add up to 1.
+        ConfigError: It is not of that form.
     """
     fractions: dict[str, float] = {}
     for entry in text.split(","):
@@ -118,7 +111,6 @@ def parse_splits(text: str) -> dict[str, float]:
             raise ConfigError(
                 f"splits are {text!r}; give names and fractions such as training=0.923,validation=0.077."
             ) from None
-    check_fractions(fractions)
     return fractions
 
 
@@ -210,7 +202,13 @@ def split(config: SubsetConfig, fractions: Mapping[str, float], *, report: Repor
         DatasetError: The source is not finished, a split would be empty, or the folder cannot be used.
         DatasetError: The source is damaged.
     """
-    check_fractions(fractions)
+    are_sound = all(_SPLIT_NAME.fullmatch(name) and 0 < share < 1 for name, share in fractions.items())
+    if not are_sound or abs(sum(fractions.values()) - 1) > _ROUNDING:
+        given = ", ".join(f"{name}={fraction:g}" for name, fraction in fractions.items())
+        raise ConfigError(
+            f"splits are {given}; give names of letters, digits, '_' and '-', and fractions between 0 and 1 "
+            "that add up to 1."
+        )
     dataset = Dataset(config.source)
     wanted = select_tasks(dataset.index, config.tasks, str(dataset.path))
     settings = {**config.settings(dataset), "splits": dict(fractions)}
@@ -247,16 +245,14 @@ def select_sample(
         raise ConfigError(f"fraction is {fraction}; it must lie above 0 and not above 1.")
     if episodes is not None and episodes < 1:
         raise ConfigError(f"episodes is {episodes}; it must be at least 1.")
-    hashes = _hash_episodes(index, "sample", seed)
+    contents, tasks = (np.array(index.column(name).to_pylist(), str) for name in ("content_hash", "task"))
     # Where hashes tie, as for one seed in two setups, the content decides.
-    tie_breaks = np.array(index.column("content_hash").to_pylist(), dtype=str)
-    tasks = np.array(index.column("task").to_pylist(), dtype=str)
+    order = np.lexsort((contents, _hash_episodes(index, "sample", seed)))
     chosen = np.zeros(len(tasks), bool)
-    for task in sorted(set(tasks.tolist())):
-        of_task = np.flatnonzero(tasks == task)
-        order = np.lexsort((tie_breaks[of_task], hashes[of_task]))
+    for task in np.unique(tasks):
+        of_task = order[tasks[order] == task]
         count = episodes if fraction is None else max(1, round(fraction * len(of_task)))
-        chosen[of_task[order[:count]]] = True
+        chosen[of_task[:count]] = True
     return chosen
 
 
@@ -276,12 +272,9 @@ def assign_splits(index: pa.Table, fractions: Mapping[str, float], seed: int) ->
     """
     # Unrelated to the hash of samples; otherwise small samples would all be in the first split.
     places = _hash_episodes(index, "split", seed) / 2.0**64
-    bounds = [0.0, *itertools.accumulate(fractions.values())]
-    bounds[-1] = np.inf
-    return {
-        name: (low <= places) & (places < high)
-        for name, (low, high) in zip(fractions, itertools.pairwise(bounds), strict=True)
-    }
+    *ends, _ = itertools.accumulate(fractions.values())  # the last split has what is left
+    numbers = np.searchsorted(ends, places, side="right")
+    return {name: numbers == number for number, name in enumerate(fractions)}
 
 
 def _hash_episodes(index: pa.Table, purpose: str, seed: int) -> np.ndarray:
@@ -322,14 +315,13 @@ def _write(
     Raises:
         DatasetError: The folder cannot be used, or what is read is damaged.
     """
-    check_out(config.out, [dataset.path for dataset in sources], force=config.force)
     manifests = [dataset.manifest for dataset in sources]
     packages = sorted({name for manifest in manifests for name in manifest["versions"]})
-    with folder_lock(config.out), atomic_folder(config.out) as folder:
+    with new_folder(config.out, [dataset.path for dataset in sources], force=config.force) as folder:
         shards = {name: _number_shards(folder / name, parts) for name, (parts, _) in sets.items()}
         todo = list(itertools.chain.from_iterable(shards.values()))
         total = sum(len(shard.episodes) for shard in todo)
-        count = None if report is None else (lambda done: report(done, total, ""))
+        count = report and (lambda done: report(done, total, ""))
         for _ in imap_unordered(write_shard, todo, config.workers, report=count):
             pass  # a shard's result is its file
         for name, (_, settings) in sets.items():

@@ -83,27 +83,33 @@ def summarise_folder(folder: str | Path, *, details: bool = False, report: Repor
 
 def _shard_histograms(dataset: Dataset, report: Report) -> dict[str, dict[str, int]]:
     names = dataset.shard_names()
-    numbers = {"objects on the table": Counter[int](), "images in the prompt": Counter[int]()}
-    kinds = {
-        "objects on the table, by shape": Counter[str](),
-        "objects on the table, by texture": Counter[str](),
+    counts = {
+        title: Counter[Any]()
+        for title in (
+            "objects on the table",
+            "images in the prompt",
+            "objects on the table, by shape",
+            "objects on the table, by texture",
+        )
     }
     for done, name in enumerate(names, start=1):
-        table = dataset.shard(name).table(["objects", "prompt_images"])
-        objects = table.column("objects").combine_chunks()
-        images = table.column("prompt_images").combine_chunks()
-        for counter, lists in zip(numbers.values(), (objects, images), strict=True):
-            counter.update(_value_counts(lists.value_lengths()))
-        for counter, field in zip(kinds.values(), ("object", "texture"), strict=True):
-            counter.update(_value_counts(objects.flatten().field(field)))
+        columns = dataset.shard(name).table(["objects", "prompt_images"]).columns
+        objects, images = (column.combine_chunks() for column in columns)
+        shown = objects.flatten()
+        values = (
+            objects.value_lengths(),
+            images.value_lengths(),
+            shown.field("object"),
+            shown.field("texture"),
+        )
+        for counter, found in zip(counts.values(), values, strict=True):
+            counter.update(_value_counts(found))
         report(done, len(names), "")
-    return {
-        **{title: _in_order(counts) for title, counts in numbers.items()},
-        **{
-            title: dict(sorted(counts.items(), key=lambda e: (-e[1], e[0])))
-            for title, counts in kinds.items()
-        },
-    }
+    histograms = {title: _in_order(counter) for title, counter in counts.items()}
+    for title, histogram in histograms.items():
+        if ", by " in title:  # frequent ones first
+            histograms[title] = dict(sorted(histogram.items(), key=lambda entry: -entry[1]))
+    return histograms
 
 
 def _in_order(counts: Mapping[Any, int]) -> dict[str, int]:

@@ -86,12 +86,13 @@ def tensors_of(demo: Demonstration) -> DemonstrationTensors:
     )
 
 
-def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:
+def collate(items: Sequence[DemonstrationTensors], *, collate_fn_map: object = None) -> dict[str, Any]:
     """Join B demonstrations to a batch; a plain `DataLoader` does so by itself.
 
     Args:
         items: As `tensors_of` returns them, at least one; the longest has T steps, the longest prompt P
             images.
+        collate_fn_map: Not used; `DataLoader` gives it.
 
     Returns:
         `rgb_front`, `rgb_top` (B, T + 1, 3, 128, 256) and `segm_front`, `segm_top` (B, T + 1, 128, 256)
@@ -126,12 +127,7 @@ def _padded(tensors: list[torch.Tensor], value: int) -> torch.Tensor:
     return pad_sequence(tensors, batch_first=True, padding_value=value)
 
 
-def _collate_items(batch: Sequence[DemonstrationTensors], *, collate_fn_map: Any = None) -> dict[str, Any]:
-    """The form in which `DataLoader` looks up how to collate a type; Any: see `collate`."""
-    return collate(batch)
-
-
-default_collate_fn_map[DemonstrationTensors] = _collate_items
+default_collate_fn_map[DemonstrationTensors] = collate
 
 
 def _images(rgb: dict[str, np.ndarray], segm: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from openvima.atomic_io import folder_lock
 from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import MANIFEST_NAME, finish_folder, read_manifest, storage_error
+from openvima.data.manifest import MANIFEST_NAME, finish_folder, read_manifest, storage_errors
 from openvima.data.records import Demonstration, Rollout, package_versions
 from openvima.data.shard import Shard, ShardWriter
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
@@ -129,17 +129,24 @@ def record_demonstration(
     if episode.task == COMPOSED:
         env_config = EnvConfig(env_config.assets, env_config.compat)  # the others are of tasks
     demo, folder = demonstrate(episode, actions, env_config=env_config), as_path(folder)
-    try:
+    with storage_errors(folder, list(folder.glob("*.arrow"))):
         folder.mkdir(parents=True, exist_ok=True)
         with folder_lock(folder, timeout_s=_LOCK_S):
             return _append(folder, demo, env_config)
-    except OSError as error:
-        raise storage_error(folder, list(folder.glob("*.arrow")), error) from error
 
 
 def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
-    """Write a shard with one episode, so that those before stay as they are."""
-    shards = _open_own_shards(folder)
+    """Write a shard with one episode, so that those before stay as they are.
+
+    Raises:
+        DatasetError: The folder holds other data than demonstrations of users, or this one already.
+        DatasetError: A shard is damaged.
+    """
+    shards = [Shard(path) for path in sorted(folder.glob("*.arrow"))]
+    if any(shard.info.domain != DOMAIN for shard in shards):
+        raise DatasetError(
+            f"{folder} holds other data; give a folder of recorded demonstrations or a new one."
+        )
     same = [shard for shard in shards if shard.info.task == demo.task]
     settings = {**env_config.record(), "assets": load_assets(env_config.assets).name}
     info = ShardInfo(demo.task, LEVEL, DOMAIN, len(same), 1, 0, versions=package_versions(), **settings)
@@ -163,21 +170,6 @@ def _finish(folder: Path) -> int:
     config, paths = {"level": LEVEL, "domain": DOMAIN}, sorted(folder.glob("*.arrow"))
     finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions())
     return read_manifest(folder)["counts"]["episodes"]
-
-
-def _open_own_shards(folder: Path) -> list[Shard]:
-    """Open the shards of a folder, by task and number.
-
-    Raises:
-        DatasetError: It holds other data than demonstrations of users.
-        DatasetError: A shard is damaged.
-    """
-    shards = [Shard(path) for path in sorted(folder.glob("*.arrow"))]
-    if any(shard.info.domain != DOMAIN for shard in shards):
-        raise DatasetError(
-            f"{folder} holds other data; give a folder of recorded demonstrations or a new one."
-        )
-    return shards
 
 
 def _find_moved(before: Scene, after: Scene) -> int | None:

@@ -12,6 +12,8 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,23 +165,6 @@ class _Whole:
     content_hashes: Sequence[str]
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayTask:
-    """Episodes of one shard to replay.
-
-    Args:
-        path: The file.
-        info: Its metadata.
-        rows: Its records to replay.
-        assets: Asset pack to replay with, as in `VerifyConfig`.
-    """
-
-    path: Path
-    info: ShardInfo
-    rows: tuple[int, ...]
-    assets: str | None
-
-
 @dataclass(slots=True)
 class _Verifier:
     """Verifies one folder."""
@@ -196,8 +181,7 @@ class _Verifier:
         shards = sorted(path.name for path in self.folder.glob("*.arrow"))
         if not shards and not (self.folder / MANIFEST_NAME).is_file():
             raise DatasetError(explain_missing(self.folder))
-        self.manifest = self._read(MANIFEST_NAME, parse_manifest)
-        manifest = self.manifest
+        manifest = self.manifest = self._read(MANIFEST_NAME, parse_manifest)
         self._read(INDEX_NAME, lambda content: manifest and parse_index(content, manifest))
         unlisted = "If a run was stopped, repeat its command; otherwise move the file elsewhere."
         entries = dict.fromkeys(shards) if manifest is None else manifest["shards"]
@@ -215,7 +199,7 @@ class _Verifier:
                 whole[path.name] = found
             else:
                 for cause in found:
-                    self._add(path.name, cause, self._remedy)
+                    self._add(path.name, cause)
         num_replayed = self._replay(whole)
         return Verification(
             self.folder,
@@ -237,14 +221,14 @@ class _Verifier:
         command = generate_command(self.folder, self.manifest["config"])
         return f"Delete it and make it again: `{echo(command, len(command))}`"
 
-    def _add(self, file: str, cause: str, remedy: str) -> None:
-        self.problems.append(Problem(file, cause, remedy))
+    def _add(self, file: str, cause: str, remedy: str = "") -> None:
+        self.problems.append(Problem(file, cause, remedy or self._remedy))
 
     def _map(
         self, job: Callable[..., Any], tasks: Sequence[Any], total: int, stage: str
     ) -> Iterator[tuple[Any, Any]]:
         report = self.report
-        watch = None if report is None else (lambda done: report(done, max(done, total), stage))
+        watch = report and (lambda done: report(done, max(done, total), stage))
         return imap_unordered(job, tasks, self.config.workers, report=watch)
 
     def _read(self, name: str, parse: Callable[[bytes], Any]) -> Any:
@@ -252,9 +236,9 @@ class _Verifier:
         try:
             return parse((self.folder / name).read_bytes())
         except FileNotFoundError:
-            self._add(name, "it is missing", self._remedy)
+            self._add(name, "it is missing")
         except DatasetError as error:
-            self._add(name, str(error), self._remedy)
+            self._add(name, str(error))
         return None
 
     def _replay(self, whole: Mapping[str, _Whole]) -> int:
@@ -262,19 +246,17 @@ class _Verifier:
         if self.config.replay == 0:
             return 0
         self.notes += _notes_on_origin(whole)
-        tasks = [
-            ReplayTask(self.folder / name, whole[name].info, rows, self.config.assets)
-            for name, rows in self._choose(whole)
-        ]
-        num_replayed, total = 0, sum(len(task.rows) for task in tasks)
-        for task, found in self._map(replay_shard, tasks, total, "replaying"):
-            name = task.path.name
+        tasks = [(self.folder / name, rows) for name, rows in self._choose(whole)]
+        num_replayed, total = 0, sum(len(rows) for _, rows in tasks)
+        job = partial(replay_shard, assets=self.config.assets)
+        for (path, rows), found in self._map(job, tasks, total, "replaying"):
+            name = path.name
             if isinstance(found, str):
                 self.notes.append(f"{name} cannot be replayed: {found}")
                 continue
-            num_replayed += len(task.rows)
+            num_replayed += len(rows)
             for cause in _by_cause(found, len(whole[name].content_hashes)):
-                if _other_versions(task.info):
+                if _other_versions(whole[name].info):
                     self.notes.append(f"{name}, written by other versions: replayed, {cause}")
                 else:
                     self._add(name, f"replayed, {cause}", _NOT_AGAIN)
@@ -284,14 +266,14 @@ class _Verifier:
         """Choose a pseudorandom sample of each task by hashes of content and seed: shards and their rows."""
         ranked: dict[str, list[tuple[bytes, str, int]]] = {}
         for name, found in whole.items():
-            if found.info.domain == _PUBLISHED:
-                continue
-            for row, content_hash in enumerate(found.content_hashes):
-                rank = hashlib.sha256(f"{self.config.seed} {content_hash}".encode()).digest()
-                ranked.setdefault(found.info.task, []).append((rank, name, row))
-        chosen = [place for places in ranked.values() for place in sorted(places)[: self.config.replay]]
-        for name, places in itertools.groupby(sorted(chosen, key=lambda c: c[1:]), key=lambda c: c[1]):
-            yield name, tuple(row for *_, row in places)
+            if found.info.domain != _PUBLISHED:
+                places = ranked.setdefault(found.info.task, [])
+                for row, content_hash in enumerate(found.content_hashes):
+                    rank = hashlib.sha256(f"{self.config.seed} {content_hash}".encode()).digest()
+                    places.append((rank, name, row))
+        chosen = sorted(p[1:] for places in ranked.values() for p in sorted(places)[: self.config.replay])
+        for name, places in itertools.groupby(chosen, key=itemgetter(0)):
+            yield name, tuple(row for _, row in places)
 
 
 def check_shard(
@@ -311,7 +293,7 @@ def check_shard(
         return ["it is missing"]
     if entry is not None:
         found = fingerprint(path)
-        if (found["bytes"], found["sha256"]) != (entry["bytes"], entry["sha256"]):
+        if not found.items() <= entry.items():
             expected = f"{found['bytes']:,} of {entry['bytes']:,}"
             return [f"its {expected} bytes are not those that were written"]
     try:
@@ -375,25 +357,30 @@ def _by_cause(faults: Iterable[tuple[int, str]], num_rows: int) -> list[str]:
     ]
 
 
-def replay_shard(task: ReplayTask, count: Callable[[int], None]) -> list[tuple[int, str]] | str:
+def replay_shard(
+    task: tuple[Path, tuple[int, ...]], count: Callable[[int], None], *, assets: str | None
+) -> list[tuple[int, str]] | str:
     """Replay episodes of a shard.
 
     Args:
-        task: The episodes.
+        task: The file, and its records to replay.
         count: Called with the number of episodes replayed so far.
+        assets: Asset pack to replay with, as in `VerifyConfig`.
 
     Returns:
         Row and differences of those that differ; or why none can be replayed.
     """
-    shard, info, found = Shard(task.path), task.info, []
+    path, rows = task
+    shard, found = Shard(path), []
+    info = shard.info
     try:
         name = HOST_TASK if info.task == COMPOSED else info.task
-        asked = None if info.assets == "procedural" else task.assets
-        assets = asked or recorded_assets(info.assets)
-        env = make_env(name, info.level, info.domain, replace(info.env_config, assets=assets))
+        asked = None if info.assets == "procedural" else assets
+        env_config = replace(info.env_config, assets=asked or recorded_assets(info.assets))
+        env = make_env(name, info.level, info.domain, env_config)
     except OpenVimaError as error:  # the task is not installed, or the asset pack not imported
         return str(error)
-    for number, row in enumerate(task.rows, start=1):
+    for number, row in enumerate(rows, start=1):
         try:
             difference = find_difference(env, shard[row])
         except AssetError as error:

@@ -60,8 +60,8 @@ def lerobot_server(source: str, python: str, *, device: str = "cpu") -> Iterator
         except OSError as error:
             raise ConfigError(f"--python is {python!r}, which cannot be started: {error}.") from error
         with process:
+            assert process.stdin is not None and process.stdout is not None  # pipes
             try:
-                assert process.stdout is not None  # a pipe
                 url = next((line.strip() for line in process.stdout if line.startswith(SERVER_SCHEMES)), None)
                 if url is None:
                     raise ServerError(
@@ -70,19 +70,13 @@ def lerobot_server(source: str, python: str, *, device: str = "cpu") -> Iterator
                     )
                 yield url
             finally:
-                _stop(process)
-
-
-def _stop(process: "subprocess.Popen[str]") -> None:
-    """End a server, which also ends by itself when its input does, should this process be killed."""
-    assert process.stdin is not None  # a pipe
-    with suppress(OSError):
-        process.stdin.close()
-    process.terminate()
-    try:
-        process.wait(_STOP_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
+                with suppress(OSError):  # it also ends when its input does, should this process be killed
+                    process.stdin.close()
+                process.terminate()
+                try:
+                    process.wait(_STOP_S)
+                except subprocess.TimeoutExpired:
+                    process.kill()
 
 
 def _last_line(log: IO[bytes]) -> str:

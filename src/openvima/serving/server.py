@@ -35,7 +35,7 @@ from openvima.serving.protocol import (
     require_extra,
     unpack,
 )
-from openvima.tasks.prompts import MULTIMODAL, check_prompts, describe
+from openvima.tasks.prompts import check_prompts, describe
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -129,16 +129,13 @@ class Session:
 
     Args:
         policy: Has no other user. Its `prompt_limits`, if any, bound the prompts.
-        max_episodes: Episodes of the largest batch.
-        prompts: Form in which the policy gets prompts, see `ServerConfig`.
+        config: Has the largest batch, and the form in which the policy gets prompts.
     """
 
-    def __init__(self, policy: Policy, max_episodes: int, prompts: str = MULTIMODAL) -> None:
-        self.policy = policy
+    def __init__(self, policy: Policy, config: ServerConfig) -> None:
+        self.policy, self._config = policy, config
         self._limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
         self._control: str = getattr(policy, "control", PRIMITIVES)
-        self._max_episodes = max_episodes
-        self._prompts = prompts
         self._num_episodes = 0
 
     def answer(self, data: bytes | str) -> bytes | str:
@@ -175,10 +172,10 @@ class Session:
 
     def _listed(self, message: object, field: str) -> list:
         values = check_form(message, {"type": str, field: list}, "the request")[field]
-        if len(values) > self._max_episodes:
+        if len(values) > (most := self._config.max_episodes):
             raise MessageError(
-                f"there are {len(values)} {field}; at most {self._max_episodes} are allowed. Lower --batch, "
-                "or serve with a higher --max-episodes."
+                f"there are {len(values)} {field}; at most {most} are allowed. Lower --batch, or serve with "
+                "a higher --max-episodes."
             )
         return values
 
@@ -189,7 +186,7 @@ class Session:
         if not prompts:
             raise MessageError("reset has no prompts; give one for each episode.")
         self._num_episodes = 0  # should the policy fail, there is nothing to go on with
-        self.policy.reset([describe(prompt, self._prompts) for prompt in prompts])
+        self.policy.reset([describe(prompt, self._config.prompts) for prompt in prompts])
         self._num_episodes = len(prompts)
 
     def _actions(self, observations: Sequence[dict[str, Any] | None]) -> list[Any]:
@@ -306,9 +303,8 @@ class _PolicyServer:
         self._num_connections = 0
         modalities = check_modalities(getattr(policy, "modalities", DEFAULT_MODALITIES))
         control = check_form(getattr(policy, "control", PRIMITIVES), CONTROLS, "control of the policy")
-        versions = {"openvima": __version__}
-        about = {"protocol": PROTOCOL, "versions": versions, **about}
-        self._metadata = pack({**about, "modalities": modalities, "control": control})
+        first = {"protocol": PROTOCOL, "versions": {"openvima": __version__}}
+        self._metadata = pack({**first, **about, "modalities": modalities, "control": control})
 
     async def run(self, ready: Callable[[str], None], stop: asyncio.Event) -> None:
         """Serve until `stop` is set, or this is cancelled."""
@@ -369,7 +365,7 @@ class _PolicyServer:
             self._num_connections -= 1
 
     async def _converse(self, connection: "ServerConnection") -> None:
-        session = Session(self._new_policy(), self._config.max_episodes, self._config.prompts)
+        session = Session(self._new_policy(), self._config)
         reply: bytes | str = self._metadata
         loop = asyncio.get_running_loop()
         while True:

@@ -349,5 +349,5 @@ def test_a_replay_gives_the_same_bytes_and_another_path_is_noticed(data) -> None
 
 def test_the_manifest_names_the_control(data) -> None:
     assert Dataset(data).manifest["config"]["control"] == "end_effector"
-    with pytest.raises(DatasetError, match="control is end_effector, asked for is primitives"):
+    with pytest.raises(DatasetError, match="control is 'end_effector' there and 'primitives' here"):
         generate(GenerateConfig(data, ("rotate",), 1))

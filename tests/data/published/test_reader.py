@@ -238,7 +238,7 @@ def test_a_source_that_vanishes_is_no_pile_of_broken_episodes(tmp_path: Path) ->
     write_folder(tmp_path / "a", episodes())
     data = PublishedData(tmp_path / "a")
     shutil.rmtree(tmp_path / "a")
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(DatasetError, match=r"a cannot be read: No such file"):
         list(data.demonstrations())
 
 

@@ -326,7 +326,7 @@ def push_to_hub(
         private: Make a new repository private.
         dry_run: Print the card and list the files; nothing is sent.
     """
-    from openvima.publishing.push import demonstrations_files, push_demonstrations
+    from openvima.publishing import demonstrations_files, push_demonstrations
 
     if dry_run:
         print_files(demonstrations_files(folder, name))

@@ -1,4 +1,4 @@
-"""Checkpoints and demonstrations on the Hugging Face Hub, each with a card."""
+"""Policies and demonstrations on the Hugging Face Hub, each with a card that says what it is."""
 
 import json
 import shlex
@@ -36,7 +36,12 @@ from openvima.report.page import default_command
 from openvima.report.table import Line, Table, markdown
 from openvima.report.tables import paper_tables
 from openvima.report.text import role
+from openvima.training.config import flatten
 
+__all__ = ["demonstrations_card", "policy_card", "push_demonstrations", "push_policy"]
+
+CARD_NAME = "README.md"
+TAGS = ["openvima", "vima-bench", "multimodal-prompts", "imitation-learning"]
 _BUNDLED_RUN = "training"  # settings of the run beside a bundled checkpoint
 _SETTINGS = (
     "preset",
@@ -79,7 +84,7 @@ def push_policy(
         ServerError: The Hub refuses or cannot be reached.
         MissingExtraError: torch or `huggingface_hub` is not installed.
     """
-    target, files = repository(name), policy_files(source, name, results=results, licence=licence)
+    target, files = _repository(name), policy_files(source, name, results=results, licence=licence)
     return commit(target, files, private=private)
 
 
@@ -115,27 +120,33 @@ def policy_card(
         InputFileError, ConfigError, DatasetError: As for `push_policy`.
     """
     require_torch("reading a checkpoint")
-    folder, target = _checkpoint(source), repository(name)
+    folder, target = _checkpoint(source), _repository(name)
     file = None if results is None else _results_file(results)
     scores = None if file is None else _of_weights(file, weights_hash(folder))
-    metadata = {
-        "license": licence.lower(),
-        "library_name": "openvima",
-        "pipeline_tag": "robotics",
-        "tags": TAGS,
-    }
     confirmed = file is not None and is_marked_verified(file)
-    parts = [
-        front_matter(metadata),
-        f"# {target.repo.partition('/')[2]}\n",
-        "A policy for VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.\n",
-        f"## Network\n\n{_network(folder)}",
-        f"## Training\n\n{_training(folder)}",
-        f"## Scores\n\n{_scores(scores, target, confirmed=confirmed)}",
-        f"## Use\n\n{_use_policy(target)}",
-        f"## Licence\n\nWeights: {licence.lower()}. openvima: MIT.\n",
-    ]
-    return "\n".join(parts)
+    metadata = {"license": licence.lower(), "library_name": "openvima", "pipeline_tag": "robotics"}
+    shell = f"pip install 'openvima[train,hub]'\nopenvima evaluate --policy {target} --out scores"
+    python = f'from openvima.policies import load_policy\n\npolicy = load_policy("{target}")'
+    return f"""{_heading(metadata, target)}
+A policy for VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.
+
+## Network
+
+{_network(folder)}
+## Training
+
+{_training(folder)}
+## Scores
+
+{_scores(scores, target, confirmed=confirmed)}
+## Use
+
+{_fenced(shell, "sh")}
+{_fenced(python, "python")}
+## Licence
+
+Weights: {licence.lower()}. openvima: MIT.
+"""
 
 
 def _checkpoint(source: str | Path) -> Path:
@@ -179,7 +190,7 @@ def _network(folder: Path) -> str:
         "precision of the weights": described(info.dtype),
         f"SHA-256 of {WEIGHTS_FILE}": info.digest,
     }
-    return facts("What was pushed.", values)
+    return _facts("What was pushed.", values)
 
 
 def _training(folder: Path) -> str:
@@ -188,15 +199,14 @@ def _training(folder: Path) -> str:
     if not recorded:
         return "Not recorded: the checkpoint does not lie in its run folder.\n"
     data = recorded.get("demonstrations") or {}
-    settings = {name: _setting(recorded["training"], name) for name in _SETTINGS}
-    left_out = _setting(recorded["training"], "loader.exclude_tasks")
+    settings = flatten(recorded["training"])
     values = {
         "demonstrations": data.get("episodes"),
-        "tasks left out": left_out,
+        "tasks left out": settings.get("loader.exclude_tasks"),
         "held-out demonstrations among them": data.get("held_out"),
-        **settings,
+        **{name: settings.get(name) for name in _SETTINGS},
     }
-    return facts("What the run folder records.", values)
+    return _facts("What the run folder records.", values)
 
 
 def _recorded(folder: Path) -> Mapping[str, Any]:
@@ -211,26 +221,14 @@ def _recorded(folder: Path) -> Mapping[str, Any]:
     return {}
 
 
-def _setting(values: Any, dotted: str) -> Any:
-    for name in dotted.split("."):
-        values = (values or {}).get(name)
-    return values
-
-
 def _scores(scores: Results | None, name: HubName, *, confirmed: bool) -> str:
     if scores is None:
         return "None were pushed with the checkpoint.\n"
     (policy,) = scores.policies
     versions = ", ".join(f"{name} {version}" for name, version in sorted(scores.versions.items()))
     tables = markdown(paper_tables(scores, published=False, confirmed=confirmed))
-    command = fenced(default_command(scores, [str(name)]), "sh")
+    command = _fenced(default_command(scores, [str(name)]), "sh")
     return f"{role(scores, policy)} `{FILE_NAME}` holds every outcome ({versions}).\n\n{command}\n{tables}"
-
-
-def _use_policy(name: HubName) -> str:
-    shell = f"pip install 'openvima[train,hub]'\nopenvima evaluate --policy {name} --out scores"
-    python = f'from openvima.policies import load_policy\n\npolicy = load_policy("{name}")'
-    return f"{fenced(shell, 'sh')}\n{fenced(python, 'python')}"
 
 
 def push_demonstrations(folder: str | Path, name: str, *, private: bool = False) -> HubName:
@@ -252,7 +250,7 @@ def push_demonstrations(folder: str | Path, name: str, *, private: bool = False)
         ServerError: The Hub refuses or cannot be reached.
         MissingExtraError: `huggingface_hub` is not installed.
     """
-    target, files = repository(name), demonstrations_files(folder, name)
+    target, files = _repository(name), demonstrations_files(folder, name)
     return commit(target, files, kind="dataset", private=private)
 
 
@@ -280,13 +278,8 @@ def demonstrations_card(dataset: Dataset, name: str) -> str:
     Returns:
         Markdown with the metadata of the Hub in front.
     """
-    manifest, target = dataset.manifest, repository(name)
+    manifest, target = dataset.manifest, _repository(name)
     counts = manifest["counts"]
-    metadata = {
-        "license": manifest["licence"].lower().split(" and "),
-        "task_categories": ["robotics"],
-        "tags": TAGS,
-    }
     provenance = {
         "episodes": f"{counts['episodes']:,}",
         "steps": f"{counts['steps']:,}",
@@ -300,34 +293,36 @@ def demonstrations_card(dataset: Dataset, name: str) -> str:
     )
     columns = ("task", "episodes", "steps", "oracle success (%)")
     contents = Table("tasks", "Demonstrations by task.", columns, lines)
-    parts = [
-        front_matter(metadata),
-        f"# {target.repo.partition('/')[2]}\n",
-        "Demonstrations of VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.\n",
-        f"## Contents\n\n{markdown([contents])}",
-        f"## Provenance\n\n{facts('What the manifest records.', provenance)}",
-        "Settings that decide the content:\n",
-        fenced(json.dumps(manifest["config"], indent=1, sort_keys=True, ensure_ascii=False), "json"),
-        f"## Use\n\n{_use_demonstrations(target)}",
-        f"## Licence\n\n{manifest['licence']}\n",
-    ]
-    return "\n".join(parts)
-
-
-def _use_demonstrations(name: HubName) -> str:
+    metadata = {"license": manifest["licence"].lower().split(" and "), "task_categories": ["robotics"]}
+    settings = json.dumps(manifest["config"], indent=1, sort_keys=True, ensure_ascii=False)
     shell = (
-        f"pip install 'openvima[train,hub]'\nopenvima data info hf://{name}\n"
-        f"openvima train --data hf://{name} --preset nano --out run"
+        f"pip install 'openvima[train,hub]'\nopenvima data info hf://{target}\n"
+        f"openvima train --data hf://{target} --preset nano --out run"
     )
-    python = f'from openvima.data import Dataset\n\nepisode = Dataset("hf://{name}")[0]'
-    return f"{fenced(shell, 'sh')}\n{fenced(python, 'python')}"
+    python = f'from openvima.data import Dataset\n\nepisode = Dataset("hf://{target}")[0]'
+    return f"""{_heading(metadata, target)}
+Demonstrations of VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.
+
+## Contents
+
+{markdown([contents])}
+## Provenance
+
+{_facts("What the manifest records.", provenance)}
+Settings that decide the content:
+
+{_fenced(settings, "json")}
+## Use
+
+{_fenced(shell, "sh")}
+{_fenced(python, "python")}
+## Licence
+
+{manifest["licence"]}
+"""
 
 
-CARD_NAME = "README.md"
-TAGS = ["openvima", "vima-bench", "multimodal-prompts", "imitation-learning"]
-
-
-def repository(text: str) -> HubName:
+def _repository(text: str) -> HubName:
     """Read the name of the repository to push to.
 
     Raises:
@@ -339,12 +334,13 @@ def repository(text: str) -> HubName:
     return name
 
 
-def front_matter(values: Mapping[str, Any]) -> str:
-    """Write the metadata of a card."""
-    return f"---\n{yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)}---\n"
+def _heading(metadata: Mapping[str, Any], target: HubName) -> str:
+    """Write the metadata of a card, and its title."""
+    text = yaml.safe_dump({**metadata, "tags": TAGS}, sort_keys=False, allow_unicode=True)
+    return f"---\n{text}---\n\n# {target.repo.partition('/')[2]}\n"
 
 
-def facts(caption: str, values: Mapping[str, object]) -> str:
+def _facts(caption: str, values: Mapping[str, object]) -> str:
     """Write a table of facts in Markdown, without those that are None or empty."""
     lines = tuple(
         Line(name, (echo(str(value)),)) for name, value in values.items() if value not in (None, "", [])
@@ -352,6 +348,6 @@ def facts(caption: str, values: Mapping[str, object]) -> str:
     return markdown([Table("facts", caption, ("", ""), lines)])
 
 
-def fenced(text: str, language: str = "") -> str:
+def _fenced(text: str, language: str) -> str:
     """Write a block of code, which nothing in the text can end."""
     return f"```{language}\n{text.replace('`', chr(39)).rstrip()}\n```\n"
