@@ -1,4 +1,4 @@
-"""Architectures with tokens of objects and of views overfit 32 demonstrations."""
+"""Architectures with tokens of objects and of views overfit 16 demonstrations."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -32,9 +32,9 @@ from small_networks import (
 pytestmark = pytest.mark.slow
 
 DEMONSTRATIONS = {
-    "rotate": 22,
-    "visual_manipulation": 6,
-    "manipulate_old_neighbor": 4,
+    "rotate": 10,
+    "visual_manipulation": 4,
+    "manipulate_old_neighbor": 2,
 }  # the last in two steps
 MAX_STEPS = 140
 WARMUP_STEPS = 25
@@ -49,12 +49,12 @@ PATCH_SHARE = 0.03
 
 @pytest.fixture(scope="module")
 def demonstrations() -> list[Demonstration]:
-    """Of each task some, 32 in all."""
+    """Of each task some, 16 in all."""
     runs = []
     for task, count in DEMONSTRATIONS.items():
         env = TabletopEnv(task, level="train", domain="user")
         runs += [rollout_oracle(env, seed) for seed in range(count)]
-    assert len(runs) == 32 and max(run.num_steps for run in runs) == 2
+    assert len(runs) == 16 and max(run.num_steps for run in runs) == 2
     return runs
 
 
@@ -73,7 +73,7 @@ def stage_of(model: PolicyNetwork, runs: Sequence[Demonstration], folder: Path) 
 
 
 @pytest.mark.parametrize("architecture", ["vima", "midas"])
-def test_each_architecture_overfits_32_demonstrations_and_repeats_them(
+def test_each_architecture_overfits_16_demonstrations_and_repeats_them(
     architecture, demonstrations, tmp_path
 ) -> None:
     model = build_network(preset(f"{architecture}-nano"), seed=0)
@@ -136,7 +136,7 @@ def overfit_pointer(sizes, runs: Sequence[Demonstration], folder: Path, max_step
     return model, stage.validate()
 
 
-def test_the_object_head_overfits_32_demonstrations(demonstrations, tmp_path) -> None:
+def test_the_object_head_overfits_16_demonstrations(demonstrations, tmp_path) -> None:
     _, metrics = overfit_pointer(narrow("nano"), demonstrations, tmp_path, 150, "accuracy")
     for name in ("accuracy", "pick_accuracy", "place_accuracy", "yaw_accuracy"):
         assert metrics[name] > 0.99, name
