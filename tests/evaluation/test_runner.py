@@ -177,7 +177,7 @@ def test_two_workers_do_not_change_a_byte(whole: Path, tmp_path: Path) -> None:
 def test_ray_gives_the_same_bytes_and_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray")
     monkeypatch.chdir(tmp_path)
-    small = replace(NETWORK, policies=("random",), tasks=NETWORK.tasks[:1], ablations=("no_prompt",))
+    small = replace(NETWORK, policies=("random",), tasks=NETWORK.tasks[:1], ablations=())
     path = evaluate(replace(small, out=Path("processes")))
     try:
         by_ray = evaluate(replace(small, out=Path("ray"), workers=2, engine="ray"))

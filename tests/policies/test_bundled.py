@@ -71,7 +71,7 @@ def test_quickstart_scores_it_beside_the_policy_that_it_trains(
     monkeypatch.setattr("openvima.data.generate", lambda *_: Path("demonstrations"))
     trained = lambda *_, **__: shutil.copytree(bundled, "quick/trained")  # noqa: E731
     monkeypatch.setattr("openvima.cli.train.train_in_processes", trained)
-    monkeypatch.setattr(videos, "recording_jobs", lambda *_: [])  # other tests record
+    monkeypatch.setattr(videos, "recordings", lambda *_: [])  # other tests record
     assert quickstart.main(out=Path("quick"), episodes=1, workers=1) == 0
     shown = capsys.readouterr().out
     names = ["trained", SMALL, "oracle", "untrained", "random"]

@@ -305,8 +305,7 @@ class Processor:
             rows = [[own[masks[own, v]] for v, own in enumerate(image)] for image in rows]
             slots = [max(map(len, view)) for view in zip(*rows, strict=True)]
             rows = [
-                [np.pad(own, (0, max(slots) - len(own)), constant_values=-1) for own in image]
-                for image in rows
+                [np.concatenate([own, np.full(max(slots) - len(own), -1)]) for own in image] for image in rows
             ]
         shown = [np.stack(image, axis=1) for image in rows]
         tokens: list[tuple[int, int, int, bool]] = []  # word, row, part, whether it is valid

@@ -1,8 +1,8 @@
 """Layers: linear ones that are fast on CPUs, MLPs, batches without their padding, records of tensors.
 
-Training uses oneDNN, which takes half the time of torch's default library on AMD CPUs (results/
-2026-11-28_training_step.md); both compute in float32. Its kernels are compiled for each number of rows, so
-`round_rows` keeps these few.
+Training on CPUs with AVX-512 uses oneDNN, which takes half the time of torch's default library on those of
+AMD (results/2026-11-28_training_step.md); both compute in float32. Its kernels are compiled for each number
+of rows, so `round_rows` keeps these few.
 
 Shape suffixes: B batch, L positions, N positions of all rows that are computed, D width.
 """
@@ -21,17 +21,22 @@ _MIN_TRAINING_ROWS = 256  # of fewer rows there are too many numbers to compile 
 # Kernels that oneDNN keeps; its default of 1,024 are fewer than training uses again. Read at its first use.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
 
-# Private operations that torch.compile uses; there is no public API for them.
-_HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+# Private operations that torch.compile uses; there is no public API for them. Without AVX-512 they are slower
+# than torch's own; see results/2026-11-30_turns.md.
+_TRAINS_BY_ONEDNN = (
+    torch.backends.mkldnn.is_available()
+    and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+    and torch.backends.cpu.get_cpu_capability() == "AVX512"
+)
 
 
 class Linear(nn.Linear):
-    """`nn.Linear` that computes outputs and gradients of many rows with oneDNN, on a CPU."""
+    """`nn.Linear` that computes outputs and gradients of many rows with oneDNN, on a CPU with AVX-512."""
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Map (..., in) to (..., out)."""
         if (
-            _HAS_ONEDNN
+            _TRAINS_BY_ONEDNN
             and torch.is_grad_enabled()
             and input.numel() >= _MIN_TRAINING_ROWS * self.in_features
             and input.dtype == self.weight.dtype == torch.float32
