@@ -417,7 +417,7 @@ def ablation_parts(text: str) -> tuple[InputAblation, ...]:
         ConfigError: There is no such ablation, a rate is missing, not allowed or out of range, or two
             ablations exclude each other.
     """
-    parts = [_rated(word.strip()) for word in text.split("+")] if text else []
+    parts = [_parse_rated(word.strip()) for word in text.split("+")] if text else []
     parts.sort(key=lambda part: [*INPUT_ABLATIONS].index(part.name))
     for one, other in combinations(parts, 2):
         if one.name == other.name or (one.exclusive and one.exclusive == other.exclusive):
@@ -427,7 +427,7 @@ def ablation_parts(text: str) -> tuple[InputAblation, ...]:
     return tuple(parts)
 
 
-def _rated(text: str) -> InputAblation:
+def _parse_rated(text: str) -> InputAblation:
     name, colon, number = text.partition(":")
     ablation = INPUT_ABLATIONS.get(name)
     if ablation is None:

@@ -173,7 +173,7 @@ def roll_out(
     slots = [EpisodeSlot(env, start, after_step) for env, start in zip(envs, starts, strict=True)]
     error = _play_together(slots, policy)
     if error is None:
-        return _played(slots)
+        return _collect_played(slots)
     running = [index for index, slot in enumerate(slots) if slot.outcome is None]
     if len(running) == 1:
         slots[running[0]].end(str(error), POLICY_ERROR)
@@ -182,7 +182,7 @@ def roll_out(
             slots[index] = EpisodeSlot(envs[index], starts[index], after_step)
             if (own := _play_together([slots[index]], policy)) is not None:
                 slots[index].end(str(own), POLICY_ERROR)
-    played = _played(slots)
+    played = _collect_played(slots)
     failed = [episode for episode in played if episode.outcome.kind == POLICY_ERROR]
     is_of_batch = not isinstance(error, PolicyRaisedError) and not failed
     never_acts = len(failed) == len(played) and not any(episode.actions for episode in failed)
@@ -191,7 +191,7 @@ def roll_out(
     return played
 
 
-def _played(slots: Sequence[EpisodeSlot]) -> list[PlayedEpisode]:
+def _collect_played(slots: Sequence[EpisodeSlot]) -> list[PlayedEpisode]:
     return [PlayedEpisode(slot.outcome, slot.actions) for slot in slots if slot.outcome is not None]
 
 

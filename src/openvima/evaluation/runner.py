@@ -119,7 +119,7 @@ def evaluate_range(config: EvaluationConfig, shards: Part, report: Report | None
         with folder_lock(config.out, shards):
             if _earlier(path, prepared) is None:
                 _play_all(own, report)
-        if len(_finished(prepared)) < len(prepared.batches):
+        if len(_read_finished(prepared)) < len(prepared.batches):
             return False
         with folder_lock(config.out, timeout_s=FINISH_S):  # others may have come to the same conclusion
             if path.exists():
@@ -160,12 +160,12 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         played = _play_all(prepared, report)
-        rows = _rows({batch: played[batch] for batch in prepared.batches})
+        rows = _join_rows({batch: played[batch] for batch in prepared.batches})
         episodes = (  # in the order of the rows
             (episode.outcome.seed, episode.actions) for batch in prepared.batches for episode in played[batch]
         )
         digest = write_actions(config.out, episodes, control=config.env_config.control)
-        policies, median_s = _answered(prepared, played)
+        policies, median_s = _add_answers(prepared, played)
         results = replace(prepared.results, rows=rows, policies=policies, actions_sha256=digest)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started, median_s)
@@ -176,13 +176,13 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
 def finished_part(config: EvaluationConfig) -> Results | None:
     """Return the results of the tasks and levels whose episodes are all finished; None without any."""
     prepared = prepare(config)
-    finished = _finished(prepared)
+    finished = _read_finished(prepared)
     unfinished = {batch.cell for batch in prepared.batches if batch not in finished}
-    rows = _rows({batch: played for batch, played in finished.items() if batch.cell not in unfinished})
+    rows = _join_rows({batch: played for batch, played in finished.items() if batch.cell not in unfinished})
     return replace(prepared.results, rows=rows) if rows else None
 
 
-def _rows(played: Played) -> tuple[Row, ...]:
+def _join_rows(played: Played) -> tuple[Row, ...]:
     """Join the batches of each policy, ablation, task and level; they are given in their order."""
     rows = []
     for (policy, ablation, task, level), group in groupby(played, key=lambda batch: batch.cell):
@@ -193,7 +193,9 @@ def _rows(played: Played) -> tuple[Row, ...]:
     return tuple(rows)
 
 
-def _answered(prepared: PreparedEvaluation, played: Played) -> tuple[dict[str, dict[str, Any]], float | None]:
+def _add_answers(
+    prepared: PreparedEvaluation, played: Played
+) -> tuple[dict[str, dict[str, Any]], float | None]:
     """Write what models said; return the records of the policies with its summary, and a median time."""
     policies, steps = dict(prepared.results.policies), []
     episodes: dict[str, list[tuple[EpisodeOutcome, Said]]] = {}
@@ -214,7 +216,7 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     if not path.exists() or prepared.config.force:
         return None
     earlier = Results.read(path)
-    differing = differences(_settings(earlier), _settings(prepared.results))
+    differing = differences(_collect_settings(earlier), _collect_settings(prepared.results))
     if not differing:
         return earlier
     raise ConfigError(
@@ -223,7 +225,7 @@ def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     )
 
 
-def _settings(results: Results) -> dict[str, object]:
+def _collect_settings(results: Results) -> dict[str, object]:
     """Return what the outcomes depend on."""
     policies = {
         name: {key: value for key, value in what.items() if key != _ANSWERS}
@@ -237,7 +239,7 @@ def _play_all(prepared: PreparedEvaluation, report: Report | None) -> Played:
     config, batches = prepared.config, prepared.batches
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
-    finished = _finished(prepared)
+    finished = _read_finished(prepared)
     total, done = sum(batch.episodes for batch in batches), sum(batch.episodes for batch in finished)
     if report is not None:
         report(done, total, "")
@@ -247,7 +249,7 @@ def _play_all(prepared: PreparedEvaluation, report: Report | None) -> Played:
         for batch in batches
         if batch not in finished
     ]
-    for batch, played in _played(config, missing):
+    for batch, played in _play_missing(config, missing):
         content = {"episodes": [asdict(episode) for episode in played]}
         atomic_write_file(_part(batch, config), json.dumps(content, ensure_ascii=False) + "\n")
         finished[batch] = played
@@ -262,7 +264,7 @@ def _part(batch: Batch, config: EvaluationConfig) -> Path:
     return config.out / _PARTS / f"{batch.key}.json"
 
 
-def _finished(prepared: PreparedEvaluation) -> Played:
+def _read_finished(prepared: PreparedEvaluation) -> Played:
     """Return the batches of an interrupted run; parts that cannot be used are left out."""
     finished: Played = {}
     for batch in prepared.batches:
@@ -275,7 +277,9 @@ def _finished(prepared: PreparedEvaluation) -> Played:
     return finished
 
 
-def _played(config: EvaluationConfig, batches: list[Batch]) -> Iterator[tuple[Batch, list[PlayedEpisode]]]:
+def _play_missing(
+    config: EvaluationConfig, batches: list[Batch]
+) -> Iterator[tuple[Batch, list[PlayedEpisode]]]:
     """Run batches on the configured engine and yield them as they finish."""
     chats = [batch for batch in batches if PolicyRef.parse(batch.source).kind == "vlm"]
     if chats:
@@ -425,4 +429,4 @@ def score(
         else source.record()
         for source in config.sources
     }
-    return Results(_rows(played), config.record(), versions(with_torch=True), kinds)
+    return Results(_join_rows(played), config.record(), versions(with_torch=True), kinds)
