@@ -373,11 +373,11 @@ def play(
         raise ConfigError(f"video is {str(video)!r}; videos are MP4 files; give a name that ends in .mp4.")
     if isinstance(policy, str):
         name = policy
-        player = load_own_rollout_policy(policy, device=device, boxes=boxes, trust_code=trust_code)
+        rollout_policy = load_own_rollout_policy(policy, device=device, boxes=boxes, trust_code=trust_code)
     else:
-        name, player = type(policy).__name__, policy
+        name, rollout_policy = type(policy).__name__, policy
     session = EpisodeSession(
-        episode, player, assets=assets, compat=compat, record=video is not None, explain=False
+        episode, rollout_policy, assets=assets, compat=compat, record=video is not None, explain=False
     )
     scenes, title = [session.scene], f"{episode.task} · {Path(name).name}"
     with nullcontext() if video is None else EpisodeRecorder(session.env, video, title=title) as recorder:
