@@ -14,14 +14,14 @@ from openvima.render import TOP, unproject
 from openvima.scene.explanation import Explanation, bin_positions
 from small_networks import perturbed
 
-POINTING = "vima-nano that points"
-NAMES = ("nano", "small", "nano-bins", "vima-nano", POINTING)
-FAST = ("nano", "small", POINTING)
+POINTING = {f"{name} that points": name for name in ("vima-nano", "midas-nano")}
+NAMES = ("nano", "small", "nano-bins", "vima-nano", "midas-nano", "gato-nano", "gpt-nano", *POINTING)
+FAST = ("nano", "small", *POINTING)
 
 
 def policy_of(name: str, **options) -> NetworkPolicy:
-    points = name == POINTING
-    network = perturbed(with_variant(preset("vima-nano"), {"points": True}) if points else name)
+    config = with_variant(preset(POINTING[name]), {"points": True}) if name in POINTING else name
+    network = perturbed(config)
     with torch.no_grad():
         for key, parameter in network.named_parameters():
             if "offset" in key:  # as fresh pointers, it places exactly at its candidate
@@ -182,5 +182,6 @@ def test_what_cannot_be_explained_is_refused(demos) -> None:
     session.act([demos[0].observation(0)])
     with pytest.raises(PolicyError, match="Sessions of a server"):
         session.explain()
-    with pytest.raises(PolicyError, match=r"Gato has no explain.*openvima-small"):
-        load_policy("untrained:gato-nano").explain()
+    mixture = NetworkPolicy(perturbed(with_variant(preset("vima-nano"), {"head": "mixture"})))
+    with pytest.raises(PolicyError, match=r"Vima has no explain.*openvima-small.*mixture"):
+        mixture.explain()

@@ -22,14 +22,12 @@ from openvima.policies.nn.action_head import BinsConfig, BinsHead, ObservationTo
 from openvima.policies.nn.decoder import (
     OBSERVATION_MARK,
     AnyDecoderConfig,
-    Decoder,
     DecoderConfig,
     PrefixDecoder,
     build_decoder,
 )
 from openvima.policies.nn.heads import (
     AutoregressiveConfig,
-    AutoregressiveHead,
     HeadConfig,
     build_action_tokens,
     build_head,
@@ -240,11 +238,7 @@ class TokenPolicy(PolicyNetwork):
             self.place_kinds = nn.Parameter(torch.zeros(2, width))
         if token_width == width:
             self._align_attention()
-        # Other heads have no bins, or decode positions twice; the other decoder does not attend to the prompt
-        # alone.
-        decodes_twice = isinstance(self.head, AutoregressiveHead) and config.points
-        has_bins = isinstance(self.head, BinsHead) and not decodes_twice
-        self.explains = has_bins and isinstance(self.decoder, Decoder)
+        self.explains = isinstance(self.head, BinsHead)
 
     def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> EncodedPrompt:
         """Encode words and image tokens through the text encoder."""

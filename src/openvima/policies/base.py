@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import torch
 
 POLICIES_THAT_EXPLAIN = (
-    "Those that do: openvima-small, openvima-vima, and networks of the presets nano, nano-bins, small, "
-    "vima-* and flamingo-*, unless their head or conditioning was exchanged."
+    "Those that do: openvima-small, openvima-vima, and networks of all presets, unless their head was "
+    "exchanged for mixture or regression."
 )
 
 

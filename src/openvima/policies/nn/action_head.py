@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
+    ACTION_WIDTH,
     PLACE_NEAR_M,
     ActionTargets,
     DecodingStrategy,
@@ -314,7 +315,14 @@ class BinsConfig:
 
 
 class BinsHead(ActionHead):
-    """Twelve classifiers on the action query, each component independent of the others."""
+    """Twelve classifiers on the action query, each component independent of the others.
+
+    Attributes:
+        pointing_places: Which of the classes that a step decodes are the objects of pick and place, with
+            `points`; the others are bins, in order.
+    """
+
+    pointing_places = (ACTION_WIDTH, ACTION_WIDTH + 1)
 
     def __init__(self, hidden_width: int, width: int, actions: nn.Module) -> None:
         super().__init__(actions)

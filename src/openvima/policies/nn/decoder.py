@@ -332,11 +332,7 @@ class CrossBlock(nn.Module):
         self, x_ND: torch.Tensor, unpadder: Unpadder, prompt: KeysValues, bias_B11P: torch.Tensor
     ) -> torch.Tensor:
         """Return the weights with which `forward` attends from the last token of each row, (B, H, P)."""
-        query_BHLK = self._queries(x_ND, unpadder)
-        last_B = unpadder.pad(torch.ones_like(x_ND[..., 0, None]))[..., 0].sum(dim=1).to(torch.int64) - 1
-        query_BHK = query_BHLK[torch.arange(len(last_B), device=last_B.device), :, last_B]
-        scores_BHP = (query_BHK[..., None, :] @ prompt[0].mT).squeeze(-2) * query_BHK.shape[-1] ** -0.5
-        return torch.softmax(scores_BHP + bias_B11P[:, 0], dim=-1)
+        return _last_attention(self._queries(x_ND, unpadder), prompt[0], bias_B11P, unpadder, x_ND)
 
     def _queries(self, x_ND: torch.Tensor, unpadder: Unpadder) -> torch.Tensor:
         """Return the queries of unpadded tokens, (B, H, L, K)."""
@@ -381,6 +377,13 @@ class SelfBlock(nn.Module):
         hidden = self.narrow(F.gelu(self.widen(attended)) * self.gate(attended))
         return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
 
+    def last_attention(
+        self, x_ND: torch.Tensor, unpadder: Unpadder, past: KeysValues, bias_B1LS: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the weights with which `forward` attends from the last token of each row, (B, H, S)."""
+        query, key, _ = self.project(x_ND, unpadder, past)
+        return _last_attention(query, key, bias_B1LS, unpadder, x_ND)
+
     def project(
         self, x_ND: torch.Tensor, unpadder: Unpadder, past: KeysValues
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -389,6 +392,21 @@ class SelfBlock(nn.Module):
         padded = unpadder.pad(self.query_key_value(x_ND)).unflatten(-1, (3, self.num_heads, -1))
         query, key, value = padded.permute(2, 0, 3, 1, 4)
         return query, torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
+
+
+def _last_attention(
+    query_BHLK: torch.Tensor,
+    key_BHSK: torch.Tensor,
+    bias_B1LS: torch.Tensor,
+    unpadder: Unpadder,
+    x_ND: torch.Tensor,
+) -> torch.Tensor:
+    last_B = unpadder.pad(torch.ones_like(x_ND[..., 0, None]))[..., 0].sum(dim=1).to(torch.int64) - 1
+    rows_B = torch.arange(len(last_B), device=last_B.device)
+    query_BHK = query_BHLK[rows_B, :, last_B]
+    bias_B1S = bias_B1LS.expand(-1, -1, query_BHLK.shape[2], -1)[rows_B, :, last_B]
+    scores_BHS = (query_BHK[..., None, :] @ key_BHSK.mT).squeeze(-2) * query_BHK.shape[-1] ** -0.5
+    return torch.softmax(scores_BHS + bias_B1S, dim=-1)
 
 
 def _align(query_DD: torch.Tensor, key_DD: torch.Tensor) -> None:

@@ -16,13 +16,12 @@ from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_head import ObservationTokens, actions_from_bins
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
-    ACTION_WIDTH,
     ActionTargets,
     DecodingStrategy,
     action_metrics,
     greedy,
 )
-from openvima.policies.nn.decoder import CrossBlock, Decoder, KVCache, PrefixDecoder
+from openvima.policies.nn.decoder import CrossBlock, Decoder, KVCache, PrefixDecoder, SelfBlock
 from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -217,10 +216,12 @@ class PolicyNetwork(nn.Module):
     def explain_step(self, step: StepInputs, decoded: Decoded) -> StepTrace:
         """Explain one step: what `decode_step` has decoded, and attention, for which it decodes once more.
 
-        Here for decoders with cross-attention, whose last layer gives the attention.
+        Here for heads over bins. Attention is that of the last layer; with a prefix that of the first one,
+        as tokens of the prompt later hold what came before them as well.
         """
-        mask_BL, weights = step.prompt.mask_BL, []
-        block = cast(CrossBlock, cast(Decoder, self.decoder).cross_blocks[-1])
+        mask_BL, weights, decoder = step.prompt.mask_BL, [], self.decoder
+        last_cross = decoder.cross_blocks[-1] if isinstance(decoder, Decoder) else None
+        block = cast(CrossBlock | SelfBlock, last_cross or decoder.self_blocks[0])
         hook = block.register_forward_pre_hook(
             lambda _, inputs: weights.append(block.last_attention(*inputs))
         )
@@ -228,15 +229,16 @@ class PolicyNetwork(nn.Module):
             self.decode_step(step)
         finally:
             hook.remove()
-        # An autoregressive head goes on with the components of the action.
-        attention = normalize_weights({"decoder": weights[0].mean(dim=1)}, mask_BL)
-        logits = [logits[:, 0] for logits, _ in decoded]
-        bins, logits = logits[:ACTION_WIDTH], logits[ACTION_WIDTH:]
-        if not logits:
+        # An autoregressive head goes on with the components of the action; a prefix goes on with the history.
+        weights_BL = weights[0].mean(dim=1)[:, : mask_BL.shape[1]]
+        attention = normalize_weights({"decoder": weights_BL}, mask_BL)
+        pointing = self.head.pointing_places if self.head.points else ()
+        bins = [logits[:, 0] for number, (logits, _) in enumerate(decoded) if number not in pointing]
+        if not pointing:
             return StepTrace((), attention, bins=bins)
         observations, _ = self._observe(step.prompt, step.state, step.history, step.features_KF)
         points_BC2, num_own = observations.candidates(1)[1][:, 0], observations.tokens_BTQD.shape[2]
-        picks_BQ, places_BC = logits
+        picks_BQ, places_BC = (decoded[number][0][:, 0] for number in pointing)
         end = num_own - self.config.query_token  # before it are the tokens of the top view
         classes_BK = torch.stack([each.argmax(-1) for each in bins], dim=-1)
         at_no_object_B2 = actions_from_bins(classes_BK, points_BC2.dtype)[:, ACTION_PARTS["pose1_position"]]
