@@ -11,6 +11,7 @@ from openvima.data import Dataset
 from openvima.errors import ConfigError, DatasetError, FolderLockedError
 from openvima.policies import load_policy
 from openvima.training import TrainingConfig, train
+from openvima.training.behaviour_cloning import BehaviourCloning
 from openvima.training.config import ScheduleConfig
 from openvima.training.loop import learning_rate_at, step_seed
 from openvima.training.run_folder import (
@@ -43,6 +44,18 @@ def test_nothing_is_held_out_against_tasks_that_have_not_been_shown(settings):
     train(config)
     lines = [line for line in metrics_of(config.out) if "validation_score" in line]
     assert [line["step"] for line in lines] == [4, 6]
+
+
+def test_it_warns_of_overfitting_once_held_out_demonstrations_gain_nothing(settings, monkeypatch, caplog):
+    scores, backward = iter((0.5, 0.6, 0.6)), BehaviourCloning.backward
+    right = {"accuracy": 0.9}
+    monkeypatch.setattr(BehaviourCloning, "backward", lambda self, step: {**backward(self, step), **right})
+    monkeypatch.setattr(
+        BehaviourCloning, "validate", lambda _: dict.fromkeys(("score", "accuracy"), next(scores))
+    )
+    train(TrainingConfig.of({**settings, "pretraining.steps": 0}))
+    (warning,) = (each.getMessage() for each in caplog.records if each.levelname == "WARNING")
+    assert warning.startswith("step 6: accuracy is 90% in training and 60% on held-out demonstrations")
 
 
 @pytest.mark.slow

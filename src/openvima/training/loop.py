@@ -364,10 +364,13 @@ class Trainer:
         step, name = self.progress.step, self.learner.score
         score = metrics.get(name, math.nan)
         logger.info("%s, step %d, held out: %s", stage.name, step, _format(metrics))
-        if self._training_score - score > OVERFIT_GAP:
+        best = self.progress.best_score  # so far
+        # A gap alone may come of inverse dynamics, which is easier and in training alone.
+        if best is not None and score <= best and self._training_score - score > OVERFIT_GAP:
             logger.warning(
-                "step %d: %s is %.0f%% in training and %.0f%% on held-out demonstrations: the network "
-                "overfits. More demonstrations or augmentation help; a longer training does not.",
+                "step %d: %s is %.0f%% in training and %.0f%% on held-out demonstrations, where it gains "
+                "nothing more: the network overfits. More demonstrations or augmentation help; a longer "
+                "training does not.",
                 step,
                 name,
                 100 * self._training_score,
