@@ -136,7 +136,7 @@ def test_init_from_disables_pretraining_unless_it_is_set(trained, tmp_path) -> N
 def test_init_from_shows_no_tasks_first_unless_it_is_asked_to(trained) -> None:
     words = ["train", "--preset", "midas-nano", "--data", "demos", "--out", "run"]
     for more, expected in (
-        ([], 600),
+        ([], 1000),
         (["--init-from", "other"], 0),
         (["--init-from", "other", "--loader.first-steps", "5"], 5),
     ):

@@ -105,10 +105,10 @@ _PAPERS_MIDAS: Mapping[str, Any] = {
     **_PAPERS,
     "preset": "midas-nano",
     "schedule.steps": 12000,  # each takes twice as long as one of VIMA
-    # Otherwise it never learns which object an image of the prompt shows. See
-    # results/2026-11-29_midas_first_tasks.md.
-    "loader.first_tasks": "pick_in_order_then_restore,visual_manipulation",
-    "loader.first_steps": 600,
+    # Otherwise it never learns which object an image of the prompt shows, nor the angle of `rotate`. See
+    # results/2026-11-29_midas_first_tasks.md and results/2026-11-30_midas.md.
+    "loader.first_tasks": "pick_in_order_then_restore,rotate,visual_manipulation",
+    "loader.first_steps": 1000,
     "augmentation.inverse_dynamics_prob": 0.33,
     "augmentation.drop_unused_objects_prob": 0.5,  # `follow_motion` shows what moves alone
 }
