@@ -59,7 +59,7 @@ class Explanation:
         action: The action, as `act` returned it.
         prompt: The prompt in reading order: words, images as "{name}", and an empty text for its end.
         attention: Kind of attention to weights of these, shape (P,): "pick" and "place" for policies that
-            point, "decoder" (mean over the heads of the last layer) for policies over bins.
+            point, "decoder" (mean over the heads of one layer) for policies over bins.
         objects: The objects in view.
         places: The place candidates.
         yaw_rad: Rotations to choose from, counter-clockwise seen from above, −π up to π, shape (R,).

@@ -66,7 +66,7 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
         _draw_place(draw, place)
     _draw_action(draw, explanation)
     _draw_labels(draw, explanation.objects, places)
-    whose = "the decoder's last layer" if explanation.bins else "pick (upper row) and place"
+    whose = "the decoder" if explanation.bins else "pick (upper row) and place"
     legend = f"below the prompt: attention of {whose}"
     draw.text((12, HEIGHT - 16), legend, font=font(13), fill=MUTED, anchor="lm")
     for number, (text, colour) in enumerate(_choices(explanation, places, scene)):
