@@ -114,7 +114,7 @@ def test_the_video_of_an_explained_episode_has_the_panel_beside_the_scene(tmp_pa
 
 @pytest.mark.parametrize("policy", [OracleRolloutPolicy(), PromptedRolloutPolicy(RandomPolicy())])
 def test_a_policy_without_explanations_is_refused_before_it_acts(env, policy, tmp_path: Path) -> None:
-    with pytest.raises(PolicyError, match=r"no explain.*openvima-small.*nano"):
+    with pytest.raises(PolicyError, match=r"no explain.*openvima-small.*all presets"):
         record_episode(env, policy, 0, tmp_path / "video.mp4", explain=True)
     assert not list(tmp_path.iterdir())
 
