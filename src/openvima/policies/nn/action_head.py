@@ -318,11 +318,11 @@ class BinsHead(ActionHead):
     """Twelve classifiers on the action query, each component independent of the others.
 
     Attributes:
-        pointing_places: Which of the classes that a step decodes are the objects of pick and place, with
+        pointing_indices: Which of the classes that a step decodes are the objects of pick and place, with
             `points`; the others are bins, in order.
     """
 
-    pointing_places = (ACTION_WIDTH, ACTION_WIDTH + 1)
+    pointing_indices = (ACTION_WIDTH, ACTION_WIDTH + 1)
 
     def __init__(self, hidden_width: int, width: int, actions: nn.Module) -> None:
         super().__init__(actions)

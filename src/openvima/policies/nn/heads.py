@@ -71,7 +71,7 @@ class AutoregressiveHead(BinsHead):
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
 
-    pointing_places = (2, 3 + ACTION_WIDTH // 2)  # each after x and y
+    pointing_indices = (2, 3 + ACTION_WIDTH // 2)  # each after x and y
 
     def loss(
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets

@@ -220,8 +220,8 @@ class PolicyNetwork(nn.Module):
         as tokens of the prompt later hold what came before them as well.
         """
         mask_BL, weights, decoder = step.prompt.mask_BL, [], self.decoder
-        last_cross = decoder.cross_blocks[-1] if isinstance(decoder, Decoder) else None
-        block = cast(CrossBlock | SelfBlock, last_cross or decoder.self_blocks[0])
+        found = decoder.cross_blocks[-1] if isinstance(decoder, Decoder) else decoder.self_blocks[0]
+        block = cast(CrossBlock | SelfBlock, found)
         hook = block.register_forward_pre_hook(
             lambda _, inputs: weights.append(block.last_attention(*inputs))
         )
@@ -232,7 +232,7 @@ class PolicyNetwork(nn.Module):
         # An autoregressive head goes on with the components of the action; a prefix goes on with the history.
         weights_BL = weights[0].mean(dim=1)[:, : mask_BL.shape[1]]
         attention = normalize_weights({"decoder": weights_BL}, mask_BL)
-        pointing = self.head.pointing_places if self.head.points else ()
+        pointing = self.head.pointing_indices if self.head.points else ()
         bins = [logits[:, 0] for number, (logits, _) in enumerate(decoded) if number not in pointing]
         if not pointing:
             return StepTrace((), attention, bins=bins)
