@@ -13,7 +13,7 @@ from lerobot_env_openvima.env import OpenVimaEnv
 from openvima.data.lerobot_frames import IMAGE_PREFIX, MAX_PROMPT_IMAGES, FrameLayout, frame_layout
 from openvima.env.tabletop import IMAGE_SHAPE
 from openvima.errors import ConfigError
-from openvima.scene.action import CONTROL_HZ, END_EFFECTOR, PRIMITIVES, check_control
+from openvima.scene.action import END_EFFECTOR, PRIMITIVES, check_control
 
 
 @EnvConfig.register_subclass("openvima")
@@ -47,7 +47,7 @@ class OpenVimaEnvConfig(EnvConfig):
         check_control(self.control)
         if self.control == END_EFFECTOR and not self.joints:
             raise ConfigError("joints is False; with control 'end_effector' observations always hold them.")
-        self.fps = self.fps or (CONTROL_HZ if self.control == END_EFFECTOR else 1)
+        self.fps = self.fps or self.layout.fps
         images = [key.removeprefix(IMAGE_PREFIX) for key in self.layout.video_keys]
         image = PolicyFeature(FeatureType.VISUAL, (*IMAGE_SHAPE, 3))
         self.features = {

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -32,10 +32,11 @@ from openvima.errors import ConfigError, DatasetError
 from openvima.input_files import settle
 from openvima.multiprocess import Report
 from openvima.render import channels_last
-from openvima.scene.action import CONTROL_HZ, END_EFFECTOR
+from openvima.scene.action import END_EFFECTOR
 from openvima.video.encoder import VideoWriter, import_av
 
 CODEBASE_VERSION = "v3.0"
+ROBOT_TYPE = "ur5"
 EPISODES_PER_FILE = 1000  # of tables and videos
 
 INFO_PATH = "meta/info.json"
@@ -49,25 +50,14 @@ VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m
 SOURCE_PATH = "meta/openvima.json"
 SOURCE_EPISODES_PATH = "meta/openvima.parquet"
 
+PixelFormat = Literal["yuv444p", "yuv420p"]
+PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
 
-def numbered_path(folder: Path, pattern: str, number: int, **names: str) -> Path:
-    """Return the path of a file by its number in the data set; its folder is made.
-
-    Args:
-        folder: The data set.
-        pattern: One of the patterns above; all files are in the first chunk.
-        number: From 0.
-        **names: What else the pattern asks for.
-    """
-    path = folder / pattern.format(chunk_index=0, file_index=number, **names)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def _place(prefix: str, number: int) -> dict[str, int]:
-    """Return the entries of an episode that say in which file it is."""
-    return {f"{prefix}/chunk_index": 0, f"{prefix}/file_index": number}
-
+# Each episode begins with a frame that needs no other, and no frames are out of order, so reading one never
+# decodes those before.
+_ENCODING = {"preset": "superfast", "tune": "zerolatency", "forced-idr": "1"}
+_QUALITY = {"yuv444p": {"qp": "0"}, "yuv420p": {"crf": "12"}}
+_COMPRESSION = "snappy"  # as LeRobot writes
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _BRIGHTNESS = np.arange(256) / 255
@@ -134,10 +124,173 @@ def _column_statistics(values: np.ndarray, counts: np.ndarray) -> dict[str, np.g
     }
 
 
-_COMPRESSION = "snappy"  # as LeRobot writes
+class LerobotWriter:
+    """Writes a data set into an empty folder, file by file; `finish` then makes it whole.
+
+    The numbers of all frames are in memory, some 120 bytes each, and the pictures of one episode.
+
+    Args:
+        folder: The folder.
+        layout: What a frame holds.
+        pixels: Pixel format of the videos.
+    """
+
+    def __init__(self, folder: Path, layout: FrameLayout, pixels: PixelFormat) -> None:
+        self._folder, self._layout, self._pixels = folder, layout, pixels
+        self._tasks: dict[str, int] = {}
+        self._values: list[dict[str, np.ndarray]] = []  # of each episode, by column
+        self._num_frames = 0
+        self._pixel_counts = {key: np.zeros((3, 256), np.int64) for key in layout.video_keys}
+
+    def write_file(self, number: int, episodes: Iterable[Trajectory]) -> None:
+        """Write the next episodes as one file of each kind: videos, frames, and the list of episodes.
+
+        Args:
+            number: From 0.
+            episodes: Of at least one step, with no more prompt images than the layout has.
+        """
+        first_frame, fps, tables, rows = self._num_frames, self._layout.fps, [], []
+        with contextlib.ExitStack() as closing:
+            videos = {key: closing.enter_context(self._video(key, number)) for key in self._pixel_counts}
+            for demo in episodes:
+                values = {**self._layout.values(demo), **self._counters(demo)}
+                statistics = self._write_pictures(demo, videos)
+                statistics |= {name: value_statistics(column) for name, column in values.items()}
+                start, end = self._num_frames, self._num_frames + demo.num_steps
+                row = {
+                    "episode_index": len(self._values),
+                    "tasks": [demo.prompt.text],
+                    "length": demo.num_steps,
+                    **_place("data", number),
+                    "dataset_from_index": start,
+                    "dataset_to_index": end,
+                    **_place("meta/episodes", number),
+                }
+                for key in videos:
+                    row |= _place(f"videos/{key}", number)
+                    row[f"videos/{key}/from_timestamp"] = (start - first_frame) / fps
+                    row[f"videos/{key}/to_timestamp"] = (end - first_frame) / fps
+                for name, entry in statistics.items():
+                    row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in entry.items()}
+                rows.append(row)
+                tables.append(_table(values))
+                self._values.append(values)
+                self._num_frames = end
+        for pattern, table in (
+            (DATA_PATH, pa.concat_tables(tables)),
+            (EPISODES_PATH, pa.Table.from_pylist(rows)),
+        ):
+            pq.write_table(table, self._path(pattern, number), compression=_COMPRESSION)
+
+    def finish(self) -> None:
+        """Write the metadata."""
+        columns = {
+            name: np.concatenate([values[name] for values in self._values]) for name in self._values[0]
+        }
+        info = {
+            "codebase_version": CODEBASE_VERSION,
+            "robot_type": ROBOT_TYPE,
+            "total_episodes": len(self._values),
+            "total_frames": self._num_frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": 1000,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": self._layout.fps,
+            "splits": {"train": f"0:{len(self._values)}"},
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH,
+            "features": self._features(columns),
+        }
+        counted = self._pixel_counts.items()
+        statistics = {key: pixel_statistics(counts, self._num_frames) for key, counts in counted}
+        statistics |= {name: value_statistics(column) for name, column in columns.items()}
+        write_json(self._folder / INFO_PATH, info)
+        write_json(self._folder / STATISTICS_PATH, statistics)
+        _write_tasks(self._folder / TASKS_PATH, list(self._tasks))
+
+    def _features(self, columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+        """Return what `info.json` says of the videos and of the columns of the tables."""
+        height, width = IMAGE_SHAPE
+        video = {
+            "dtype": "video",
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+            "info": {
+                "video.height": height,
+                "video.width": width,
+                "video.codec": "h264",
+                "video.pix_fmt": self._pixels,
+                "video.is_depth_map": False,
+                "video.fps": self._layout.fps,
+                "video.channels": 3,
+                "has_audio": False,
+            },
+        }
+        names = {"observation.state": self._layout.state_names, "action": self._layout.action_names}
+        numbers = {
+            name: {"dtype": str(column.dtype), "shape": column.shape[1:] or [1], "names": names.get(name)}
+            for name, column in columns.items()
+        }
+        return {**dict.fromkeys(self._layout.video_keys, video), **numbers}
+
+    def _counters(self, demo: Trajectory) -> dict[str, np.ndarray]:
+        """Return the columns that every LeRobot data set has, after its own."""
+        steps = np.arange(demo.num_steps)
+        task_index = self._tasks.setdefault(demo.prompt.text, len(self._tasks))
+        return {
+            "timestamp": (steps / self._layout.fps).astype(np.float32),
+            "frame_index": steps,
+            "episode_index": np.full_like(steps, len(self._values)),
+            "index": steps + self._num_frames,
+            "task_index": np.full_like(steps, task_index),
+        }
+
+    def _video(self, key: str, number: int) -> VideoWriter:
+        height, width = IMAGE_SHAPE
+        return VideoWriter(
+            self._path(VIDEO_PATH, number, video_key=key),
+            width,
+            height,
+            frames_per_second=self._layout.fps,
+            pixels=self._pixels,
+            options={**_ENCODING, **_QUALITY[self._pixels]},
+        )
+
+    def _write_pictures(self, demo: Trajectory, videos: Mapping[str, VideoWriter]) -> dict[str, Statistics]:
+        statistics = {}
+        views = {view: images[: demo.num_steps] for view, images in demo.rgb.items()}
+        for key, pictures in self._layout.pictures(views, demo.prompt).items():
+            for index, picture in enumerate(pictures):
+                repeat = demo.num_steps // len(pictures)
+                videos[key].write(channels_last(picture), repeat=repeat, is_key=index == 0)
+            counts = count_pixels(pictures, demo.num_steps)
+            self._pixel_counts[key] += counts
+            statistics[key] = pixel_statistics(counts, demo.num_steps)
+        return statistics
+
+    def _path(self, pattern: str, number: int, **names: str) -> Path:
+        """Return the path of a file by its number; its folder is made. All are in the first chunk."""
+        path = self._folder / pattern.format(chunk_index=0, file_index=number, **names)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
 
 
-def write_tasks(path: Path, tasks: Sequence[str]) -> None:
+def _place(prefix: str, number: int) -> dict[str, int]:
+    """Return the entries of an episode that say in which file it is."""
+    return {f"{prefix}/chunk_index": 0, f"{prefix}/file_index": number}
+
+
+def _table(values: Mapping[str, np.ndarray]) -> pa.Table:
+    """Make a table of columns of numbers, shape (T,), (T, 1), or (T, D), which become lists."""
+    columns = {}
+    for name, numbers in values.items():
+        flat, width = pa.array(numbers.reshape(-1)), numbers.size // len(numbers)
+        columns[name] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+    return pa.table(columns)
+
+
+def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Write the list of prompts; LeRobot reads it with pandas and expects the texts as its index."""
     columns = {"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())}
     kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
@@ -150,175 +303,10 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     pq.write_table(table, path, compression=_COMPRESSION)
 
 
-PixelFormat = Literal["yuv444p", "yuv420p"]
-PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
-
-# Each episode begins with a frame that needs no other, and no frames are out of order, so reading one never
-# decodes those before.
-_ENCODING = {"preset": "superfast", "tune": "zerolatency", "forced-idr": "1"}
-_QUALITY = {"yuv444p": {"qp": "0"}, "yuv420p": {"crf": "12"}}
-
-
-ROBOT_TYPE = "ur5"
-
-
-class LerobotWriter:
-    """Writes a data set into an empty folder, file by file; `finish` then makes it whole.
-
-    Args:
-        folder: The folder.
-        frames: What a frame holds.
-        fps: Frames a second.
-        pixels: Pixel format of the videos.
-    """
-
-    def __init__(self, folder: Path, frames: FrameLayout, *, fps: int, pixels: PixelFormat) -> None:
-        self._folder, self._frames, self._fps, self._pixels = folder, frames, fps, pixels
-        self._schema = _schema(frames)
-        self._tasks: dict[str, int] = {}
-        self._num_episodes = self._num_frames = 0
-        self._pixel_counts = {key: np.zeros((3, 256), np.int64) for key in frames.video_keys}
-
-    def write_file(self, number: int, episodes: Iterable[Trajectory]) -> None:
-        """Write the next episodes as one file of each kind: videos, frames, and the list of episodes.
-
-        Their numbers are in memory, and the pictures of one.
-
-        Args:
-            number: From 0.
-            episodes: Of at least one step, with no more prompt images than the layout has.
-        """
-        first_frame, tables, rows = self._num_frames, [], []
-        with contextlib.ExitStack() as closing:
-            videos = {key: closing.enter_context(self._video(key, number)) for key in self._pixel_counts}
-            for demo in episodes:
-                values = {**self._frames.values(demo), **self._counters(demo)}
-                tables.append(_table(values, self._schema))
-                statistics = self._write_pictures(demo, videos)
-                statistics |= {name: value_statistics(column) for name, column in values.items()}
-                start, end = self._num_frames, self._num_frames + demo.num_steps
-                row = {
-                    "episode_index": self._num_episodes,
-                    "tasks": [demo.prompt.text],
-                    "length": demo.num_steps,
-                    **_place("data", number),
-                    "dataset_from_index": start,
-                    "dataset_to_index": end,
-                    **_place("meta/episodes", number),
-                }
-                for key in videos:
-                    row |= _place(f"videos/{key}", number)
-                    row[f"videos/{key}/from_timestamp"] = (start - first_frame) / self._fps
-                    row[f"videos/{key}/to_timestamp"] = (end - first_frame) / self._fps
-                for name, entry in statistics.items():
-                    row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in entry.items()}
-                rows.append(row)
-                self._num_episodes += 1
-                self._num_frames = end
-        for pattern, table in (
-            (DATA_PATH, pa.concat_tables(tables)),
-            (EPISODES_PATH, pa.Table.from_pylist(rows)),
-        ):
-            pq.write_table(table, numbered_path(self._folder, pattern, number), compression=_COMPRESSION)
-
-    def finish(self) -> None:
-        """Write the metadata."""
-        info = {
-            "codebase_version": CODEBASE_VERSION,
-            "robot_type": ROBOT_TYPE,
-            "total_episodes": self._num_episodes,
-            "total_frames": self._num_frames,
-            "total_tasks": len(self._tasks),
-            "chunks_size": 1000,
-            "data_files_size_in_mb": 100,
-            "video_files_size_in_mb": 200,
-            "fps": self._fps,
-            "splits": {"train": f"0:{self._num_episodes}"},
-            "data_path": DATA_PATH,
-            "video_path": VIDEO_PATH,
-            "features": self._frames.features(fps=self._fps, pixels=self._pixels),
-        }
-        counted = self._pixel_counts.items()
-        statistics = {key: pixel_statistics(counts, self._num_frames) for key, counts in counted}
-        statistics |= {name: self._overall(name) for name in self._schema.names}
-        plain = {
-            name: {kind: value.tolist() for kind, value in entry.items()}
-            for name, entry in statistics.items()
-        }
-        write_json(self._folder / INFO_PATH, info)
-        write_json(self._folder / STATISTICS_PATH, plain)
-        write_tasks(self._folder / TASKS_PATH, list(self._tasks))
-
-    def _counters(self, demo: Trajectory) -> dict[str, np.ndarray]:
-        steps = np.arange(demo.num_steps)
-        task_index = self._tasks.setdefault(demo.prompt.text, len(self._tasks))
-        return {
-            "timestamp": (steps / self._fps).astype(np.float32),
-            "frame_index": steps,
-            "episode_index": np.full_like(steps, self._num_episodes),
-            "index": steps + self._num_frames,
-            "task_index": np.full_like(steps, task_index),
-        }
-
-    def _video(self, key: str, number: int) -> VideoWriter:
-        height, width = IMAGE_SHAPE
-        return VideoWriter(
-            numbered_path(self._folder, VIDEO_PATH, number, video_key=key),
-            width,
-            height,
-            frames_per_second=self._fps,
-            pixels=self._pixels,
-            options={**_ENCODING, **_QUALITY[self._pixels]},
-        )
-
-    def _write_pictures(self, demo: Trajectory, videos: Mapping[str, VideoWriter]) -> dict[str, Statistics]:
-        statistics = {}
-        views = {view: images[: demo.num_steps] for view, images in demo.rgb.items()}
-        for key, pictures in self._frames.pictures(views, demo.prompt).items():
-            for index, picture in enumerate(pictures):
-                repeat = demo.num_steps // len(pictures)
-                videos[key].write(channels_last(picture), repeat=repeat, is_key=index == 0)
-            counts = count_pixels(pictures, demo.num_steps)
-            self._pixel_counts[key] += counts
-            statistics[key] = pixel_statistics(counts, demo.num_steps)
-        return statistics
-
-    def _overall(self, name: str) -> Statistics:
-        """Statistics of a column over all frames, read back from the files."""
-        paths = sorted((self._folder / "data").rglob("*.parquet"))
-        return value_statistics(np.concatenate([_read(path, name) for path in paths]))
-
-
 def write_json(path: Path, content: object) -> None:
-    """Write a JSON file as LeRobot does."""
-    path.write_text(json.dumps(content, indent=4, ensure_ascii=False), encoding="utf-8")
-
-
-def _schema(frames: FrameLayout) -> pa.Schema:
-    def field(name: str, dtype: str, length: int) -> pa.Field:
-        number = pa.type_for_alias(dtype)
-        return pa.field(name, number if length == 1 else pa.list_(number, length))
-
-    features = frames.value_features()
-    return pa.schema([field(name, f["dtype"], f["shape"][0]) for name, f in features.items()])
-
-
-def _table(values: dict[str, np.ndarray], schema: pa.Schema) -> pa.Table:
-    def column(field: pa.Field) -> pa.Array:
-        flat = pa.array(values[field.name].reshape(-1))
-        is_list = pa.types.is_fixed_size_list(field.type)
-        return pa.FixedSizeListArray.from_arrays(flat, type=field.type) if is_list else flat
-
-    return pa.Table.from_arrays([column(field) for field in schema], schema=schema)
-
-
-def _read(path: Path, name: str) -> np.ndarray:
-    """Read a column of numbers, shape (N, D)."""
-    column = pq.ParquetFile(path).read(columns=[name], use_threads=False).column(0).combine_chunks()
-    num_rows = len(column)
-    if pa.types.is_fixed_size_list(column.type):
-        column = column.flatten()
-    return column.to_numpy(zero_copy_only=False).reshape(num_rows, -1)
+    """Write a JSON file as LeRobot does; arrays become lists."""
+    text = json.dumps(content, indent=4, ensure_ascii=False, default=np.ndarray.tolist)
+    path.write_text(text, encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,13 +358,11 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     import_av()  # before the work begins
     dataset = Dataset(config.data, tasks=config.tasks)
     layout = find_layout(dataset)
-    is_dense = layout.control == END_EFFECTOR
-    fps = CONTROL_HZ if is_dense else 1  # a whole number of float32 seconds, by which LeRobot finds frames
 
     def trajectories(first: int) -> Iterator[Trajectory]:
         for index in range(first, min(first + EPISODES_PER_FILE, len(dataset))):
             demo = dataset[index]
-            if is_dense:
+            if layout.control == END_EFFECTOR:
                 info = dataset.shard(dataset.locate(index)[0]).info
                 yield dense_trajectory(demo, replace(info.env_config, assets=recorded_assets(info.assets)))
             else:
@@ -387,11 +373,11 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     with new_folder(
         config.out, [config.data], force=config.force, is_own=lambda out: (out / INFO_PATH).is_file()
     ) as folder:
-        writer = LerobotWriter(folder, layout, fps=fps, pixels=config.pixels)
+        writer = LerobotWriter(folder, layout, config.pixels)
         for number, first in enumerate(range(0, len(dataset), EPISODES_PER_FILE)):
             writer.write_file(number, trajectories(first))
         writer.finish()
-        _write_source(folder, dataset, config, fps)
+        _write_source(folder, dataset, config, layout.fps)
     return config.out
 
 
@@ -417,20 +403,14 @@ def find_layout(dataset: Dataset) -> FrameLayout:
 
 def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig, fps: int) -> None:
     """Write where the episodes came from, which the format has no place for."""
-    manifest = dataset.manifest
-    source = {key: manifest[key] for key in ("command", "config", "content_hash", "licence", "versions")}
-    versions = {"openvima": __version__, "av": import_av().__version__, "pyarrow": pa.__version__}
-    settings = {"tasks": config.tasks, "fps": fps, "pixels": config.pixels}
-    write_json(
-        folder / SOURCE_PATH,
-        {
-            "command": "openvima data export-lerobot",
-            "config": settings,
-            "versions": versions,
-            "source": source,
-        },
-    )
+    kept = ("command", "config", "content_hash", "licence", "versions")
+    source = {
+        "command": "openvima data export-lerobot",
+        "config": {"tasks": config.tasks, "fps": fps, "pixels": config.pixels},
+        "versions": {"openvima": __version__, "av": import_av().__version__, "pyarrow": pa.__version__},
+        "source": {key: dataset.manifest[key] for key in kept},
+    }
+    write_json(folder / SOURCE_PATH, source)
     index = dataset.index.select(["task", "level", "seed", "content_hash"])
-    numbers = pa.array(range(index.num_rows), pa.int64())
-    index = index.add_column(0, "episode_index", numbers)
-    pq.write_table(index, folder / SOURCE_EPISODES_PATH, compression="snappy")
+    index = index.add_column(0, "episode_index", pa.array(range(index.num_rows), pa.int64()))
+    pq.write_table(index, folder / SOURCE_EPISODES_PATH, compression=_COMPRESSION)

@@ -12,7 +12,7 @@ from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.env.config import EnvConfig
 from openvima.errors import ActionError, DatasetError
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS, WORKSPACE_HIGH, WORKSPACE_LOW, RenderedPrompt
-from openvima.scene.action import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES
+from openvima.scene.action import COMMAND_NAMES, CONTROL_HZ, END_EFFECTOR, PRIMITIVES
 
 if TYPE_CHECKING:  # comes with the simulator
     from openvima.env import TabletopEnv
@@ -22,18 +22,6 @@ TOOL_NAMES = ("tool_x", "tool_y", "tool_z", "tool_yaw", "tool_holds")
 ACTION_NAMES = tuple(f"{key}.{axis}" for key, length in ACTION_SHAPES.items() for axis in "xyzw"[:length])
 MAX_PROMPT_IMAGES = 8  # of the benchmark's prompts: novel_adj
 IMAGE_PREFIX = "observation.images."
-
-# Columns that every LeRobot data set has, after its own.
-_COUNTERS = {
-    "timestamp": "float32",
-    "frame_index": "int64",
-    "episode_index": "int64",
-    "index": "int64",
-    "task_index": "int64",
-}
-_HEIGHT, _WIDTH = IMAGE_SHAPE
-
-Feature = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,45 +75,15 @@ class FrameLayout:
         return COMMAND_NAMES if self.control == END_EFFECTOR else ACTION_NAMES
 
     @property
+    def fps(self) -> int:
+        """Frames a second; a step is one of float32, by which LeRobot finds frames."""
+        return CONTROL_HZ if self.control == END_EFFECTOR else 1
+
+    @property
     def video_keys(self) -> tuple[str, ...]:
         """Names of the image features: the views, then those of the first prompt image, and so on."""
         prompts = (f"prompt_{n}_{view}" for n in range(self.num_prompt_images) for view in VIEWS)
         return tuple(f"{IMAGE_PREFIX}{name}" for name in (*VIEWS, *prompts))
-
-    def value_features(self) -> dict[str, Feature]:
-        """Return the features that are columns of the tables, in order."""
-        return {
-            "observation.state": _feature("float32", self.state_names),
-            "action": _feature("float32", self.action_names),
-            "next.reward": _feature("float32"),
-            "next.done": _feature("bool"),
-            "next.success": _feature("bool"),
-            **{name: _feature(dtype) for name, dtype in _COUNTERS.items()},
-        }
-
-    def features(self, *, fps: int, pixels: str) -> dict[str, Feature]:
-        """Return all features as `info.json` lists them.
-
-        Args:
-            fps: Frames a second.
-            pixels: Pixel format of the videos.
-        """
-        video = {
-            "dtype": "video",
-            "shape": [_HEIGHT, _WIDTH, 3],
-            "names": ["height", "width", "channels"],
-            "info": {
-                "video.height": _HEIGHT,
-                "video.width": _WIDTH,
-                "video.codec": "h264",
-                "video.pix_fmt": pixels,
-                "video.is_depth_map": False,
-                "video.fps": fps,
-                "video.channels": 3,
-                "has_audio": False,
-            },
-        }
-        return {**dict.fromkeys(self.video_keys, video), **self.value_features()}
 
     def values(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
         """Return what the frames of one episode hold besides images and counters, arrays of T rows."""
@@ -153,7 +111,7 @@ class FrameLayout:
         for number, image in enumerate(prompt.images.values()):
             for view in VIEWS:
                 shown[f"{IMAGE_PREFIX}prompt_{number}_{view}"] = image.rgb[view][None]
-        black = np.zeros((1, 3, _HEIGHT, _WIDTH), np.uint8)
+        black = np.zeros((1, 3, *IMAGE_SHAPE), np.uint8)
         return {key: shown.get(key, black) for key in self.video_keys}
 
     def frame(self, observation: Mapping[str, Any], prompt: RenderedPrompt) -> dict[str, Any]:
@@ -216,10 +174,6 @@ def _within_bounds(values: np.ndarray) -> np.ndarray:
     if len(values) == len(WORKSPACE_LOW):
         return np.clip(values, *np.array([WORKSPACE_LOW, WORKSPACE_HIGH], np.float32))
     return np.clip(values / max(float(np.linalg.norm(values)), 1e-6), -1, 1).astype(np.float32)
-
-
-def _feature(dtype: str, names: tuple[str, ...] = ()) -> Feature:
-    return {"dtype": dtype, "shape": [len(names) or 1], "names": list(names) or None}
 
 
 def step_trajectory(demo: Demonstration, *, has_joints: bool) -> Trajectory:
