@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -226,7 +225,7 @@ def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:
         max_steps=row["max_steps"],
         prompt=_prompt(row, views),
         rgb={view: planes(row[f"rgb_{view}"]) for view in views},
-        segm={view: row[f"segm_{view}"] for view in views},
+        segm={view: row[f"segm_{view}"].copy() for view in views},
         end_effector=row["end_effector"],
         actions=decode_actions(row),
         pick_ids=tuple(row["pick_ids"]),
@@ -248,7 +247,7 @@ def decode_columns(batch: pa.RecordBatch) -> dict[str, Any]:
 
     Returns:
         Column name to value: an array for poses, actions and images (colours last, as they are stored), a
-        list of arrays for joint paths, and else what `to_pylist` gives.
+        list of arrays for joint paths, and else what `to_pylist` gives. Arrays are read-only.
 
     Raises:
         ValueError: Its arrays do not fit together.
@@ -257,9 +256,12 @@ def decode_columns(batch: pa.RecordBatch) -> dict[str, Any]:
     for number, name in enumerate(batch.schema.names):
         column = batch.column(number)
         if name in ARRAYS:
-            values[name] = _view_array(column, *ARRAYS[name])
+            values[name] = column.values.values.to_numpy().reshape(-1, *ARRAYS[name][1])
         elif name == "joint_paths":
-            values[name] = _view_paths(column)
+            paths = column.values
+            waypoints = paths.values.values.to_numpy().reshape(-1, 6)
+            ends = paths.offsets.to_numpy().tolist()
+            values[name] = [waypoints[start:end] for start, end in itertools.pairwise(ends)]
         else:
             values[name] = column[0].as_py()
     if len(values.get("poses", ())):
@@ -276,35 +278,6 @@ def decode_actions(row: Mapping[str, Any]) -> tuple[Action, ...]:
     )
 
 
-def _view_array(column: pa.ListArray, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
-    """The arrays that a row lists, without a copy: nobody else sees what Arrow has decompressed."""
-    buffers = column.buffers()  # Arrow's own ways to the numbers take ten times as long
-    start, end = _ends(buffers[1], column.offset, 1)
-    return _slice(buffers[-1], dtype, shape, start, end)
-
-
-def _view_paths(column: pa.ListArray) -> list[np.ndarray]:
-    _, outer, _, inner, *_, numbers = column.buffers()
-    start, end = _ends(outer, column.offset, 1)
-    ends = _ends(inner, start, end - start)
-    return [_slice(numbers, "<f4", (6,), *pair) for pair in itertools.pairwise(ends)]
-
-
-def _ends(offsets: pa.Buffer, start: int, count: int) -> list[int]:
-    """Where lists begin, and where the last one ends; `count` of them from number `start`."""
-    return np.frombuffer(offsets, "<i4", count=count + 1, offset=4 * start).tolist() if count else []
-
-
-def _slice(buffer: pa.Buffer | None, dtype: str, shape: tuple[int, ...], start: int, end: int) -> np.ndarray:
-    if start == end:
-        return np.zeros((0, *shape), dtype)
-    length = math.prod(shape)
-    offset = start * length * np.dtype(dtype).itemsize
-    assert buffer is not None  # since it is not empty
-    numbers = np.frombuffer(buffer, dtype, count=(end - start) * length, offset=offset)
-    return numbers.reshape(end - start, *shape)
-
-
 def _prompt(row: Mapping[str, Any], views: Sequence[str]) -> RenderedPrompt:
     rgb = {view: planes(row[f"prompt_rgb_{view}"]) for view in views}
     images = {}
@@ -313,7 +286,7 @@ def _prompt(row: Mapping[str, Any], views: Sequence[str]) -> RenderedPrompt:
             name=entry["name"],
             kind=entry["kind"],
             rgb={view: rgb[view][number] for view in views},
-            segm={view: row[f"prompt_segm_{view}"][number] for view in views},
+            segm={view: row[f"prompt_segm_{view}"][number].copy() for view in views},
             objects=tuple(_record(shown) for shown in entry["objects"]),
         )
     return RenderedPrompt(row["prompt"], images)

@@ -165,7 +165,8 @@ class Shard:
 
         Returns:
             Column name to value: an array for poses, actions and images (colours last, as they are stored), a
-            list of arrays for joint paths, and else texts, numbers, lists and dictionaries.
+            list of arrays for joint paths, and else texts, numbers, lists and dictionaries. Arrays are
+            read-only.
 
         Raises:
             DatasetError: There is no such column.
@@ -176,8 +177,7 @@ class Shard:
             values = decode_columns(batch)
         except DAMAGE_ERRORS as error:
             raise self._row_damage(row, error) from None
-        images = IMAGES.intersection(columns)
-        if images and not any(len(values[name]) for name in images) and not self.info.images:
+        if not self.info.images and IMAGES.intersection(columns):
             values |= make_columns(self[row]).images
         return {name: values[name] for name in columns}
 
