@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +15,7 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter, generate
 from openvima.data.encoding import ShardInfo, Skipped
 from openvima.data.manifest import finish_folder
-from openvima.data.reader import DemonstrationQuery, find_demonstrations
+from openvima.data.reader import find_demonstrations
 from openvima.data.subsets import (
     MergeConfig,
     SubsetConfig,
@@ -310,29 +311,30 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def test_each_field_finds_what_a_walk_over_all_demonstrations_finds(dataset: Dataset) -> None:
     demos = list(dataset)
     shown, (first, second, *_) = demos[3].objects[0], demos[0].objects
-    mixed = DemonstrationQuery(object=first.object, texture=second.texture)  # of two objects
-    cases = {
-        DemonstrationQuery(): lambda d: True,
-        DemonstrationQuery(task="visual_manipulation"): lambda d: d.task == "visual_manipulation",
-        DemonstrationQuery(level="L1"): lambda d: False,
-        DemonstrationQuery(min_steps=2): lambda d: d.num_steps >= 2,
-        DemonstrationQuery(max_steps=1): lambda d: d.num_steps <= 1,
-        DemonstrationQuery(object=shown.object): lambda d: shown.object in {o.object for o in d.objects},
-        DemonstrationQuery(texture=shown.texture): lambda d: shown.texture in {o.texture for o in d.objects},
-        DemonstrationQuery(object=shown.object, texture=shown.texture): lambda d: (
-            (shown.object, shown.texture) in {(o.object, o.texture) for o in d.objects}
+    mixed = {"object": first.object, "texture": second.texture}  # of two objects
+    cases: list[tuple[dict[str, Any], Callable[[Demonstration], bool]]] = [
+        ({}, lambda d: True),
+        ({"task": "visual_manipulation"}, lambda d: d.task == "visual_manipulation"),
+        ({"level": "L1"}, lambda d: False),
+        ({"min_steps": 2}, lambda d: d.num_steps >= 2),
+        ({"max_steps": 1}, lambda d: d.num_steps <= 1),
+        ({"object": shown.object}, lambda d: shown.object in {o.object for o in d.objects}),
+        ({"texture": shown.texture}, lambda d: shown.texture in {o.texture for o in d.objects}),
+        (
+            {"object": shown.object, "texture": shown.texture},
+            lambda d: (shown.object, shown.texture) in {(o.object, o.texture) for o in d.objects},
         ),
-        mixed: lambda d: (first.object, second.texture) in {(o.object, o.texture) for o in d.objects},
-    }
-    for query, fits in cases.items():
+        (mixed, lambda d: (first.object, second.texture) in {(o.object, o.texture) for o in d.objects}),
+    ]
+    for query, fits in cases:
         expected = [index for index, demo in enumerate(demos) if fits(demo)]
-        assert find_demonstrations(dataset, query).tolist() == expected, query
-    assert 0 < len(find_demonstrations(dataset, DemonstrationQuery(min_steps=2))) < len(demos)
-    assert 0 not in find_demonstrations(dataset, mixed)
+        assert find_demonstrations(dataset, **query).tolist() == expected, query
+    assert 0 < len(find_demonstrations(dataset, min_steps=2)) < len(demos)
+    assert 0 not in find_demonstrations(dataset, **mixed)
 
 
 def test_unknown_names_are_refused(dataset: Dataset) -> None:
     with pytest.raises(DatasetError, match=r"no object 'hart'\. Did you mean 'heart'\?"):
-        DemonstrationQuery(object="hart")
-    with pytest.raises(DatasetError, match=r"task in .* called 'rotate'"):
-        find_demonstrations(dataset, DemonstrationQuery(task="rotate"))
+        find_demonstrations(dataset, object="hart")
+    with pytest.raises(DatasetError, match=r"no task 'rotate'.* Allowed: manipulate_old_neighbor"):
+        find_demonstrations(dataset, task="rotate")

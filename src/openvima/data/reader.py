@@ -1,8 +1,8 @@
 """Reading a folder of demonstrations, or one on the Hugging Face Hub, as a sequence of episodes."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -206,11 +206,22 @@ def hash_names(names: Iterable[str]) -> np.ndarray:
     return np.frombuffer(b"".join(digests), "<u8")
 
 
-@dataclass(frozen=True, slots=True)
-class DemonstrationQuery:
-    """Which demonstrations to find; empty fields admit all.
+def find_demonstrations(
+    dataset: Dataset,
+    *,
+    task: str = "",
+    level: str = "",
+    object: str = "",
+    texture: str = "",
+    min_steps: int = 0,
+    max_steps: int | None = None,
+) -> np.ndarray:
+    """Find demonstrations; empty arguments admit all.
+
+    Shards are read only for objects and textures, without images, and only those with candidates.
 
     Args:
+        dataset: The data set.
         task: Name of the task.
         level: one of `openvima.catalog.LEVELS`.
         object: Object of the catalogue that is on the table.
@@ -218,66 +229,40 @@ class DemonstrationQuery:
         min_steps: Fewest steps.
         max_steps: Most steps; None for no limit.
 
-    Raises:
-        DatasetError: There is no such level, object or texture.
-    """
-
-    task: str = ""
-    level: str = ""
-    object: str = ""
-    texture: str = ""
-    min_steps: int = 0
-    max_steps: int | None = None
-
-    def __post_init__(self) -> None:
-        known = {"level": LEVELS, "object": OBJECTS, "texture": TEXTURES}
-        for field, names in known.items():
-            if (name := getattr(self, field)) and name not in names:
-                raise DatasetError(unknown_name(field, name, names))
-
-
-def find_demonstrations(dataset: Dataset, query: DemonstrationQuery) -> np.ndarray:
-    """Find demonstrations.
-
-    Shards are read only for objects and textures, without images, and only those with candidates.
-
-    Args:
-        dataset: The data set.
-        query: What to find.
-
     Returns:
         Indices into the data set, ascending, int64.
 
     Raises:
-        DatasetError: The data set has no such task.
+        DatasetError: The data set has no such task, or there is no such level, object or texture.
         DatasetError: A shard is damaged.
     """
     index = dataset.index
-    known = dataset.manifest["tasks"]
-    if query.task and query.task not in known:
-        raise DatasetError(unknown_name(f"task in {dataset.path} called", query.task, known))
     steps = index.column("steps").to_numpy()
-    chosen = steps >= query.min_steps
-    if query.max_steps is not None:
-        chosen &= steps <= query.max_steps
-    for field in ("task", "level"):
-        if value := getattr(query, field):
-            chosen &= index.column(field).to_numpy() == value
+    chosen = (steps >= min_steps) & (steps <= (np.inf if max_steps is None else max_steps))
+    asked = {"task": task, "level": level, "object": object, "texture": texture}
+    allowed = {"task": dataset.manifest["tasks"], "level": LEVELS, "object": OBJECTS, "texture": TEXTURES}
+    shown = {}  # on the table, of which the index knows nothing
+    for field, name in asked.items():
+        if name and name not in allowed[field]:
+            raise DatasetError(unknown_name(field, name, allowed[field]))
+        if name and field in index.column_names:
+            chosen &= index.column(field).to_numpy() == name
+        elif name:
+            shown[field] = name
     end = 0
-    for name, part in split_index(index).items() if query.object or query.texture else ():
+    for shard_name, part in split_index(index).items() if shown else ():
         start, end = end, end + part.num_rows
         if chosen[start:end].any():
-            chosen[start:end] &= _shows(dataset.shard(name), query)
+            chosen[start:end] &= _shows(dataset.shard(shard_name), shown)
     return np.flatnonzero(chosen)
 
 
-def _shows(shard: Shard, query: DemonstrationQuery) -> np.ndarray:
-    """Whether each demonstration of a shard has an object that fits, shape (N,), bool."""
+def _shows(shard: Shard, shown: Mapping[str, str]) -> np.ndarray:
+    """Whether each demonstration of a shard has an object with these fields, shape (N,), bool."""
     lists = shard.table(["objects"]).column("objects").combine_chunks()
     objects: pa.StructArray = lists.flatten()
     fits = np.ones(len(objects), bool)
-    for field in ("object", "texture"):
-        if value := getattr(query, field):
-            fits &= objects.field(field).to_numpy(zero_copy_only=False) == value
+    for field, name in shown.items():
+        fits &= objects.field(field).to_numpy(zero_copy_only=False) == name
     owners = np.repeat(np.arange(len(lists)), lists.value_lengths().to_numpy())
     return np.bincount(owners[fits], minlength=len(lists)) > 0

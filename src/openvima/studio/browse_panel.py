@@ -9,7 +9,7 @@ import viser
 from openvima.catalog import LEVELS, OBJECTS, TEXTURES
 from openvima.data import Dataset, Demonstration
 from openvima.data.manifest import MANIFEST_NAME
-from openvima.data.reader import DemonstrationQuery, find_demonstrations
+from openvima.data.reader import find_demonstrations
 from openvima.env.tabletop import VideoFrame
 from openvima.errors import DatasetError, PolicyError
 from openvima.evaluation.evaluated_episode import evaluated_episode
@@ -168,10 +168,8 @@ class BrowsePanel:
         assert self._dataset is not None  # as opened
         fields = {name: field.value for name, field in self._choices.items() if field.value != _ALL}
         fewest, most = (int(value) for value in self._steps.value)
-        query = DemonstrationQuery(
-            **fields, min_steps=fewest, max_steps=None if most == _MOST_STEPS else most
-        )
-        self._found = find_demonstrations(self._dataset, query)
+        limit = None if most == _MOST_STEPS else most
+        self._found = find_demonstrations(self._dataset, **fields, min_steps=fewest, max_steps=limit)
         self._count.content = f"{len(self._found):,} of {len(self._dataset):,} found"
         self._number.max = max(1, len(self._found) - 1)
         self._number.value = 0
