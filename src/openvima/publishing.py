@@ -38,7 +38,7 @@ from openvima.report.tables import paper_tables
 from openvima.report.text import role
 from openvima.training.config import flatten
 
-__all__ = ["demonstrations_card", "policy_card", "push_demonstrations", "push_policy"]
+__all__ = ["push_demonstrations", "push_policy"]
 
 CARD_NAME = "README.md"
 TAGS = ["openvima", "vima-bench", "multimodal-prompts", "imitation-learning"]
@@ -84,50 +84,28 @@ def push_policy(
         ServerError: The Hub refuses or cannot be reached.
         MissingExtraError: torch or `huggingface_hub` is not installed.
     """
-    target, files = _repository(name), policy_files(source, name, results=results, licence=licence)
-    return commit(target, files, private=private)
+    files = policy_files(source, name, results=results, licence=licence)
+    return commit(_repository(name), files, private=private)
 
 
 def policy_files(
     source: str | Path, name: str, *, results: str | Path | None = None, licence: str = "mit"
 ) -> dict[str, Path | bytes]:
-    """Return what `push_policy` pushes: path in the repository to a local file or content."""
-    folder = _checkpoint(source)
-    card = policy_card(source, name, results=results, licence=licence)
-    files: dict[str, Path | bytes] = {CARD_NAME: card.encode()}
-    files |= {file: folder / file for file in (WEIGHTS_FILE, CONFIG_FILE)}
-    files |= {f"{TOKENIZER_FOLDER}/{p.name}": p for p in sorted((folder / TOKENIZER_FOLDER).glob("*"))}
-    if results is not None:
-        files[FILE_NAME] = _results_file(results)
-    return files
+    """Return what `push_policy` pushes: path in the repository to a local file or content.
 
-
-def policy_card(
-    source: str | Path, name: str, *, results: str | Path | None = None, licence: str = "mit"
-) -> str:
-    """Write the model card of a checkpoint: network, training, scores with intervals, licence.
-
-    Args:
-        source: As for `push_policy`.
-        name: As for `push_policy`.
-        results: As for `push_policy`.
-        licence: As for `push_policy`.
-
-    Returns:
-        Markdown with the metadata of the Hub in front.
-
-    Raises:
-        InputFileError, ConfigError, DatasetError: As for `push_policy`.
+    The card says network, training, scores with intervals and licence.
     """
     require_torch("reading a checkpoint")
-    folder, target = _checkpoint(source), _repository(name)
-    file = None if results is None else _results_file(results)
-    scores = None if file is None else _of_weights(file, weights_hash(folder))
-    confirmed = file is not None and is_marked_verified(file)
+    folder, target = find_checkpoint(source), _repository(name)
+    if not folder.is_dir():
+        raise InputFileError(
+            f"{source} is a file; convert it to a checkpoint folder first: `openvima policies convert`."
+        )
+    scored = None if results is None else as_path(results)
     metadata = {"license": licence.lower(), "library_name": "openvima", "pipeline_tag": "robotics"}
     shell = f"pip install 'openvima[train,hub]'\nopenvima evaluate --policy {target} --out scores"
     python = f'from openvima.policies import load_policy\n\npolicy = load_policy("{target}")'
-    return f"""{_heading(metadata, target)}
+    card = f"""{_heading(metadata, target)}
 A policy for VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.
 
 ## Network
@@ -138,7 +116,7 @@ A policy for VIMA-Bench: tabletop manipulation from multimodal prompts of words 
 {_training(folder)}
 ## Scores
 
-{_scores(scores, target, confirmed=confirmed)}
+{_scores(scored, folder, target)}
 ## Use
 
 {_fenced(shell, "sh")}
@@ -147,20 +125,12 @@ A policy for VIMA-Bench: tabletop manipulation from multimodal prompts of words 
 
 Weights: {licence.lower()}. openvima: MIT.
 """
-
-
-def _checkpoint(source: str | Path) -> Path:
-    folder = find_checkpoint(source)
-    if not folder.is_dir():
-        raise InputFileError(
-            f"{source} is a file; convert it to a checkpoint folder first: `openvima policies convert`."
-        )
-    return folder
-
-
-def _results_file(path: str | Path) -> Path:
-    path = as_path(path)
-    return path / FILE_NAME if path.is_dir() else path
+    files: dict[str, Path | bytes] = {CARD_NAME: card.encode()}
+    files |= {file: folder / file for file in (WEIGHTS_FILE, CONFIG_FILE)}
+    files |= {f"{TOKENIZER_FOLDER}/{p.name}": p for p in sorted((folder / TOKENIZER_FOLDER).glob("*"))}
+    if scored is not None:
+        files[FILE_NAME] = scored / FILE_NAME if scored.is_dir() else scored
+    return files
 
 
 def _of_weights(path: Path, sha256: str) -> Results:
@@ -221,12 +191,13 @@ def _recorded(folder: Path) -> Mapping[str, Any]:
     return {}
 
 
-def _scores(scores: Results | None, name: HubName, *, confirmed: bool) -> str:
-    if scores is None:
+def _scores(path: Path | None, folder: Path, name: HubName) -> str:
+    if path is None:
         return "None were pushed with the checkpoint.\n"
+    scores = _of_weights(path, weights_hash(folder))
     (policy,) = scores.policies
     versions = ", ".join(f"{name} {version}" for name, version in sorted(scores.versions.items()))
-    tables = markdown(paper_tables(scores, published=False, confirmed=confirmed))
+    tables = markdown(paper_tables(scores, published=False, confirmed=is_marked_verified(path)))
     command = _fenced(default_command(scores, [str(name)]), "sh")
     return f"{role(scores, policy)} `{FILE_NAME}` holds every outcome ({versions}).\n\n{command}\n{tables}"
 
@@ -250,35 +221,22 @@ def push_demonstrations(folder: str | Path, name: str, *, private: bool = False)
         ServerError: The Hub refuses or cannot be reached.
         MissingExtraError: `huggingface_hub` is not installed.
     """
-    target, files = _repository(name), demonstrations_files(folder, name)
-    return commit(target, files, kind="dataset", private=private)
+    return commit(_repository(name), demonstrations_files(folder, name), kind="dataset", private=private)
 
 
 def demonstrations_files(folder: str | Path, name: str) -> dict[str, Path | bytes]:
-    """Return what `push_demonstrations` pushes: path in the repository to a local file or content."""
-    dataset = Dataset(folder)
-    for shard, entry in dataset.manifest["shards"].items():
+    """Return what `push_demonstrations` pushes: path in the repository to a local file or content.
+
+    The card says contents by task, provenance and licence.
+    """
+    dataset, target = Dataset(folder), _repository(name)
+    manifest = dataset.manifest
+    for shard, entry in manifest["shards"].items():
         if fingerprint(dataset.path / shard)["sha256"] != entry["sha256"]:
             raise DatasetError(
                 f"{dataset.path / shard} is damaged: its checksum is not that of the manifest. "
                 f"`openvima data verify {shlex.quote(str(dataset.path))}` says more."
             )
-    files: dict[str, Path | bytes] = {CARD_NAME: demonstrations_card(dataset, name).encode()}
-    names = (MANIFEST_NAME, INDEX_NAME, *dataset.manifest["shards"])
-    return files | {file: dataset.path / file for file in names}
-
-
-def demonstrations_card(dataset: Dataset, name: str) -> str:
-    """Write the card of a data set: contents by task, provenance, licence.
-
-    Args:
-        dataset: The data set.
-        name: The repository, as for `push_demonstrations`.
-
-    Returns:
-        Markdown with the metadata of the Hub in front.
-    """
-    manifest, target = dataset.manifest, _repository(name)
     counts = manifest["counts"]
     provenance = {
         "episodes": f"{counts['episodes']:,}",
@@ -300,7 +258,7 @@ def demonstrations_card(dataset: Dataset, name: str) -> str:
         f"openvima train --data hf://{target} --preset nano --out run"
     )
     python = f'from openvima.data import Dataset\n\nepisode = Dataset("hf://{target}")[0]'
-    return f"""{_heading(metadata, target)}
+    card = f"""{_heading(metadata, target)}
 Demonstrations of VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.
 
 ## Contents
@@ -320,6 +278,8 @@ Settings that decide the content:
 
 {manifest["licence"]}
 """
+    files = (MANIFEST_NAME, INDEX_NAME, *manifest["shards"])
+    return {CARD_NAME: card.encode(), **{file: dataset.path / file for file in files}}
 
 
 def _repository(text: str) -> HubName:

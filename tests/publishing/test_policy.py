@@ -18,7 +18,14 @@ from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
 from openvima.policies.naming import find_checkpoint  # noqa: E402
-from openvima.publishing import policy_card, push_policy  # noqa: E402
+from openvima.publishing import policy_files, push_policy  # noqa: E402
+
+
+def policy_card(*args, **options) -> str:
+    card = policy_files(*args, **options)["README.md"]
+    assert isinstance(card, bytes)
+    return card.decode()
+
 
 SETTINGS = {
     "training": {
