@@ -3,7 +3,6 @@
 import contextlib
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from openvima.cli.options import Folder, Json
@@ -12,7 +11,7 @@ from openvima.cli.terminal import print_table, progress_bar
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from openvima.data.summary import Summary
+    from openvima.data.verification import Verification
 
 _BAR_WIDTH = 40
 
@@ -33,25 +32,22 @@ def info(
         details: Count objects, textures and prompt images too; reads every file.
         as_json: Print everything as JSON.
     """
+    from openvima.data.reader import data_folder
     from openvima.data.summary import summarise_folder
-
-    with progress_bar("files") if details else contextlib.nullcontext() as report:
-        summary = summarise_folder(folder, details=details, report=report)
-    if as_json:
-        print(json.dumps(summary.to_record(), indent=2, ensure_ascii=False))
-    else:
-        for line in _summary(summary, _shown_name(folder, summary)):
-            print(_printable(line)) if isinstance(line, str) else print_table(line)
-        if not details:
-            print("\n--details counts objects, textures and prompt images too.")
-
-
-def _shown_name(folder: Path, summary: "Summary") -> str:
-    """The folder, or the name on the Hub with the commit."""
     from openvima.hub import dataset_name
 
     name = dataset_name(folder)
-    return f"hf://{name.repo}@{summary.folder.name}" if name else str(folder)
+    index_only = name is not None and not details
+    local = data_folder(folder, shards=not index_only)
+    with progress_bar("files") if details else contextlib.nullcontext() as report:
+        record = summarise_folder(local, index_only=index_only, details=details, report=report)
+    if as_json:
+        print(json.dumps(record, indent=2, ensure_ascii=False))
+    else:
+        for line in _summary(record, f"hf://{name.repo}@{local.name}" if name else str(folder)):
+            print(_printable(line)) if isinstance(line, str) else print_table(line)
+        if not details:
+            print("\n--details counts objects, textures and prompt images too.")
 
 
 def _printable(line: str) -> str:
@@ -61,21 +57,21 @@ def _printable(line: str) -> str:
     return echo(line, len(line))
 
 
-def _summary(summary: "Summary", name: str) -> "Iterator[str | Table]":
-    manifest = summary.manifest
+def _summary(manifest: dict[str, Any], name: str) -> "Iterator[str | Table]":
+    summary = manifest["summary"]
     counts, versions = manifest["counts"], manifest["versions"]
     yield (
         f"{name}: {counts['episodes']:,} episodes, {counts['steps']:,} steps, "
-        f"{counts['shards']:,} shards, {summary.file_bytes / 1e6:,.1f} MB"
+        f"{counts['shards']:,} shards, {summary['file_bytes'] / 1e6:,.1f} MB"
     )
     yield f"written by {manifest['command']}{_settings(manifest['config'])}"
     yield ", ".join(f"{name} {versions[name]}" for name in sorted(versions))
     yield f"finished; content {manifest['content_hash']}, licence {manifest['licence']}"
-    for name, size in summary.object_caches.items():
+    for name, size in summary["object_caches"].items():
         yield f"object cache {name}: {size / 1e6:,.1f} MB"
     yield ""
-    yield _task_table(summary)
-    for title, counts in summary.histograms.items():
+    yield _task_table(summary["tasks"])
+    for title, counts in summary["histograms"].items():
         if len(counts) > 1:
             yield ""
             yield title
@@ -88,7 +84,7 @@ def _settings(config: dict[str, Any]) -> str:
     return "".join(f", {name.replace('_', ' ')} {value}" for name, value in sorted(plain.items()))
 
 
-def _task_table(summary: "Summary") -> "Table":
+def _task_table(tasks: dict[str, dict[str, Any]]) -> "Table":
     from rich.markup import escape
     from rich.table import Table
 
@@ -96,7 +92,7 @@ def _task_table(summary: "Summary") -> "Table":
     for name in ("episodes", "steps", "kB/episode", "seeds tried", "oracle success", "resamples"):
         table.add_column(name, justify="right", no_wrap=True)
     table.columns[0].no_wrap = True
-    for task, entry in summary.tasks.items():
+    for task, entry in tasks.items():
         table.add_row(
             escape(_printable(task)),
             f"{entry['episodes']:,}",
@@ -114,10 +110,6 @@ def _bars(counts: dict[str, int]) -> Iterator[str]:
     for label, count in counts.items():
         bar = f"{'█' * max(1, round(_BAR_WIDTH * count / most))} {count:,} ({count / total:.1%})"
         yield f"  {label:>{width}}  {bar}".rstrip()
-
-
-if TYPE_CHECKING:
-    from openvima.data.verification import Verification
 
 
 def verify(
