@@ -10,9 +10,9 @@ import pytest
 
 from openvima.cli.main import main
 from openvima.data import Dataset
+from openvima.data.manifest import joint_hash
 from openvima.data.object_cache import (
     Boxes,
-    CacheFile,
     ObjectCache,
     open_object_cache,
     write_cache_file,
@@ -142,7 +142,8 @@ def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> 
     cache = open_object_cache(dataset, boxes=CLUMSY)
     path = cache.folder / "rotate-train-00000.arrow"
     whole = path.read_bytes()
-    write_cache_file(path, [cache[0], cache[1]], "objects", CacheFile(path).source, "clumsy-2")
+    source = joint_hash(dataset[row].content_hash() for row in range(2))
+    write_cache_file(path, [cache[0], cache[1]], "objects", source, "clumsy-2")
     with pytest.raises(DatasetError, match="lacks 1 shards"):
         ObjectCache(dataset, variant="clumsy-1")
     open_object_cache(dataset, boxes=CLUMSY)

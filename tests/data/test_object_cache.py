@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data.manifest import joint_hash
 from openvima.data.object_cache import CacheFile, ObjectCache, open_object_cache
 from openvima.data.preprocessed import preprocess
 from openvima.errors import DatasetError
@@ -85,11 +86,12 @@ def test_outdated_files_are_noticed(copy: Path) -> None:
 def test_a_truncated_file_is_made_anew(copy: Path) -> None:
     dataset = Dataset(copy, tasks=["rotate"])
     path = open_object_cache(dataset).folder / "rotate-train-00000.arrow"
+    source = joint_hash(dataset[row].content_hash() for row in range(2))
     whole = path.read_bytes()
     for size in (0, 7, 1000, -1):
         path.write_bytes(whole[:size])
         with pytest.raises(DatasetError, match="is no readable file"):
-            CacheFile(path)
+            CacheFile(path, "objects", source)
         with pytest.raises(DatasetError, match="lacks 1 shards"):
             ObjectCache(dataset)
         open_object_cache(dataset)

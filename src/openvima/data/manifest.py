@@ -11,7 +11,7 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeVar
@@ -128,7 +128,7 @@ def _summarise_shard(path: Path) -> tuple[dict[str, Any], pa.Table]:
         DatasetError: It is damaged.
     """
     table = Shard(path).table(_COLUMNS)
-    envelope, spans = measure(path)
+    frame, spans = measure(path)
     skipped = Counter(entry["kind"] for row in table.column("skipped").to_pylist() for entry in row)
     counts = {
         "episodes": table.num_rows,
@@ -140,9 +140,9 @@ def _summarise_shard(path: Path) -> tuple[dict[str, Any], pa.Table]:
         **{name: table.column(name) for name in table.column_names},
         "shard": [path.name] * table.num_rows,
         "row": range(table.num_rows),
-        **{name: [getattr(span, name) for span in spans] for name in Span.__slots__},
+        **{name: [getattr(span, name) for span in spans] for name in Span._fields},
     }
-    return {**counts, **fingerprint(path), **asdict(envelope)}, pa.table(columns, schema=INDEX_SCHEMA)
+    return {**counts, **fingerprint(path), **frame}, pa.table(columns, schema=INDEX_SCHEMA)
 
 
 def _add_up(entries: Sequence[Mapping[str, Any]]) -> dict[str, object]:

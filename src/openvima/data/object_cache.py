@@ -4,7 +4,6 @@ A derived folder, written when first needed and safe to delete. It has an Arrow 
 row per demonstration, uncompressed and memory-mapped: a demonstration that is read is a set of views into it.
 """
 
-import contextlib
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +22,7 @@ from openvima.data.manifest import CACHE_FOLDER, joint_hash, split_index
 from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empty_episode, preprocess
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
-from openvima.data.shard import DAMAGE_ERRORS, Envelope, Shard, list_spans, map_file
+from openvima.data.shard import DAMAGE_ERRORS, Shard, list_spans, map_file
 from openvima.errors import DatasetError, one_line, unknown_name
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, imap_unordered
@@ -117,30 +116,27 @@ class CacheFile:
 
     Args:
         path: The file.
+        kind: As for `write_cache_file`.
+        source: As for `write_cache_file`.
+        variant: As for `write_cache_file`.
 
     Raises:
-        DatasetError: It is missing, truncated, or no file of this version.
+        DatasetError: It is missing, truncated, or of another version, kind, source or variant.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, kind: InputKind, source: str, variant: str = "") -> None:
         self.path = path
         try:
             reader = pa.ipc.open_file(pa.py_buffer(map_file(path)))
-            metadata = reader.schema.metadata or {}
-            about: dict[str, Any] = {key.decode(): value.decode() for key, value in metadata.items()}
-            if not reader.schema.equals(_schema(about["kind"])):
-                raise ValueError("it has other columns")
+            if not reader.schema.equals(_schema(kind, source, variant), check_metadata=True):
+                raise ValueError("it is of other demonstrations, or another version or variant")
             rows = reader.get_batch(0)
             rows.validate(full=True)  # no list reaches beyond its records
-            self._lists = {
-                name: _unpack(rows.column(name), fields) for name, fields in _lists(about["kind"]).items()
-            }
+            self._lists = {name: _unpack(rows.column(name), fields) for name, fields in _lists(kind).items()}
             self._scalars = {name: rows.column(name).to_pylist() for name in _SCALARS}
             self._checksums = rows.column(_CHECKSUM).to_pylist()
         except DAMAGE_ERRORS as error:
             raise _damage(path, one_line(error)) from None
-        self.kind: InputKind = about["kind"]
-        self.source, self.variant = about["source"], about["variant"]
 
     def __len__(self) -> int:
         return len(self._checksums)
@@ -192,9 +188,7 @@ def write_cache_file(
         source: Content hash of the demonstrations that they were made of.
         variant: How the episodes differ from these, as in `Variant`; empty if they do not.
     """
-    schema = _schema(
-        kind, {"version": str(CACHE_VERSION), "kind": kind, "source": source, "variant": variant}
-    )
+    schema = _schema(kind, source, variant)
     scalars = [_scalars(episode) for episode in episodes]
     lists = _lists(kind)
     arrays = {
@@ -214,7 +208,7 @@ def _lists(kind: InputKind) -> dict[str, _Fields]:
     return {**_LISTS, "images": {"images": (pa.uint8(), (3, *IMAGE_SIZES[kind]))}}
 
 
-def _schema(kind: InputKind, about: dict[str, str] | None = None) -> pa.Schema:
+def _schema(kind: InputKind, source: str, variant: str) -> pa.Schema:
     lists = {
         column: pa.list_(
             pa.struct(
@@ -226,6 +220,7 @@ def _schema(kind: InputKind, about: dict[str, str] | None = None) -> pa.Schema:
         )
         for column, fields in _lists(kind).items()
     }
+    about = {"version": str(CACHE_VERSION), "kind": kind, "source": source, "variant": variant}
     return pa.schema({**lists, **_SCALARS, _CHECKSUM: pa.uint64()}, about)
 
 
@@ -235,10 +230,8 @@ def _pack(fields: Mapping[str, Sequence[np.ndarray]]) -> pa.Array:
     for arrays in fields.values():
         joined = np.concatenate(arrays)
         numbers = pa.array(joined.reshape(-1))
-        is_flat = joined.ndim == 1
-        columns.append(
-            numbers if is_flat else pa.FixedSizeListArray.from_arrays(numbers, prod(joined.shape[1:]))
-        )
+        width = prod(joined.shape[1:])
+        columns.append(numbers if joined.ndim == 1 else pa.FixedSizeListArray.from_arrays(numbers, width))
     ends = np.cumsum([0, *map(len, next(iter(fields.values())))])
     records = pa.StructArray.from_arrays(columns, [*fields])
     return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), records)
@@ -306,11 +299,11 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     ) -> None:
         self.dataset, self.kind, self.variant, self._root = dataset, kind, variant, folder
         self.folder = _cache_folder(dataset, kind, folder, variant)
-        self._files, missing = _open_files(self.folder, split_index(dataset.index), kind, variant)
+        self._files, missing = _open_files(self.folder, dataset, kind, variant)
         if missing:
             raise DatasetError(
-                f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; `openvima data preprocess` "
-                "writes them."
+                f"{self.folder} lacks {len(missing)} shards, first {next(iter(missing))}; `openvima data "
+                "preprocess` writes them."
             )
 
     def __len__(self) -> int:
@@ -366,15 +359,13 @@ def open_object_cache(
         raise DatasetError(f"boxes are those of {boxes.name}, but whole frames have none; leave them out.")
     variant = Variant(boxes, appearance)
     if check_object_cache(dataset, kind, variant, folder=folder):
-        target, indices = _cache_folder(dataset, kind, folder, variant.name), split_index(dataset.index)
+        target, entries = _cache_folder(dataset, kind, folder, variant.name), dataset.manifest["shards"]
         with folder_lock(target, timeout_s=timeout_s):
-            _, missing = _open_files(target, indices, kind, variant.name)
-            missing.sort(key=lambda name: -indices[name].num_rows)
-            total = sum(indices[name].num_rows for name in missing)
-            entries = dataset.manifest["shards"]
+            _, missing = _open_files(target, dataset, kind, variant.name)
+            total = sum(index.num_rows for index in missing.values())
             work = [
-                (dataset.path / name, Envelope.from_entry(entries[name]), indices[name], target / name)
-                for name in missing
+                (dataset.path / name, entries[name], index, target / name)
+                for name, index in sorted(missing.items(), key=lambda entry: -entry[1].num_rows)
             ]
             job = partial(_write, kind=kind, variant=variant)
             watch = report and (lambda done: report(done, total, ""))
@@ -401,8 +392,7 @@ def check_object_cache(
         DatasetError: The folder would have to be written to, and cannot be.
     """
     target = _cache_folder(dataset, kind, folder, variant.name)
-    _, missing = _open_files(target, split_index(dataset.index), kind, variant.name)
-    if not missing:
+    if not _open_files(target, dataset, kind, variant.name)[1]:
         return False
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -423,34 +413,32 @@ def _cache_folder(dataset: Dataset, kind: InputKind, folder: str | Path | None, 
 
 
 def _open_files(
-    folder: Path, indices: Mapping[str, pa.Table], kind: InputKind, variant: str
-) -> tuple[dict[str, CacheFile], list[str]]:
-    """Open the file of each shard; list those missing, damaged, or of another version or content.
+    folder: Path, dataset: Dataset, kind: InputKind, variant: str
+) -> tuple[dict[str, CacheFile], dict[str, pa.Table]]:
+    """Open the file of each shard; return the parts of the index for which there is none that fits.
 
     A shard has one task, so that the data set has all of its rows or none.
     """
-    files, missing = {}, []
-    for name, index in indices.items():
-        asked = (joint_hash(index.column("content_hash").to_pylist()), kind, variant)
-        with contextlib.suppress(DatasetError):
-            file = CacheFile(folder / name)
-            if (file.source, file.kind, file.variant) == asked:
-                files[name] = file
-        if name not in files:
-            missing.append(name)
+    files, missing = {}, {}
+    for name, index in split_index(dataset.index).items():
+        source = joint_hash(index.column("content_hash").to_pylist())
+        try:
+            files[name] = CacheFile(folder / name, kind, source, variant)
+        except DatasetError:
+            missing[name] = index
     return files, missing
 
 
 def _write(
-    work: tuple[Path, Envelope, pa.Table, Path],
+    work: tuple[Path, Mapping[str, Any], pa.Table, Path],
     count: Callable[[int], None],
     *,
     kind: InputKind,
     variant: Variant,
 ) -> None:
     """Write a file for a shard, given with its part of the index."""
-    path, envelope, index, target = work
-    shard = Shard(path, envelope)
+    path, entry, index, target = work
+    shard = Shard(path, entry)
     extractor = _extractor(variant.boxes) if variant.boxes else None
     kept = split_hashes(index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
     tasks, seeds = (index.column(name).to_pylist() for name in ("task", "seed"))

@@ -13,7 +13,7 @@ import pyarrow as pa
 from openvima.catalog import LEVELS, OBJECTS, TEXTURES
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, read_index, read_manifest, split_index
 from openvima.data.records import Demonstration
-from openvima.data.shard import Envelope, Shard, Span, remedy
+from openvima.data.shard import Shard, Span, remedy
 from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
 from openvima.html import notebook_html
 from openvima.hub import cache_folder, dataset_name, fetch
@@ -57,7 +57,7 @@ class Dataset:
         self._names = names.dictionary.to_pylist()
         self._name_of = names.indices.to_numpy()  # numbers instead of a million texts
         self._rows = self.index.column("row").to_numpy()
-        self._spans = [self.index.column(name).to_numpy() for name in ("offset", "num_bytes", "crc32")]
+        self._spans = [self.index.column(name).to_numpy() for name in Span._fields]
         self._shards: dict[str, Shard] = {}
         missing = [name for name in sorted(self._names) if not (self.path / name).is_file()]
         if missing and not index_only:
@@ -115,7 +115,7 @@ class Dataset:
             name: Its file name.
         """
         if name not in self._shards:
-            self._shards[name] = Shard(self.path / name, Envelope.from_entry(self.manifest["shards"][name]))
+            self._shards[name] = Shard(self.path / name, self.manifest["shards"][name])
         return self._shards[name]
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -10,9 +10,8 @@ import itertools
 import shlex
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
@@ -29,42 +28,12 @@ _MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
 _BUFFER_BYTES = 1 << 20  # Arrow writes an episode in 150 pieces
 
 
-@dataclass(frozen=True, slots=True)
-class Span:
+class Span(NamedTuple):
     """Where a record lies in its file, and the CRC-32 of its bytes."""
 
     offset: int
     num_bytes: int
     crc32: int
-
-
-@dataclass(frozen=True, slots=True)
-class Envelope:
-    """What lies around the records, as the manifest names it.
-
-    Args:
-        bytes: Size of the whole file.
-        head_bytes: Bytes before the first record.
-        tail_bytes: Bytes after the last one.
-        frame_crc32: CRC-32 of head and tail.
-    """
-
-    bytes: int
-    head_bytes: int
-    tail_bytes: int
-    frame_crc32: int
-
-    def fault_in(self, content: memoryview) -> str:
-        """Say what is wrong around the records in a file's content; nothing if all is as it was."""
-        if len(content) != self.bytes:
-            return f"it has {len(content):,} of {self.bytes:,} bytes"
-        is_same = _envelope_crc32(content, self.head_bytes, self.tail_bytes) == self.frame_crc32
-        return "" if is_same else "the checksum of its schema and footer is wrong"
-
-    @staticmethod
-    def from_entry(entry: Mapping[str, Any]) -> "Envelope":
-        """Read a shard's entry in the manifest."""
-        return Envelope(*(entry[name] for name in Envelope.__slots__))
 
 
 def map_file(path: Path) -> memoryview:
@@ -79,8 +48,14 @@ def map_file(path: Path) -> memoryview:
         return memoryview(file.read_buffer())
 
 
-def measure(path: Path) -> tuple[Envelope, list[Span]]:
-    """Find the parts of a whole shard and their checksums."""
+def measure(path: Path) -> tuple[dict[str, int], list[Span]]:
+    """Find the parts of a whole shard and their checksums.
+
+    Returns:
+        What lies around the records, as the manifest names it: `bytes`, the size of the whole file,
+        `head_bytes` before the first record, `tail_bytes` after the last one, and `frame_crc32`, the CRC-32
+        of head and tail; and where the records lie.
+    """
     content, ends = map_file(path), []
     with pa.memory_map(str(path)) as file:
         file.seek(_MAGIC_BYTES)
@@ -90,18 +65,27 @@ def measure(path: Path) -> tuple[Envelope, list[Span]]:
     spans = [
         Span(start, end - start, zlib.crc32(content[start:end])) for start, end in itertools.pairwise(ends)
     ]
-    head, tail = ends[0], len(content) - ends[-1]
-    return Envelope(len(content), head, tail, _envelope_crc32(content, head, tail)), spans
+    frame = {"bytes": len(content), "head_bytes": ends[0], "tail_bytes": len(content) - ends[-1]}
+    return {**frame, "frame_crc32": _frame_crc32(content, frame)}, spans
 
 
 def list_spans(index: pa.Table) -> list[Span]:
     """Return where the records of a shard lie, from its part of the index."""
-    columns = (index.column(name).to_pylist() for name in ("offset", "num_bytes", "crc32"))
+    columns = (index.column(name).to_pylist() for name in Span._fields)
     return [Span(*numbers) for numbers in zip(*columns, strict=True)]
 
 
-def _envelope_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:
-    return zlib.crc32(content[len(content) - tail_bytes :], zlib.crc32(content[:head_bytes]))
+def _frame_crc32(content: memoryview, frame: Mapping[str, Any]) -> int:
+    tail = content[len(content) - frame["tail_bytes"] :]
+    return zlib.crc32(tail, zlib.crc32(content[: frame["head_bytes"]]))
+
+
+def _find_fault(content: memoryview, entry: Mapping[str, Any]) -> str:
+    """Say what is wrong around the records in a file's content; nothing if all is as it was."""
+    if len(content) != entry["bytes"]:
+        return f"it has {len(content):,} of {entry['bytes']:,} bytes"
+    is_same = _frame_crc32(content, entry) == entry["frame_crc32"]
+    return "" if is_same else "the checksum of its schema and footer is wrong"
 
 
 class Shard:
@@ -112,13 +96,13 @@ class Shard:
 
     Args:
         path: The file.
-        envelope: Checksum of all that surrounds the records, as the folder's manifest holds it.
+        entry: What the folder's manifest says of it, with the checksum of all that surrounds the records.
 
     Raises:
         DatasetError: It is missing, truncated, damaged, or no shard of this package.
     """
 
-    def __init__(self, path: Path, envelope: Envelope | None = None) -> None:
+    def __init__(self, path: Path, entry: Mapping[str, Any] | None = None) -> None:
         self.path = path
         try:
             self._content = map_file(path)
@@ -126,7 +110,7 @@ class Shard:
             raise DatasetError(f"there is no file {path}. {remedy(path.parent)}") from None
         except DAMAGE_ERRORS as error:
             raise self._damage("it", error) from None
-        if envelope is not None and (fault := envelope.fault_in(self._content)):
+        if entry is not None and (fault := _find_fault(self._content, entry)):
             raise self._damage("it", fault)
         self._readers: dict[tuple[str, ...], pa.RecordBatchFileReader] = {}  # of some columns each
         whole = self._open(COLUMNS.names)
