@@ -17,7 +17,7 @@ from openvima.data import (
     verify,
 )
 from openvima.data.encoding import Skipped
-from openvima.data.planning import (
+from openvima.data.generation import (
     MAX_EPISODES,
     MAX_FIRST_SEED,
     SEEDS_PER_EPISODE,

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 from openvima.imports import lazy_names
 
 if TYPE_CHECKING:
-    from openvima.data.generation import generate
-    from openvima.data.planning import GenerateConfig, plan
+    from openvima.data.generation import GenerateConfig, generate, plan
     from openvima.data.reader import Dataset
     from openvima.data.records import Demonstration, rollout_oracle
     from openvima.data.shard import Shard, ShardWriter
@@ -17,12 +16,12 @@ if TYPE_CHECKING:
 _HOMES = {
     "Dataset": "reader",
     "Demonstration": "records",
-    "GenerateConfig": "planning",
+    "GenerateConfig": "generation",
     "Shard": "shard",
     "ShardWriter": "shard",
     "VerifyConfig": "verification",
     "generate": "generation",
-    "plan": "planning",
+    "plan": "generation",
     "record_demonstration": "user_demonstrations",
     "rollout_oracle": "records",
     "verify": "verification",

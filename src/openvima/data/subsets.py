@@ -19,6 +19,7 @@ import pyarrow as pa
 
 from openvima.atomic_io import atomic_folder, folder_lock, is_lock_file
 from openvima.data.encoding import ShardInfo
+from openvima.data.generation import LARGEST_SHARD
 from openvima.data.manifest import (
     BROKEN_NAME,
     CACHE_FOLDER,
@@ -27,7 +28,6 @@ from openvima.data.manifest import (
     finish_folder,
     split_index,
 )
-from openvima.data.planning import LARGEST_SHARD
 from openvima.data.reader import Dataset, hash_names, select_tasks
 from openvima.data.shard import ShardWriter
 from openvima.errors import ConfigError, DatasetError

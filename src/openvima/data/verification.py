@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from openvima.catalog.packs import load_assets, recorded_assets
 from openvima.data.encoding import ShardInfo, encode
+from openvima.data.generation import COMMAND, generate_command
 from openvima.data.manifest import (
     INDEX_NAME,
     MANIFEST_NAME,
@@ -27,7 +28,6 @@ from openvima.data.manifest import (
     parse_index,
     parse_manifest,
 )
-from openvima.data.planning import COMMAND, generate_command
 from openvima.data.records import Demonstration, Rollout, make_env, package_versions, rollout_oracle
 from openvima.data.schema import COLUMNS
 from openvima.data.shard import Shard, remedy
