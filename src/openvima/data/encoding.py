@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from openvima.data.records import Demonstration, make_columns, planes
 from openvima.data.schema import ARRAYS, CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION, VIEWS
-from openvima.env.config import ENV_SETTINGS, EnvConfig, without_published
+from openvima.env.config import EnvConfig, without_published
 from openvima.errors import DatasetError, unknown_name
 from openvima.scene import (
     ACTION_SHAPES,
@@ -108,7 +108,7 @@ class ShardInfo:
     @property
     def env_config(self) -> EnvConfig:
         """Settings of the environments; assets by their recorded name."""
-        return EnvConfig(**{name: getattr(self, name) for name in ENV_SETTINGS})
+        return EnvConfig.from_record(asdict(self))
 
     def of_data_set(self) -> dict[str, Any]:
         """Return the settings and versions that all shards of a data set share."""
@@ -117,7 +117,7 @@ class ShardInfo:
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""
-        fields = without_published({name: getattr(self, name) for name in self.__slots__})
+        fields = without_published(asdict(self))
         if not self.task_options:
             fields["difficulty"] = "easy"  # part of schema version 1, whose bytes are published
         text = json.dumps({"schema": SCHEMA_VERSION, **fields}, sort_keys=True)

@@ -5,16 +5,15 @@ from openvima.compilation import njit
 
 @njit
 def join_colours(planes, pixels):
-    """Copy red, green and blue planes, (N, 3, P), to pixels of three colours, (N, 3 · P); contiguous uint8.
+    """Copy red, green and blue planes of an image, (3, P), to its pixels, (3 · P); contiguous uint8.
 
     Written so that the compiler makes shuffles of it: 20 GB/s against 1 for a copy by NumPy.
     """
-    for image in range(len(planes)):
-        red, green, blue, joined = planes[image, 0], planes[image, 1], planes[image, 2], pixels[image]
-        for pixel in range(len(red)):
-            joined[3 * pixel] = red[pixel]
-            joined[3 * pixel + 1] = green[pixel]
-            joined[3 * pixel + 2] = blue[pixel]
+    red, green, blue = planes[0], planes[1], planes[2]
+    for pixel in range(len(red)):
+        pixels[3 * pixel] = red[pixel]
+        pixels[3 * pixel + 1] = green[pixel]
+        pixels[3 * pixel + 2] = blue[pixel]
 
 
 @njit

@@ -40,6 +40,12 @@ class FalsePositives:
     crop_index: np.ndarray
     boxes: np.ndarray
 
+    @staticmethod
+    def none(num_steps: int) -> "FalsePositives":
+        """Return zeros for so many steps."""
+        shape = (num_steps, len(VIEWS))
+        return FalsePositives(np.zeros(shape, np.int32), np.zeros((*shape, 4), np.int16))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreprocessedEpisode:
@@ -121,9 +127,7 @@ def preprocess(
         for t, (observation, found) in enumerate(zip(observations, views, strict=True)):
             slots = match_ids_to_slots(found, observe(observation))
             pick_ids[t], place_ids[t] = (slots.get(int(ids[t]), -1) for ids in (pick_ids, place_ids))
-    false_positives = FalsePositives(
-        np.zeros((demo.num_steps, len(VIEWS)), np.int32), np.zeros((demo.num_steps, len(VIEWS), 4), np.int16)
-    )
+    false_positives = FalsePositives.none(demo.num_steps)
     if kind == "objects":
         # From the content alone, so that the cache does not depend on who makes it and in what order.
         rng = np.random.default_rng([demo.seed, *demo.task.encode()])
@@ -173,7 +177,7 @@ def empty_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:
         objects_per_step=none,
         pick_ids=none,
         place_ids=none,
-        false_positives=FalsePositives(np.zeros((0, 2), np.int32), np.zeros((0, 2, 4), np.int16)),
+        false_positives=FalsePositives.none(0),
         final=nothing,
         actions=np.zeros((0, sum(ACTION_SHAPES.values())), np.float32),
         images=stack.images()[1:],

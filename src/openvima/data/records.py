@@ -330,13 +330,10 @@ def pixels(planes: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
     from openvima.data.kernels import join_colours  # Numba takes a moment to be imported
 
     memory = pa.allocate_buffer(3 * _NUM_PIXELS * len(planes))  # whose pages are used again
-    flat = np.frombuffer(memory, np.uint8).reshape(-1, 3 * _NUM_PIXELS)
-    parts = [planes] if isinstance(planes, np.ndarray) else [image[np.newaxis] for image in planes]
-    end = 0
-    for part in parts:
-        start, end = end, end + len(part)
-        join_colours(np.ascontiguousarray(part).reshape(-1, 3, _NUM_PIXELS), flat[start:end])
-    return flat.reshape(-1, *IMAGE_SHAPE, 3)
+    joined = np.frombuffer(memory, np.uint8).reshape(-1, 3 * _NUM_PIXELS)
+    for image, pixels in zip(planes, joined, strict=True):
+        join_colours(np.ascontiguousarray(image).reshape(3, _NUM_PIXELS), pixels)
+    return joined.reshape(-1, *IMAGE_SHAPE, 3)
 
 
 def planes(pixels: np.ndarray) -> np.ndarray:

@@ -36,7 +36,6 @@ from openvima.errors import ConfigError, DatasetError, SamplingError, UnknownTas
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
 from openvima.scene.prompt import PLACEHOLDER, PromptFill
-from openvima.tasks import sample_episode
 from openvima.tasks.prompts import MULTIMODAL
 
 RERENDERING_VERSION = 1  # grows whenever the same demonstration gets another appearance
@@ -72,7 +71,7 @@ def rerender(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonst
     try:
         rasteriser = _rasteriser(info.assets)
         rgb, segm = render_observations(rasteriser, demo.scenes)
-        prompt = rasteriser.prompt(sample_prompt(demo, info, rasteriser.assets))
+        prompt = rasteriser.prompt(sample_prompt(demo, info))
     except (SamplingError, ConfigError, UnknownTaskError) as error:  # the task is another one, or gone
         raise _explain_change(demo, info, f" ({error})") from error
     result = dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=prompt)
@@ -96,25 +95,15 @@ def render_observations(
     return rgb, segm
 
 
-def sample_prompt(demo: Demonstration, info: ShardInfo, assets: Assets) -> Prompt:
+def sample_prompt(demo: Demonstration, info: ShardInfo) -> Prompt:
     """Sample the episode of a demonstration again, and return its prompt.
 
     Args:
         demo: Names the episode; its own prompt is not used.
         info: Of the shard that stores it.
-        assets: The pack of the shard.
     """
-    episode = sample_episode(
-        demo.task,
-        level=demo.level,
-        seed=demo.seed,
-        domain=demo.domain,
-        assets=assets,
-        compat=info.compat,
-        prompts=info.prompts,
-        **info.env_config.options(demo.task),
-    )
-    return episode.problem.prompt
+    settings = dataclasses.replace(info.env_config, assets=recorded_assets(info.assets))
+    return settings.sample(demo.task, demo.level, demo.seed, domain=demo.domain).problem.prompt
 
 
 @lru_cache(maxsize=4)
@@ -146,7 +135,7 @@ def with_random_appearance(demo: Demonstration, info: ShardInfo, variant: int) -
     if not demo.scenes:
         raise DatasetError(UNKNOWN_SCENES.format(f"the demonstration of {demo.task} with seed {demo.seed}"))
     rasteriser = _rasteriser(info.assets, is_random=True)
-    prompt = sample_prompt(demo, info, rasteriser.assets)
+    prompt = sample_prompt(demo, info)
     placements = [*demo.scenes[0].placements, *_shown(prompt)]
     rng = np.random.default_rng([variant, demo.seed, *demo.task.encode()])
     in_words = info.prompts != MULTIMODAL
