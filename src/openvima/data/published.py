@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,17 +66,14 @@ class Broken:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodePlace:
+class EpisodePlace(NamedTuple):
     """Where an episode lies.
 
     Args:
-        key: Its name.
         folder: Its folder below that of all tasks, such as "same_profile/000123".
         place: For the archive or folder that holds it.
     """
 
-    key: EpisodeKey
     folder: str
     place: Any
 
@@ -110,34 +107,25 @@ class PublishedData(Sequence[Demonstration]):
         self.path = as_path(path)
         self.tasks = None if tasks is None else names_of(tasks)
         self.source = open_source(self.path)
-        places, self.broken_folders = _sort_places(self.source)
+        self.places, self.broken_folders = _sort_places(self.source)
         if self.tasks is not None:
-            present = {place.key.task for place in places}
+            present = {key.task for key in self.places}
             wanted = {current_task(task) or task_spec(task).name for task in self.tasks}
             if missing := sorted(wanted - present):
                 there = ", ".join(sorted(present)) or "none"
                 raise DatasetError(f"{self.path} has no episodes of {missing[0]}; it has {there}.")
-            places = [place for place in places if place.key.task in wanted]
-        self.places = tuple(places)
+            self.places = {key: place for key, place in self.places.items() if key.task in wanted}
         if not self.places:
             raise DatasetError(
                 f"{self.path} holds no episodes; give vima.zip, or the folder it was unpacked to."
             )
-
-    @cached_property
-    def _place_of(self) -> dict[EpisodeKey, EpisodePlace]:
-        return {place.key: place for place in self.places}
-
-    @property
-    def keys(self) -> tuple[EpisodeKey, ...]:
-        """Task and id of all episodes, sorted."""
-        return tuple(place.key for place in self.places)
+        self.keys = tuple(self.places)  # task and id of all episodes, sorted
 
     def __len__(self) -> int:
         return len(self.places)
 
     def __getitem__(self, index: int) -> Demonstration:  # type: ignore[override]  # no slices
-        return self._read(self.places[index])
+        return self.read(*self.keys[index])
 
     def read(self, task: str, episode_id: str) -> Demonstration:
         """Read one episode.
@@ -151,11 +139,14 @@ class PublishedData(Sequence[Demonstration]):
             DatasetError: It is broken; the message names archive, file and reason.
         """
         key = EpisodeKey(current_task(task) or task, episode_id)
-        if key not in self._place_of:
+        if key not in self.places:
             raise DatasetError(
                 f"{self.path} has no episode {task}/{episode_id}; its ids have gaps, see `keys`."
             )
-        return self._read(self._place_of[key])
+        found = read_place(self.source, task=key.task, place=self.places[key])
+        if isinstance(found, Broken):
+            raise DatasetError(f"{self.path}: {found.member}: {found.reason}")
+        return found
 
     def demonstrations(self, on_broken: Callable[[Broken], None] | None = None) -> Iterator[Demonstration]:
         """Read all episodes that are whole.
@@ -163,8 +154,8 @@ class PublishedData(Sequence[Demonstration]):
         Args:
             on_broken: Called with each one that is not.
         """
-        for place in self.places:
-            found = read_place(self.source, place)
+        for key, place in self.places.items():
+            found = read_place(self.source, task=key.task, place=place)
             if isinstance(found, Demonstration):
                 yield found
             elif on_broken is not None:
@@ -172,12 +163,6 @@ class PublishedData(Sequence[Demonstration]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(PublishedData, tasks=self.tasks), (self.path,)
-
-    def _read(self, place: EpisodePlace) -> Demonstration:
-        found = read_place(self.source, place)
-        if isinstance(found, Broken):
-            raise DatasetError(f"{self.path}: {found.member}: {found.reason}")
-        return found
 
 
 def open_source(path: Path) -> Source:
@@ -195,25 +180,21 @@ def open_source(path: Path) -> Source:
     return ZipArchive(path)
 
 
-def read_place(source: Source, place: EpisodePlace) -> Demonstration | Broken:
-    """Read one episode, or say what is wrong with it.
+def read_place(source: Source, *, task: str, place: EpisodePlace) -> Demonstration | Broken:
+    """Read one episode of a task, or say what is wrong with it.
 
     Raises:
         DatasetError: The source cannot be read any more.
     """
     try:
-        files = source.files(place.place)
+        return read_demonstration(source.files(place.place), task=task, folder=place.folder)
     except OSError as error:
         raise DatasetError(f"{source.path} cannot be read: {error.strerror or error}.") from error
     except DatasetError as error:
         return Broken(place.folder, str(error))
-    try:
-        return read_demonstration(files, task=place.key.task, folder=place.folder)
-    except DatasetError as error:
-        return Broken(place.folder, str(error))
 
 
-def _sort_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]]:
+def _sort_places(source: Source) -> tuple[dict[EpisodeKey, EpisodePlace], tuple[Broken, ...]]:
     """All episodes of known tasks by task and id, and the folders of others."""
     places: dict[EpisodeKey, tuple[str, EpisodePlace]] = {}
     todays: dict[str, str | None] = {}
@@ -228,10 +209,10 @@ def _sort_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]
         if key in places:
             raise DatasetError(f"{source.path} holds {task} {episode_id} twice: {places[key][0]} and {path}.")
         folder = f"{parent.rpartition('/')[2]}/{episode_id}"
-        places[key] = path, EpisodePlace(key, folder, place)
+        places[key] = path, EpisodePlace(folder, place)
     strange = sorted(parent for parent, task in todays.items() if task is None)
     unknown = "there is no task of that name, so its episodes are left out."
-    return [places[key][1] for key in sorted(places)], tuple(Broken(parent, unknown) for parent in strange)
+    return {key: places[key][1] for key in sorted(places)}, tuple(Broken(each, unknown) for each in strange)
 
 
 COMMAND = "openvima data import"
@@ -248,7 +229,6 @@ class ImportConfig:
         out: The folder to write.
         tasks: Old or new names of tasks; ("all",) means all that are there.
         episodes: At most so many of each task, the first ones; None means all.
-        shard_size: Episodes in a file.
         compression: Codec of the files, "lz4" or "zstd".
         workers: Number of processes.
         force: Delete a data set that is in the folder.
@@ -258,7 +238,6 @@ class ImportConfig:
     out: Path
     tasks: tuple[str, ...] = ("all",)
     episodes: int | None = None
-    shard_size: int = SHARD_SIZE
     compression: str = "zstd"
     workers: int = 1
     force: bool = False
@@ -266,9 +245,8 @@ class ImportConfig:
     def __post_init__(self) -> None:
         settle(self, paths=("source", "out"), names=("tasks",))
         check_workers(self.workers)
-        for name in ("episodes", "shard_size"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise ConfigError(f"{name} is {value}; it must be at least 1.")
+        if self.episodes is not None and self.episodes < 1:
+            raise ConfigError(f"episodes is {self.episodes}; it must be at least 1.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +259,7 @@ class ImportBlock(Block):
     """
 
     source: Path
-    places: tuple[EpisodePlace, ...]
+    places: Sequence[EpisodePlace]
 
 
 def import_published(config: ImportConfig, report: Report | None = None) -> Path:
@@ -324,22 +302,22 @@ def plan(config: ImportConfig, data: PublishedData) -> list[ImportBlock]:
     """Divide the episodes into blocks; the division depends on source and settings alone."""
     versions = {**package_versions(), "vima": data.source.digest()}
     blocks = []
-    for task, group in groupby(data.places, key=lambda place: place.key.task):
-        places = tuple(group)[: config.episodes]
-        for number, start in enumerate(range(0, len(places), config.shard_size)):
+    for task, keys in groupby(data.places, key=lambda key: key.task):
+        places = [data.places[key] for key in keys][: config.episodes]
+        for number, start in enumerate(range(0, len(places), SHARD_SIZE)):
             info = ShardInfo(
                 task=task,
                 level=LEVEL,
                 domain=DOMAIN,
                 number=number,
-                shard_size=config.shard_size,
+                shard_size=SHARD_SIZE,
                 first_seed=0,
                 assets=ASSETS,
                 versions=versions,
                 compat=True,
                 compression=config.compression,
             )
-            chunk = places[start : start + config.shard_size]
+            chunk = places[start : start + SHARD_SIZE]
             blocks.append(ImportBlock(config.out / info.file_name, info, len(chunk), data.path, chunk))
     return blocks
 
@@ -354,7 +332,7 @@ def write_block(block: ImportBlock, count: Callable[[int], None]) -> None:
     source = open_source(block.source)
     with ShardWriter(block.path, block.info) as writer:
         for number, place in enumerate(block.places, start=1):
-            found = read_place(source, place)
+            found = read_place(source, task=block.info.task, place=place)
             if isinstance(found, Demonstration):
                 writer.write(found)
             count(number)
@@ -366,7 +344,8 @@ def _find_broken(block: ImportBlock) -> list[Broken] | None:
         return None
     present = set(Shard(block.path).table(["reason"]).column(0).to_pylist())
     source = open_source(block.source)
-    found = [read_place(source, place) for place in block.places if place.folder not in present]
+    missing = [place for place in block.places if place.folder not in present]
+    found = [read_place(source, task=block.info.task, place=place) for place in missing]
     broken = [entry for entry in found if isinstance(entry, Broken)]
     return broken if len(broken) == len(found) else None
 
@@ -382,9 +361,9 @@ def _settings(config: ImportConfig, data: PublishedData, blocks: Sequence[Import
     info = blocks[0].info  # but for task and number, the same of all
     return {
         "tasks": sorted({block.info.task for block in blocks}),
+        "episodes": config.episodes,
         "level": info.level,
         "domain": info.domain,
-        "episodes": config.episodes,
         "shard_size": info.shard_size,
         "compression": info.compression,
         "assets": info.assets,

@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import mmap
 import os
 import re
 import struct
@@ -11,8 +10,8 @@ import zlib
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO
 
+from openvima.data.shard import map_file
 from openvima.errors import DatasetError
 
 PICKLES = ("obs.pkl", "action.pkl", "trajectory.pkl")
@@ -121,18 +120,17 @@ class _Excerpt(io.RawIOBase):
     """An archive in whose directory are the entries of one episode; those of all would take gigabytes.
 
     Args:
-        file: The archive.
-        start: Where its directory begins.
+        members: The archive up to its directory.
         entries: Those of the episode.
     """
 
-    def __init__(self, file: BinaryIO, start: int, entries: bytes) -> None:
-        size, end = len(entries), start + len(entries)
-        self._file, self._start, self._place = file, start, 0
+    def __init__(self, members: memoryview, entries: bytes) -> None:
+        size, start = len(entries), len(members)
+        self._members, self._place = members, 0
         self._tail = (
             entries
             + _END_64.pack(b"PK\6\6", _END_64.size - 12, 45, 45, 0, 0, 0, 0, size, start)
-            + _POINTER_64.pack(b"PK\6\7", 0, end, 1)
+            + _POINTER_64.pack(b"PK\6\7", 0, start + size, 1)
             + _END.pack(b"PK\5\6", 0, 0, 0, 0, 0, 0, 0)
         )
 
@@ -142,16 +140,15 @@ class _Excerpt(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """Move to a place and return it."""
-        self._place = (0, self._place, self._start + len(self._tail))[whence] + offset
+        self._place = (0, self._place, len(self._members) + len(self._tail))[whence] + offset
         return self._place
 
     def read(self, size: int = -1) -> bytes:
         """Read at most so many bytes; -1: all."""
-        source, place = self._file, self._place
-        if place >= self._start:
-            source, place = io.BytesIO(self._tail), place - self._start
-        source.seek(place)
-        content = source.read(size)
+        source, place = self._members, self._place
+        if place >= len(source):
+            source, place = self._tail, place - len(source)
+        content = bytes(source[place:] if size < 0 else source[place : place + size])
         self._place += len(content)
         return content
 
@@ -167,9 +164,8 @@ class ZipArchive:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        with open(path, "rb") as file:
-            self._start, self._end = _find_directory(file, path)
+        self.path, self._content = path, map_file(path)
+        self._start, self._end = _find_directory(self._content, path)
 
     def episodes(self) -> dict[str, Place]:
         """Return the folders of all episodes, such as "vima_v6/rotate/000123", and where their entries are.
@@ -186,13 +182,7 @@ class ZipArchive:
 
     def digest(self) -> str:
         """Return 32 hexadecimal digits for the archive's directory, so for all names, sizes and checksums."""
-        digest, left = hashlib.sha256(), self._end - self._start
-        with open(self.path, "rb") as file:
-            file.seek(self._start)
-            while left > 0 and (piece := file.read(min(left, 2**20))):
-                digest.update(piece)
-                left -= len(piece)
-        return digest.hexdigest()[:32]
+        return hashlib.sha256(self._content[self._start : self._end]).hexdigest()[:32]
 
     def files(self, place: Place) -> Mapping[str, bytes]:
         """Read the files of an episode.
@@ -206,56 +196,49 @@ class ZipArchive:
         Raises:
             DatasetError: A member is damaged, too large or beyond the end.
         """
-        with open(self.path, "rb") as file:
-            entries = b""
-            for start, end in place:
-                file.seek(start)
-                entries += file.read(end - start)
+        entries = b"".join(self._content[start:end] for start, end in place)
+        try:
+            archive = zipfile.ZipFile(_Excerpt(self._content[: self._start], entries))
+        except _DAMAGE_ERRORS as error:
+            raise DatasetError(f"the archive's directory is damaged here ({error}).") from None
+        members = {_EPISODE.sub(b"", m.filename.encode()).decode(): m for m in archive.infolist()}
+        members = {name: member for name, member in members.items() if is_episode_file(name)}
+        total = sum(max(member.file_size, member.compress_size) for member in members.values())
+        if total > MAX_EPISODE_BYTES:
+            raise DatasetError(f"it claims {total:,} bytes; episodes have at most {MAX_EPISODE_BYTES:,}.")
+        contents = {}
+        for name, member in members.items():
             try:
-                archive = zipfile.ZipFile(_Excerpt(file, self._start, entries))
+                contents[name] = archive.read(member)
             except _DAMAGE_ERRORS as error:
-                raise DatasetError(f"the archive's directory is damaged here ({error}).") from None
-            members = {_EPISODE.sub(b"", m.filename.encode()).decode(): m for m in archive.infolist()}
-            members = {name: member for name, member in members.items() if is_episode_file(name)}
-            total = sum(max(member.file_size, member.compress_size) for member in members.values())
-            if total > MAX_EPISODE_BYTES:
-                raise DatasetError(f"it claims {total:,} bytes; episodes have at most {MAX_EPISODE_BYTES:,}.")
-            contents = {}
-            for name, member in members.items():
-                try:
-                    contents[name] = archive.read(member)
-                except _DAMAGE_ERRORS as error:
-                    raise DatasetError(f"{name} cannot be read: {str(error)[:_MAX_TEXT]}.") from None
-            return contents
+                raise DatasetError(f"{name} cannot be read: {str(error)[:_MAX_TEXT]}.") from None
+        return contents
 
     def _runs(self) -> Iterator[tuple[bytes, int, int]]:
         """Folder, start and end of each run of entries that lie in the same episode's folder."""
-        with open(self.path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            folder, run_start, position = None, self._start, self._start
-            while position < self._end:
-                try:
-                    name, extra, comment = _LENGTHS.unpack_from(content, position + _LENGTHS_AT)
-                except struct.error:
-                    break  # beyond the end of the file
-                name_start = position + _ENTRY_BYTES
-                if folder is None or content[name_start : name_start + len(folder)] != folder:
-                    if folder is not None:
-                        yield folder, run_start, position
-                    match = _EPISODE.match(content[name_start : name_start + name])
-                    folder, run_start = match and match.group(), position
-                position = name_start + name + extra + comment
-            if position != self._end:
-                raise DatasetError(f"{self.path}: its directory is damaged; copy or download it again.")
-            if folder is not None:
-                yield folder, run_start, position
+        content, folder, run_start, position = self._content, None, self._start, self._start
+        while position < self._end:
+            try:
+                name, extra, comment = _LENGTHS.unpack_from(content, position + _LENGTHS_AT)
+            except struct.error:
+                break  # beyond the end of the file
+            name_start = position + _ENTRY_BYTES
+            if folder is None or bytes(content[name_start : name_start + len(folder)]) != folder:
+                if folder is not None:
+                    yield folder, run_start, position
+                match = _EPISODE.match(content[name_start : name_start + name])
+                folder, run_start = match and match.group(), position
+            position = name_start + name + extra + comment
+        if position != self._end:
+            raise DatasetError(f"{self.path}: its directory is damaged; copy or download it again.")
+        if folder is not None:
+            yield folder, run_start, position
 
 
-def _find_directory(file: BinaryIO, path: Path) -> tuple[int, int]:
+def _find_directory(content: memoryview, path: Path) -> tuple[int, int]:
     """Start and end of the directory."""
-    size = file.seek(0, 2)
-    tail_start = max(0, size - _LONGEST_END)
-    file.seek(tail_start)
-    tail = file.read()
+    tail_start = max(0, len(content) - _LONGEST_END)
+    tail = bytes(content[tail_start:])
     end = tail.rfind(b"PK\5\6")
     if end < 0 or end + _END.size > len(tail):
         raise DatasetError(f"{path} is no zip archive, or its end is missing (an interrupted download?).")

@@ -1,13 +1,14 @@
 """Importing the published data set: equal content, equal bytes by any road, and nothing lost or hidden."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from openvima.cli.main import main
-from openvima.data import Dataset
+from openvima.data import Dataset, published
 from openvima.data.published import ImportConfig, PublishedData, import_published
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError
@@ -26,13 +27,21 @@ def episodes() -> dict[str, Files]:
     return {**made, **{f"rotate/00000{number}": MadeEpisode(number).files(PUBLISHED) for number in (3, 5)}}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_shards() -> Iterator[None]:
+    """Shards of three episodes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(published, "SHARD_SIZE", 3)
+        yield
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_zip(tmp_path_factory.mktemp("source") / "vima.zip", episodes())
 
 
 def config(source: Path, out: Path, **changes: object) -> ImportConfig:
-    return replace(ImportConfig(source, out, shard_size=3), **changes)
+    return replace(ImportConfig(source, out), **changes)
 
 
 @pytest.fixture(scope="module")
