@@ -86,7 +86,7 @@ def test_outdated_files_are_noticed(copy: Path) -> None:
 def test_a_truncated_file_is_made_anew(copy: Path) -> None:
     dataset = Dataset(copy, tasks=["rotate"])
     path = open_object_cache(dataset).folder / "rotate-train-00000.arrow"
-    source = joint_hash(dataset[row].content_hash() for row in range(2))
+    source = joint_hash(dataset.index.slice(0, 2))
     whole = path.read_bytes()
     for size in (0, 7, 1000, -1):
         path.write_bytes(whole[:size])

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from openvima.atomic_io import FINISH_S, Part, atomic_write_file, folder_lock, parts_in_range
 from openvima.data.encoding import ShardInfo
 from openvima.data.schema import SCHEMA_VERSION
-from openvima.data.shard import Shard, Span, measure, remedy
+from openvima.data.shard import SPAN, Shard, measure, remedy
 from openvima.errors import DatasetError, StorageError, differences
 from openvima.multiprocess import Report
 
@@ -94,7 +94,7 @@ def finish_folder(
         "config": dict(config),
         "versions": dict(versions),
         "licence": licence,
-        "content_hash": joint_hash(index.column("content_hash").to_pylist()),
+        "content_hash": joint_hash(index),
         "counts": {
             "episodes": index.num_rows,
             "steps": sum(entry["steps"] for entry in entries.values()),
@@ -140,7 +140,7 @@ def _summarise_shard(path: Path) -> tuple[dict[str, Any], pa.Table]:
         **{name: table.column(name) for name in table.column_names},
         "shard": [path.name] * table.num_rows,
         "row": range(table.num_rows),
-        **{name: [getattr(span, name) for span in spans] for name in Span._fields},
+        **{name: [span[number] for span in spans] for number, name in enumerate(SPAN)},
     }
     return {**counts, **fingerprint(path), **frame}, pa.table(columns, schema=INDEX_SCHEMA)
 
@@ -242,9 +242,9 @@ def fingerprint(path: Path) -> dict[str, Any]:
         return {"bytes": file.tell(), "sha256": digest}
 
 
-def joint_hash(content_hashes: Iterable[str]) -> str:
-    """Return 32 hexadecimal digits that stand for all episodes in their order."""
-    return hashlib.sha256("".join(content_hashes).encode()).hexdigest()[:32]
+def joint_hash(index: pa.Table) -> str:
+    """Return 32 hexadecimal digits that stand for all episodes of an index in their order."""
+    return hashlib.sha256("".join(index.column("content_hash").to_pylist()).encode()).hexdigest()[:32]
 
 
 def is_finished(folder: Path) -> bool:

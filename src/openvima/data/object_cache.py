@@ -22,7 +22,7 @@ from openvima.data.manifest import CACHE_FOLDER, joint_hash, split_index
 from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empty_episode, preprocess
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
-from openvima.data.shard import DAMAGE_ERRORS, Shard, list_spans, map_file
+from openvima.data.shard import DAMAGE_ERRORS, SPAN, Shard, map_file
 from openvima.errors import DatasetError, one_line, unknown_name
 from openvima.input_files import as_path
 from openvima.multiprocess import Report, imap_unordered
@@ -38,28 +38,23 @@ from openvima.perception.preprocessing import (
 from openvima.scene import COMPOSED
 
 CACHE_VERSION = 7  # grows whenever the same demonstration gives another row
-# Columns of lists, one record for each object, step or image: Arrow type of a number and shape of each field,
-# which has the name that it has in `PreprocessedEpisode`.
-_Fields = dict[str, tuple[pa.DataType, tuple[int, ...]]]
-_OBJECT: _Fields = {
-    "ids": (pa.int16(), ()),
-    "crop_index": (pa.int32(), (2,)),
-    "boxes": (pa.int16(), (2, 4)),
-    "grasps": (pa.int16(), (2, 2)),
-}
+# Columns of lists, one record for each object, step or image: shape and NumPy type of each field, which has
+# the name that it has in `PreprocessedEpisode`.
+_Fields = dict[str, str]
+_OBJECT: _Fields = {"ids": "i2", "crop_index": "(2,)i4", "boxes": "(2,4)i2", "grasps": "(2,2)i2"}
 _LISTS: dict[str, _Fields] = {
-    "prompt_images": {"prompt.objects_per_image": (pa.int16(), ()), "prompt.is_scene": (pa.bool_(), ())},
+    "prompt_images": {"prompt.objects_per_image": "i2", "prompt.is_scene": "?"},
     **{
-        column: {f"{path}.{name}": type_ for name, type_ in _OBJECT.items()}
+        column: {f"{path}.{name}": dtype for name, dtype in _OBJECT.items()}
         for column, path in (("prompt_objects", "prompt.objects"), ("objects", "objects"), ("final", "final"))
     },
     "steps": {
-        "objects_per_step": (pa.int16(), ()),
-        "pick_ids": (pa.int16(), ()),
-        "place_ids": (pa.int16(), ()),
-        "false_positives.crop_index": (pa.int32(), (2,)),
-        "false_positives.boxes": (pa.int16(), (2, 4)),
-        "actions": (pa.float32(), (12,)),
+        "objects_per_step": "i2",
+        "pick_ids": "i2",
+        "place_ids": "i2",
+        "false_positives.crop_index": "(2,)i4",
+        "false_positives.boxes": "(2,4)i2",
+        "actions": "(12,)f4",
     },
 }
 _SCALARS = {
@@ -205,23 +200,22 @@ def write_cache_file(
 
 
 def _lists(kind: InputKind) -> dict[str, _Fields]:
-    return {**_LISTS, "images": {"images": (pa.uint8(), (3, *IMAGE_SIZES[kind]))}}
+    height, width = IMAGE_SIZES[kind]
+    return {**_LISTS, "images": {"images": f"(3,{height},{width})u1"}}
 
 
 def _schema(kind: InputKind, source: str, variant: str) -> pa.Schema:
     lists = {
-        column: pa.list_(
-            pa.struct(
-                {
-                    name: pa.list_(number, prod(shape)) if shape else number
-                    for name, (number, shape) in fields.items()
-                }
-            )
-        )
+        column: pa.list_(pa.struct({name: _arrow_type(dtype) for name, dtype in fields.items()}))
         for column, fields in _lists(kind).items()
     }
     about = {"version": str(CACHE_VERSION), "kind": kind, "source": source, "variant": variant}
     return pa.schema({**lists, **_SCALARS, _CHECKSUM: pa.uint64()}, about)
+
+
+def _arrow_type(dtype: str) -> pa.DataType:
+    number, shape = pa.from_numpy_dtype(np.dtype(dtype).base), np.dtype(dtype).shape
+    return pa.list_(number, prod(shape)) if shape else number
 
 
 def _pack(fields: Mapping[str, Sequence[np.ndarray]]) -> pa.Array:
@@ -240,8 +234,8 @@ def _pack(fields: Mapping[str, Sequence[np.ndarray]]) -> pa.Array:
 def _unpack(column: pa.Array, fields: _Fields) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return where the lists of a column begin and end, and all records, field by field, without a copy."""
     flat = {}
-    for number, (name, (_, shape)) in enumerate(fields.items()):
-        values = column.values.field(number)
+    for name, dtype in fields.items():
+        values, shape = column.values.field(name), np.dtype(dtype).shape
         numbers = (values.values if shape else values).to_numpy(zero_copy_only=False)
         flat[name] = numbers.reshape(-1, *shape)
     return column.offsets.to_numpy(), flat
@@ -421,9 +415,8 @@ def _open_files(
     """
     files, missing = {}, {}
     for name, index in split_index(dataset.index).items():
-        source = joint_hash(index.column("content_hash").to_pylist())
         try:
-            files[name] = CacheFile(folder / name, kind, source, variant)
+            files[name] = CacheFile(folder / name, kind, joint_hash(index), variant)
         except DatasetError:
             missing[name] = index
     return files, missing
@@ -437,18 +430,18 @@ def _write(
     variant: Variant,
 ) -> None:
     """Write a file for a shard, given with its part of the index."""
-    path, entry, index, target = work
-    shard = Shard(path, entry)
+    path, written, index, target = work
+    shard = Shard(path, written)
     extractor = _extractor(variant.boxes) if variant.boxes else None
     kept = split_hashes(index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
-    tasks, seeds = (index.column(name).to_pylist() for name in ("task", "seed"))
     episodes = []
-    for row, span in enumerate(list_spans(index)):
-        is_unknown = variant.appearance is not None and tasks[row] == COMPOSED  # its prompt is not sampled
+    for row, entry in enumerate(index.to_pylist()):
+        task, seed = entry["task"], entry["seed"]
+        is_unknown = variant.appearance is not None and task == COMPOSED  # its prompt is not sampled
         if is_unknown or not kept[row]:
-            episodes.append(empty_episode(tasks[row], seeds[row], kind))
+            episodes.append(empty_episode(task, seed, kind))
         else:
-            shard.check(row, span)
+            shard.check(row, *(entry[name] for name in SPAN))
             demo = shard[row]
             if variant.appearance is not None:
                 demo = with_random_appearance(demo, shard.info, variant.appearance)
@@ -456,8 +449,7 @@ def _write(
             # Random appearances have no names.
             episodes.append(episode if variant.appearance is None else replace(episode, descriptions={}))
         count(row + 1)
-    source = joint_hash(index.column("content_hash").to_pylist())
-    write_cache_file(target, episodes, kind, source, variant.name)
+    write_cache_file(target, episodes, kind, joint_hash(index), variant.name)
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,7 @@ import pyarrow as pa
 from openvima.catalog import LEVELS, OBJECTS, TEXTURES
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, read_index, read_manifest, split_index
 from openvima.data.records import Demonstration
-from openvima.data.shard import Shard, Span, remedy
+from openvima.data.shard import SPAN, Shard, remedy
 from openvima.errors import MAX_CHARACTERS, DatasetError, cut, unknown_name
 from openvima.html import notebook_html
 from openvima.hub import cache_folder, dataset_name, fetch
@@ -57,7 +57,7 @@ class Dataset:
         self._names = names.dictionary.to_pylist()
         self._name_of = names.indices.to_numpy()  # numbers instead of a million texts
         self._rows = self.index.column("row").to_numpy()
-        self._spans = [self.index.column(name).to_numpy() for name in Span._fields]
+        self._spans = [self.index.column(name).to_numpy() for name in SPAN]
         self._shards: dict[str, Shard] = {}
         missing = [name for name in sorted(self._names) if not (self.path / name).is_file()]
         if missing and not index_only:
@@ -127,7 +127,7 @@ class Dataset:
             raise IndexError(f"episode {episode_index} of {len(self)}; count from 0 to {len(self) - 1}.")
         name, row = self.locate(episode_index)
         shard = self.shard(name)
-        shard.check(row, Span(*(int(numbers[episode_index]) for numbers in self._spans)))
+        shard.check(row, *(int(numbers[episode_index]) for numbers in self._spans))
         return shard, row
 
 

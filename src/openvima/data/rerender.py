@@ -69,30 +69,22 @@ def rerender(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonst
         UnknownNameError: An object or texture of a user is not registered.
     """
     try:
-        rasteriser = _rasteriser(info.assets)
-        rgb, segm = render_observations(rasteriser, demo.scenes)
-        prompt = rasteriser.prompt(sample_prompt(demo, info))
+        result = _render(demo, _rasteriser(info.assets), demo.scenes, sample_prompt(demo, info))
     except (SamplingError, ConfigError, UnknownTaskError) as error:  # the task is another one, or gone
         raise _explain_change(demo, info, f" ({error})") from error
-    result = dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=prompt)
     if result.content_hash() != content_hash:
         raise _explain_change(demo, info)
     return result
 
 
-def render_observations(
-    rasteriser: Rasteriser, scenes: Sequence[Scene]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Render the observations of N scenes.
-
-    Returns:
-        View name to images, shape (N, 3, 128, 256), uint8; view name to object ids, shape (N, 128, 256),
-        uint8.
-    """
+def _render(
+    demo: Demonstration, rasteriser: Rasteriser, scenes: Sequence[Scene], prompt: Prompt
+) -> Demonstration:
+    """Return the demonstration with the images of these scenes and this prompt."""
     rendered = [rasteriser.scene(scene) for scene in scenes]
     rgb = {view: np.stack([images[view].rgb for images in rendered]) for view in VIEWS}
     segm = {view: np.stack([images[view].segm for images in rendered]) for view in VIEWS}
-    return rgb, segm
+    return dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=rasteriser.prompt(prompt))
 
 
 def sample_prompt(demo: Demonstration, info: ShardInfo) -> Prompt:
@@ -142,10 +134,9 @@ def with_random_appearance(demo: Demonstration, info: ShardInfo, variant: int) -
     appearance = RandomAppearance(
         placements, prompt.text, in_words=in_words, variant=variant, assets=rasteriser.assets, rng=rng
     )
-    rgb, segm = render_observations(rasteriser, [appearance.of_scene(scene) for scene in demo.scenes])
     images = tuple((name, appearance.of_image(fill)) for name, fill in prompt.images)
-    rendered = rasteriser.prompt(dataclasses.replace(prompt, images=images))
-    return dataclasses.replace(demo, rgb=rgb, segm=segm, prompt=rendered)
+    scenes = list(map(appearance.of_scene, demo.scenes))
+    return _render(demo, rasteriser, scenes, dataclasses.replace(prompt, images=images))
 
 
 class RandomAppearance:

@@ -6,6 +6,7 @@ not know are written beside the columns, under the key "shape". Lists are empty 
 and joint paths of imported demonstrations, images where they are redrawn on reading.
 """
 
+from collections.abc import Mapping
 from math import prod
 
 import pyarrow as pa
@@ -37,8 +38,8 @@ def _list(dtype: pa.DataType, length: int = -1) -> pa.DataType:
     return pa.list_(pa.field("item", dtype, nullable=False), length)
 
 
-def _field(name: str, dtype: pa.DataType, shape: str = "") -> pa.Field:
-    return pa.field(name, dtype, nullable=False, metadata={"shape": shape} if shape else None)
+def _fields(types: Mapping[str, pa.DataType]) -> list[pa.Field]:
+    return [pa.field(name, dtype, nullable=False) for name, dtype in types.items()]
 
 
 def _arrays(name: str) -> pa.Field:
@@ -46,49 +47,46 @@ def _arrays(name: str) -> pa.Field:
     dtype, shape = ARRAYS[name]
     written = "steps + 1,objects,7" if name == "poses" else ",".join(map(str, shape))
     numbers = _list(pa.from_numpy_dtype(dtype), prod(shape))
-    return _field(name, _list(numbers), "" if name in ACTION_SHAPES else written)
+    metadata = None if name in ACTION_SHAPES else {"shape": written}
+    return pa.field(name, _list(numbers), nullable=False, metadata=metadata)
 
 
-RECORD = pa.struct([_field("id", pa.int32()), _field("object", pa.string()), _field("texture", pa.string())])
-OBJECT = pa.struct(
-    [
-        *RECORD,
-        _field("size", _list(pa.float64(), 3)),
-        _field("scale", _list(pa.float64(), 3)),
-        _field("fixed", pa.bool_()),
-    ]
-)
-PROMPT_IMAGE = pa.struct(
-    [
-        _field("name", pa.string()),
-        _field("kind", pa.string()),
-        _field("objects", _list(RECORD)),
-    ]
-)
-SKIPPED = pa.struct([_field("seed", pa.int64()), _field("kind", pa.string()), _field("reason", pa.string())])
+RECORD = pa.struct(_fields({"id": pa.int32(), "object": pa.string(), "texture": pa.string()}))
+_VECTOR = _list(pa.float64(), 3)
+OBJECT = pa.struct([*RECORD, *_fields({"size": _VECTOR, "scale": _VECTOR, "fixed": pa.bool_()})])
+PROMPT_IMAGE = pa.struct(_fields({"name": pa.string(), "kind": pa.string(), "objects": _list(RECORD)}))
+SKIPPED = pa.struct(_fields({"seed": pa.int64(), "kind": pa.string(), "reason": pa.string()}))
 
 COLUMNS = pa.schema(
     [
-        _field("task", pa.string()),
-        _field("level", pa.string()),
-        _field("domain", pa.string()),
-        _field("seed", pa.int64()),
-        _field("steps", pa.int32()),
-        _field("max_steps", pa.int32()),
-        _field("redraws", pa.int32()),
-        _field("content_hash", pa.string()),
-        _field("skipped", _list(SKIPPED)),  # seeds tried since the row before, and why they were not kept
-        _field("success", pa.bool_()),
-        _field("failure", pa.bool_()),
-        _field("reason", pa.string()),
-        _field("end_effector", pa.string()),
-        _field("objects", _list(OBJECT)),
+        *_fields(
+            {
+                "task": pa.string(),
+                "level": pa.string(),
+                "domain": pa.string(),
+                "seed": pa.int64(),
+                "steps": pa.int32(),
+                "max_steps": pa.int32(),
+                "redraws": pa.int32(),
+                "content_hash": pa.string(),
+                "skipped": _list(SKIPPED),  # seeds tried since the row before, and why they were not kept
+                "success": pa.bool_(),
+                "failure": pa.bool_(),
+                "reason": pa.string(),
+                "end_effector": pa.string(),
+                "objects": _list(OBJECT),
+            }
+        ),
         *map(_arrays, ("poses", *ACTION_SHAPES)),
-        _field("pick_ids", _list(pa.int32())),
-        _field("place_ids", _list(pa.int32())),
-        _field("joint_paths", _list(_list(_list(pa.float32(), 6)))),  # radians
-        _field("prompt", pa.string()),
-        _field("prompt_images", _list(PROMPT_IMAGE)),
+        *_fields(
+            {
+                "pick_ids": _list(pa.int32()),
+                "place_ids": _list(pa.int32()),
+                "joint_paths": _list(_list(_list(pa.float32(), 6))),  # radians
+                "prompt": pa.string(),
+                "prompt_images": _list(PROMPT_IMAGE),
+            }
+        ),
         *map(_arrays, filter(IMAGES.__contains__, ARRAYS)),
     ]
 )

@@ -11,7 +11,7 @@ import shlex
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pyarrow as pa
 
@@ -28,12 +28,8 @@ _MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
 _BUFFER_BYTES = 1 << 20  # Arrow writes an episode in 150 pieces
 
 
-class Span(NamedTuple):
-    """Where a record lies in its file, and the CRC-32 of its bytes."""
-
-    offset: int
-    num_bytes: int
-    crc32: int
+# Columns of the index: where a record lies in its file, and the CRC-32 of its bytes.
+SPAN = ("offset", "num_bytes", "crc32")
 
 
 def map_file(path: Path) -> memoryview:
@@ -48,13 +44,13 @@ def map_file(path: Path) -> memoryview:
         return memoryview(file.read_buffer())
 
 
-def measure(path: Path) -> tuple[dict[str, int], list[Span]]:
+def measure(path: Path) -> tuple[dict[str, int], list[tuple[int, int, int]]]:
     """Find the parts of a whole shard and their checksums.
 
     Returns:
         What lies around the records, as the manifest names it: `bytes`, the size of the whole file,
         `head_bytes` before the first record, `tail_bytes` after the last one, and `frame_crc32`, the CRC-32
-        of head and tail; and where the records lie.
+        of head and tail; and `SPAN` of each record.
     """
     content, ends = map_file(path), []
     with pa.memory_map(str(path)) as file:
@@ -62,17 +58,9 @@ def measure(path: Path) -> tuple[dict[str, int], list[Span]]:
         with contextlib.suppress(EOFError):  # the mark after the last record
             while pa.ipc.read_message(file):
                 ends.append(file.tell())
-    spans = [
-        Span(start, end - start, zlib.crc32(content[start:end])) for start, end in itertools.pairwise(ends)
-    ]
+    spans = [(start, end - start, zlib.crc32(content[start:end])) for start, end in itertools.pairwise(ends)]
     frame = {"bytes": len(content), "head_bytes": ends[0], "tail_bytes": len(content) - ends[-1]}
     return {**frame, "frame_crc32": _frame_crc32(content, frame)}, spans
-
-
-def list_spans(index: pa.Table) -> list[Span]:
-    """Return where the records of a shard lie, from its part of the index."""
-    columns = (index.column(name).to_pylist() for name in Span._fields)
-    return [Span(*numbers) for numbers in zip(*columns, strict=True)]
 
 
 def _frame_crc32(content: memoryview, frame: Mapping[str, Any]) -> int:
@@ -182,17 +170,19 @@ class Shard:
             raise self._row_damage(row, error) from None
         return batch
 
-    def check(self, row: int, span: Span) -> None:
+    def check(self, row: int, offset: int, num_bytes: int, crc32: int) -> None:
         """Compare the bytes of a row with their checksum, before anything is made of them.
 
         Args:
             row: The row.
-            span: Where the index says that it lies.
+            offset: Where it lies in the file, as the index says.
+            num_bytes: Their number.
+            crc32: Their checksum.
 
         Raises:
             DatasetError: They are damaged.
         """
-        if zlib.crc32(self._content[span.offset : span.offset + span.num_bytes]) != span.crc32:
+        if zlib.crc32(self._content[offset : offset + num_bytes]) != crc32:
             raise self._row_damage(row, "its checksum is wrong")
 
     def table(self, names: Sequence[str]) -> pa.Table:
