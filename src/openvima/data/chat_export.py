@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -107,24 +107,22 @@ def _save(folder: Path, name: str, turns: Sequence[Turn]) -> list[str]:
 
 def _line(format: ExportFormat, name: str, turns: Sequence[Turn], paths: Sequence[str]) -> str:
     """Write an example; `paths` are those of its images, and may go on."""
-    said: list[dict[str, Any]] = []
-    shown = 0
-    for turn in turns:
-        shown += sum(isinstance(part, bytes) for part in turn.parts)
-        if format == "messages":
-            said.append({"role": turn.role, "content": [_block(part) for part in turn.parts]})
-        else:
-            text = "\n".join(part if isinstance(part, str) else "<image>" for part in turn.parts)
-            said.append({"from": _SPEAKERS[turn.role], "value": text})
+    shown = paths[: sum(isinstance(part, bytes) for turn in turns for part in turn.parts)]
     if format == "messages":
-        example = {"id": name, "messages": said, "images": paths[:shown]}
+        said = [{"role": turn.role, "content": [_block(part) for part in turn.parts]} for turn in turns]
+        example = {"id": name, "messages": said, "images": shown}
     else:
-        example = {"id": name, "image": paths[:shown], "conversations": said}
+        said = [{"from": _SPEAKERS[turn.role], "value": "\n".join(map(_text, turn.parts))} for turn in turns]
+        example = {"id": name, "image": shown, "conversations": said}
     return json.dumps(example, ensure_ascii=False) + "\n"
 
 
 def _block(part: Part) -> dict[str, str]:
     return {"type": "text", "text": part} if isinstance(part, str) else {"type": "image"}
+
+
+def _text(part: Part) -> str:
+    return part if isinstance(part, str) else "<image>"
 
 
 def _questions(

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.data.records import Demonstration, make_columns, planes
-from openvima.data.schema import ARRAYS, CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION, VIEWS
+from openvima.data.schema import ARRAYS, CODECS, COLUMNS, IMAGES, SCHEMA_VERSION, VIEWS
 from openvima.env.config import EnvConfig, without_published
 from openvima.errors import DatasetError, unknown_name
 from openvima.scene import (
@@ -32,10 +32,8 @@ from openvima.user_code import is_code
 _METADATA_KEY = b"openvima"
 _MAX_FUNCTION = 200  # characters
 _WORD = re.compile(r"\w[\w .+-]{0,100}")
-_NAMES = COLUMNS.names
-_TYPES: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in _NAMES}
 # Texts, records and single numbers, which are made at once: each call into Arrow takes microseconds.
-_OTHER_NAMES = [name for name in _NAMES if name not in (*IMAGES, *NUMBERS)]
+_OTHER_NAMES = [name for name in COLUMNS.names if name not in (*ARRAYS, "joint_paths")]
 _OTHERS = pa.struct([COLUMNS.field(name) for name in _OTHER_NAMES])
 
 SkipKind = Literal["failed", "unsolved", "no_action", "not_sampled"]
@@ -171,24 +169,19 @@ def encode(
     Returns:
         A record batch of one row with the columns of `schema.COLUMNS`.
     """
-    columns = make_columns(demo)
-    others = {
-        **columns.records,
-        "content_hash": columns.content_hash,
-        "skipped": [asdict(each) for each in skipped],
-    }
-    made = pa.array([others], type=_OTHERS)
-    cells: dict[str, pa.Array] = {name: made.field(number) for number, name in enumerate(_OTHER_NAMES)}
-    images = {name: array if with_images else array[:0] for name, array in columns.images.items()}
-    for name, rows in {**columns.numbers, **images}.items():
-        dtype, is_path = _TYPES[name], name == "joint_paths"
+    records, arrays = make_columns(demo)
+    made = pa.array([{**records, "skipped": [asdict(each) for each in skipped]}], type=_OTHERS)
+    cells = dict(zip(_OTHER_NAMES, made.flatten(), strict=True))
+    for name, array in arrays.items():
+        rows = array if with_images or name not in IMAGES else array[:0]
+        dtype, is_path = schema.field(name).type, name == "joint_paths"
         item = dtype.value_type.value_type if is_path else dtype.value_type
         items = pa.FixedSizeListArray.from_arrays(rows.reshape(-1), type=item)
         if is_path:  # one for each step
             ends = [0, *itertools.accumulate(map(len, demo.joint_paths))]
             items = _make_lists(items, ends, dtype.value_type)
         cells[name] = _make_lists(items, [0, len(items)], dtype)
-    return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=schema)
+    return pa.RecordBatch.from_arrays([cells[name] for name in COLUMNS.names], schema=schema)
 
 
 def _make_lists(items: pa.Array, ends: Sequence[int], dtype: pa.ListType) -> pa.ListArray:

@@ -2,20 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from openvima.data.records import Demonstration, action_arrays
+from openvima.data.records import Demonstration, action_arrays, make_env
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
 from openvima.env.config import EnvConfig
 from openvima.errors import ActionError, DatasetError
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS, WORKSPACE_HIGH, WORKSPACE_LOW, RenderedPrompt
 from openvima.scene.action import COMMAND_NAMES, CONTROL_HZ, END_EFFECTOR, PRIMITIVES
-
-if TYPE_CHECKING:  # comes with the simulator
-    from openvima.env import TabletopEnv
 
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 TOOL_NAMES = ("tool_x", "tool_y", "tool_z", "tool_yaw", "tool_holds")
@@ -199,7 +195,7 @@ def dense_trajectory(demo: Demonstration, env_config: EnvConfig) -> Trajectory:
     Raises:
         DatasetError: The arm moves on another path than the stored one.
     """
-    env = _env(demo.task, demo.level, demo.domain, env_config)
+    env = make_env(demo.task, demo.level, demo.domain, env_config, ("rgb", "joints"))
     observation, _ = env.reset(seed=demo.seed)
     seen, commands = [], []
     for step, (action, path) in enumerate(zip(demo.actions, demo.joint_paths, strict=True)):
@@ -221,10 +217,3 @@ def dense_trajectory(demo: Demonstration, env_config: EnvConfig) -> Trajectory:
         np.array(commands, np.float32),
         demo.outcome.success,
     )
-
-
-@lru_cache(maxsize=4)
-def _env(task: str, level: str, domain: str, env_config: EnvConfig) -> "TabletopEnv":
-    env = env_config.make(task, level, domain=domain)
-    env.modalities = ("rgb", "joints")
-    return env

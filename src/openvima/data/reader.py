@@ -71,9 +71,7 @@ class Dataset:
         return cut(f"Dataset({str(self.path)!r}, {len(self):,} demonstrations: {tasks})", MAX_CHARACTERS)
 
     def _repr_html_(self) -> str | None:
-        found = self.index.group_by("task").aggregate([([], "count_all"), ("steps", "sum")]).to_pylist()
-        counts = {entry["task"]: (entry["count_all"], entry["steps_sum"]) for entry in found}
-        return notebook_html("dataset", dataset=self, counts=dict(sorted(counts.items())))
+        return notebook_html("dataset", dataset=self)
 
     def __len__(self) -> int:
         return len(self._rows)

@@ -1,6 +1,5 @@
 """A demonstration: observations, actions and outcome of one rollout; its columns, as shards store them."""
 
-import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,7 +32,6 @@ if TYPE_CHECKING:  # reading needs no simulation
     from openvima.env import TabletopEnv
     from openvima.env.config import EnvConfig
 
-_MOST_FRAMES = 6  # in a notebook
 _JSON = json.JSONEncoder(sort_keys=True)
 
 
@@ -90,9 +88,7 @@ class Demonstration:
     __repr__ = brief_repr
 
     def _repr_html_(self) -> str | None:
-        view = next(iter(self.rgb), None)
-        frames = [] if view is None else list(self.rgb[view][:_MOST_FRAMES])
-        return notebook_html("demonstration", demo=self, frames=frames)
+        return notebook_html("demonstration", demo=self)
 
     @property
     def num_steps(self) -> int:
@@ -113,13 +109,17 @@ class Demonstration:
         Unlike the bytes of a file they depend neither on the version of pyarrow nor on compression. The
         versions of the packages do not count.
         """
-        return make_columns(self).content_hash
+        return make_columns(self)[0]["content_hash"]
 
 
 @lru_cache(maxsize=4)
-def make_env(task: str, level: str, domain: str, env_config: "EnvConfig") -> "TabletopEnv":
+def make_env(
+    task: str, level: str, domain: str, env_config: "EnvConfig", modalities: tuple[str, ...] = ("rgb", "segm")
+) -> "TabletopEnv":
     """Make an environment once in this process, for all shards of a task."""
-    return env_config.make(task, level, domain=domain)
+    env = env_config.make(task, level, domain=domain)
+    env.modalities = modalities
+    return env
 
 
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
@@ -208,39 +208,24 @@ def package_versions() -> dict[str, str]:
     return dict(versions_of("mujoco", "numba", "numpy", "pyarrow"))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Columns:
-    """A demonstration, column by column; only "skipped" is missing.
+def make_columns(demo: Demonstration) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return a demonstration column by column; only "skipped" is missing.
 
-    Args:
-        records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
-        numbers: Column name to numbers, shape (rows, width): poses, the four arrays of the actions, and the
-            waypoints of all joint paths, one path after the other.
-        images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
-            and `segm_…` (N, 128, 256).
-        content_hash: 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
+    Returns:
+        Column name to what `to_pylist` gives of the column's row, for all that is no array, with the content
+        hash that docs/format.md derives; and column name to array: poses (T + 1, objects, 7), the four arrays
+        of the actions, the waypoints of all joint paths, one path after the other, and images, uint8,
+        `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…` and `segm_…` (N, 128, 256).
     """
-
-    records: dict[str, Any]
-    numbers: dict[str, np.ndarray]
-    images: dict[str, np.ndarray]
-    content_hash: str
-
-
-def make_columns(demo: Demonstration) -> Columns:
-    """Return the columns of a demonstration."""
-    records, arrays = _records(demo), _arrays(demo)
+    records, arrays = _records(demo), {}
     lengths = [len(path) for path in demo.joint_paths]
     described = {**records, "assets": demo.assets, "path_lengths": lengths}
     digest = xxhash.xxh3_128(_JSON.encode(described).encode())
-    images = {}
-    for name, array in itertools.chain(arrays.items(), _images(demo)):
+    for name, array in _arrays(demo):
         digest.update(array.nbytes.to_bytes(8, "little"))
         digest.update(array.reshape(-1).view(np.uint8).data)  # while it is in the CPU cache
-        if name not in arrays:
-            images[name] = array
-    numbers = {name: array.reshape(-1, array.shape[-1]) for name, array in arrays.items()}
-    return Columns(records, numbers, images, digest.hexdigest())
+        arrays[name] = array
+    return {**records, "content_hash": digest.hexdigest()}, arrays
 
 
 def _records(demo: Demonstration) -> dict[str, Any]:
@@ -294,18 +279,12 @@ def action_arrays(demo: Demonstration) -> dict[str, np.ndarray]:
     }
 
 
-def _arrays(demo: Demonstration) -> dict[str, np.ndarray]:
+def _arrays(demo: Demonstration) -> Iterator[tuple[str, np.ndarray]]:
     poses = [[(*p.pose.position, *p.pose.quaternion) for p in scene.placements] for scene in demo.scenes]
-    arrays: dict[str, np.ndarray] = {
-        "poses": np.array(poses, "<f8").reshape(len(poses), len(demo.objects), 7)
-    }
-    arrays |= action_arrays(demo)
+    yield "poses", np.array(poses, "<f8").reshape(len(poses), len(demo.objects), 7)
+    yield from action_arrays(demo).items()
     paths = [np.zeros((0, 6), "<f4"), *demo.joint_paths]
-    arrays["joint_paths"] = np.concatenate(paths).astype("<f4", copy=False)
-    return arrays
-
-
-def _images(demo: Demonstration) -> Iterator[tuple[str, np.ndarray]]:
+    yield "joint_paths", np.concatenate(paths).astype("<f4", copy=False)
     shown = list(demo.prompt.images.values())
     for view in VIEWS:
         yield f"prompt_rgb_{view}", pixels([image.rgb[view] for image in shown])

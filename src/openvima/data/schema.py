@@ -30,7 +30,6 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     },
 }
 IMAGES = frozenset(name for name, (_, shape) in ARRAYS.items() if shape[:2] == IMAGE_SHAPE)
-NUMBERS = frozenset({*ARRAYS, "joint_paths"}) - IMAGES
 
 
 def _list(dtype: pa.DataType, length: int = -1) -> pa.DataType:

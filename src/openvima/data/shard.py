@@ -150,7 +150,8 @@ class Shard:
         except DAMAGE_ERRORS as error:
             raise self._row_damage(row, error) from None
         if not self.info.images and IMAGES.intersection(columns):
-            values |= make_columns(self[row]).images
+            _, arrays = make_columns(self[row])
+            values |= {name: arrays[name] for name in IMAGES}
         return {name: values[name] for name in columns}
 
     def batch(self, row: int, columns: Sequence[str] = COLUMNS.names) -> pa.RecordBatch:
