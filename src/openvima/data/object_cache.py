@@ -19,7 +19,7 @@ from xxhash import xxh3_64
 
 from openvima.atomic_io import atomic_write, folder_lock
 from openvima.data.manifest import CACHE_FOLDER, joint_hash, split_index
-from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, empty_episode, preprocess
+from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, preprocess
 from openvima.data.reader import Dataset, split_hashes
 from openvima.data.rerender import RERENDERING_VERSION, with_random_appearance
 from openvima.data.shard import DAMAGE_ERRORS, SPAN, Shard, map_file
@@ -65,6 +65,7 @@ _SCALARS = {
     "descriptions": pa.list_(pa.string()),  # one for each prompt image; "" where there is none
 }
 _CHECKSUM = "checksum"  # of a row, compared at every read
+LeftOut = tuple[str, int]  # task and seed of a demonstration that a cache leaves out: its row has no steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +173,11 @@ class CacheFile:
 
 
 def write_cache_file(
-    path: Path, episodes: Sequence[PreprocessedEpisode], kind: InputKind, source: str, variant: str = ""
+    path: Path,
+    episodes: Sequence[PreprocessedEpisode | LeftOut],
+    kind: InputKind,
+    source: str,
+    variant: str = "",
 ) -> None:
     """Write one file of the object cache, under its name only when it is complete.
 
@@ -187,9 +192,9 @@ def write_cache_file(
     scalars = [_scalars(episode) for episode in episodes]
     lists = _lists(kind)
     arrays = {
-        name: [np.ascontiguousarray(attrgetter(name)(episode)) for episode in episodes]
+        name: [_array(episode, name, dtype) for episode in episodes]
         for fields in lists.values()
-        for name in fields
+        for name, dtype in fields.items()
     }
     checksums = [_checksum(*row) for row in zip(scalars, zip(*arrays.values(), strict=True), strict=True)]
     columns = [_pack({name: arrays[name] for name in fields}) for fields in lists.values()]
@@ -241,8 +246,17 @@ def _unpack(column: pa.Array, fields: _Fields) -> tuple[np.ndarray, dict[str, np
     return column.offsets.to_numpy(), flat
 
 
-def _scalars(episode: PreprocessedEpisode) -> tuple[object, ...]:
+def _array(episode: PreprocessedEpisode | LeftOut, name: str, dtype: str) -> np.ndarray:
+    """Return one of the arrays of a row."""
+    if isinstance(episode, tuple):
+        return np.zeros(0, dtype)  # of the shape that is part of the type
+    return np.ascontiguousarray(attrgetter(name)(episode))
+
+
+def _scalars(episode: PreprocessedEpisode | LeftOut) -> tuple[object, ...]:
     """Return what a row has besides its arrays, in the order of `_SCALARS`."""
+    if isinstance(episode, tuple):
+        return *episode, 0, "", []
     prompt = episode.prompt
     descriptions = [episode.descriptions.get(name, "") for name in prompt.image_names]
     return episode.task, episode.seed, episode.end_effector, prompt.text, descriptions
@@ -439,7 +453,7 @@ def _write(
         task, seed = entry["task"], entry["seed"]
         is_unknown = variant.appearance is not None and task == COMPOSED  # its prompt is not sampled
         if is_unknown or not kept[row]:
-            episodes.append(empty_episode(task, seed, kind))
+            episodes.append((task, seed))
         else:
             shard.check(row, *(entry[name] for name in SPAN))
             demo = shard[row]

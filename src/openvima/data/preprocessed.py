@@ -1,14 +1,14 @@
 """One demonstration as a policy takes it: tables of objects, and the actions to learn."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from openvima.data.records import Demonstration, action_arrays
 from openvima.data.schema import VIEWS
 from openvima.perception.boxes import match_ids_to_slots
-from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, make_hidden_objects, observe
+from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, observe
 from openvima.perception.preprocessing import (
     IMAGE_SIZES,
     ImageStack,
@@ -20,7 +20,7 @@ from openvima.perception.preprocessing import (
     offset_index,
     preprocess_prompt,
 )
-from openvima.scene import ACTION_SHAPES, END_EFFECTORS
+from openvima.scene import END_EFFECTORS
 from openvima.tasks.prompts import image_descriptions
 
 _SMALL_BOX = 16  # pixels, of a false positive where a view shows nothing to take the size from
@@ -39,12 +39,6 @@ class FalsePositives:
 
     crop_index: np.ndarray
     boxes: np.ndarray
-
-    @staticmethod
-    def none(num_steps: int) -> "FalsePositives":
-        """Return zeros for so many steps."""
-        shape = (num_steps, len(VIEWS))
-        return FalsePositives(np.zeros(shape, np.int32), np.zeros((*shape, 4), np.int16))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +77,7 @@ class PreprocessedEpisode:
     final: ObjectTable
     actions: np.ndarray
     images: np.ndarray
-    descriptions: Mapping[str, str] = field(default_factory=dict)
+    descriptions: Mapping[str, str]
 
     @property
     def num_steps(self) -> int:
@@ -127,7 +121,8 @@ def preprocess(
         for t, (observation, found) in enumerate(zip(observations, views, strict=True)):
             slots = match_ids_to_slots(found, observe(observation))
             pick_ids[t], place_ids[t] = (slots.get(int(ids[t]), -1) for ids in (pick_ids, place_ids))
-    false_positives = FalsePositives.none(demo.num_steps)
+    shape = (demo.num_steps, len(VIEWS))
+    false_positives = FalsePositives(np.zeros(shape, np.int32), np.zeros((*shape, 4), np.int16))
     if kind == "objects":
         # From the content alone, so that the cache does not depend on who makes it and in what order.
         rng = np.random.default_rng([demo.seed, *demo.task.encode()])
@@ -162,26 +157,6 @@ def number_images(
     counts = np.array([len(episode.images) for episode in episodes])
     firsts = (np.cumsum(counts) - counts).tolist() if first_images is None else first_images
     return [episode.with_image_offset(first) for episode, first in zip(episodes, firsts, strict=True)]
-
-
-def empty_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:
-    """Return an episode without steps and images, in place of one that a cache leaves out."""
-    stack, none = ImageStack(IMAGE_SIZES[kind]), np.zeros(0, np.int16)
-    nothing = ObjectTable.from_views(make_hidden_objects(), stack)
-    return PreprocessedEpisode(
-        task=task,
-        seed=seed,
-        end_effector=0,
-        prompt=PreprocessedPrompt("", nothing, none, none.astype(bool)),
-        objects=nothing,
-        objects_per_step=none,
-        pick_ids=none,
-        place_ids=none,
-        false_positives=FalsePositives.none(0),
-        final=nothing,
-        actions=np.zeros((0, sum(ACTION_SHAPES.values())), np.float32),
-        images=stack.images()[1:],
-    )
 
 
 def _cut_false_positives(
