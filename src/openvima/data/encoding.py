@@ -152,18 +152,13 @@ def _is_function(assets: str) -> bool:
 
 
 def encode(
-    demo: Demonstration,
-    skipped: Sequence[Skipped] = (),
-    *,
-    schema: pa.Schema = COLUMNS,
-    with_images: bool = True,
+    demo: Demonstration, skipped: Sequence[Skipped] = (), *, with_images: bool = True
 ) -> pa.RecordBatch:
     """Make one row of a demonstration.
 
     Args:
         demo: The demonstration.
         skipped: Seeds tried just before it in vain.
-        schema: `COLUMNS`, perhaps with metadata.
         with_images: Store what the cameras saw and the prompt shows; the content hash counts them either way.
 
     Returns:
@@ -174,14 +169,14 @@ def encode(
     cells = dict(zip(_OTHER_NAMES, made.flatten(), strict=True))
     for name, array in arrays.items():
         rows = array if with_images or name not in IMAGES else array[:0]
-        dtype, is_path = schema.field(name).type, name == "joint_paths"
+        dtype, is_path = COLUMNS.field(name).type, name == "joint_paths"
         item = dtype.value_type.value_type if is_path else dtype.value_type
         items = pa.FixedSizeListArray.from_arrays(rows.reshape(-1), type=item)
         if is_path:  # one for each step
             ends = [0, *itertools.accumulate(map(len, demo.joint_paths))]
             items = _make_lists(items, ends, dtype.value_type)
         cells[name] = _make_lists(items, [0, len(items)], dtype)
-    return pa.RecordBatch.from_arrays([cells[name] for name in COLUMNS.names], schema=schema)
+    return pa.RecordBatch.from_arrays([cells[name] for name in COLUMNS.names], schema=COLUMNS)
 
 
 def _make_lists(items: pa.Array, ends: Sequence[int], dtype: pa.ListType) -> pa.ListArray:

@@ -198,7 +198,7 @@ def _sort_places(source: Source) -> tuple[dict[EpisodeKey, EpisodePlace], tuple[
     """All episodes of known tasks by task and id, and the folders of others."""
     places: dict[EpisodeKey, tuple[str, EpisodePlace]] = {}
     todays: dict[str, str | None] = {}
-    for path, place in source.episodes().items():
+    for path, place in source.episodes.items():
         parent, _, episode_id = path.rpartition("/")
         if parent not in todays:
             todays[parent] = current_task(parent.rpartition("/")[2])

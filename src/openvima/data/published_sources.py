@@ -39,15 +39,12 @@ class EpisodeFolders:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def episodes(self) -> Mapping[str, str]:
-        """Return the folders of all episodes, such as "vima_v6/rotate/000123", and their paths.
+    @cached_property
+    def episodes(self) -> dict[str, str]:
+        """The folders of all episodes, such as "vima_v6/rotate/000123", and their paths.
 
         The disk is searched once; what comes later is not seen.
         """
-        return self._episodes
-
-    @cached_property
-    def _episodes(self) -> dict[str, str]:
         found = {}
         for folder, names, _ in os.walk(self.path, followlinks=True):
             below = Path(folder).relative_to(self.path)
@@ -61,7 +58,7 @@ class EpisodeFolders:
 
     def digest(self) -> str:
         """Return 32 hexadecimal digits for the names of all episodes; to read all files would take hours."""
-        names = "\n".join(sorted(self.episodes()))
+        names = "\n".join(sorted(self.episodes))
         return hashlib.sha256(names.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
     def files(self, place: str) -> Mapping[str, bytes]:
@@ -167,8 +164,9 @@ class ZipArchive:
         self.path, self._content = path, map_file(path)
         self._start, self._end = _find_directory(self._content, path)
 
+    @property
     def episodes(self) -> dict[str, Place]:
-        """Return the folders of all episodes, such as "vima_v6/rotate/000123", and where their entries are.
+        """The folders of all episodes, such as "vima_v6/rotate/000123", and where their entries are.
 
         Raises:
             DatasetError: The directory is damaged.

@@ -263,7 +263,7 @@ class ShardWriter(contextlib.ExitStack):
             demo: The demonstration.
             skipped: Seeds tried just before it in vain.
         """
-        self._writer.write_batch(encode(demo, skipped, schema=self._schema, with_images=self._has_images))
+        self.copy(encode(demo, skipped, with_images=self._has_images))
 
     def copy(self, batch: pa.RecordBatch) -> None:
         """Append one episode as another shard holds it.

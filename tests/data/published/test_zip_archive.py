@@ -19,7 +19,7 @@ EPISODES = {
 
 
 def contents(archive: ZipArchive) -> dict[str, dict[str, bytes]]:
-    return {folder: dict(archive.files(place)) for folder, place in archive.episodes().items()}
+    return {folder: dict(archive.files(place)) for folder, place in archive.episodes.items()}
 
 
 def with_root(root: str = "vima_v6/") -> dict[str, dict[str, bytes]]:
@@ -95,7 +95,7 @@ def test_a_member_beyond_the_end_is_named(tmp_path: Path, offset: int) -> None:
     (tmp_path / "a.zip").write_bytes(head + entry + name + extra + end)
     archive = ZipArchive(tmp_path / "a.zip")
     with pytest.raises(DatasetError, match=r"(obs\.pkl cannot be read|directory is damaged)"):
-        archive.files(archive.episodes()["rotate/000001"])
+        archive.files(archive.episodes["rotate/000001"])
 
 
 def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     path = patched(tmp_path / "a.zip", name, local=22, central=24, layout="<L", value=1000)
     archive = ZipArchive(path)
     with pytest.raises(DatasetError, match=r"obs\.pkl cannot be read: Bad CRC-32"):
-        archive.files(archive.episodes()["rotate/000001"])
+        archive.files(archive.episodes["rotate/000001"])
 
 
 def test_flipped_bytes_never_pass_for_content(path: Path) -> None:
