@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -182,6 +183,14 @@ def encode(
 def _make_lists(items: pa.Array, ends: Sequence[int], dtype: pa.ListType) -> pa.ListArray:
     """Lists of the items, each up to where the next begins."""
     return pa.ListArray.from_arrays(pa.array(np.array(ends, np.int32)), items, type=dtype)
+
+
+def list_rows(numbers: np.ndarray) -> pa.Array:
+    """Return numbers of shape (N,) as they are, and those of shape (N, …) as N lists of one length."""
+    flat = pa.array(numbers.reshape(-1))
+    if numbers.ndim == 1:
+        return flat
+    return pa.FixedSizeListArray.from_arrays(flat, math.prod(numbers.shape[1:]))
 
 
 def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:

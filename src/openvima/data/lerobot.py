@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from openvima import __version__
 from openvima.catalog.packs import recorded_assets
+from openvima.data.encoding import list_rows
 from openvima.data.lerobot_frames import (
     FrameLayout,
     Trajectory,
@@ -51,8 +52,6 @@ SOURCE_PATH = "meta/openvima.json"
 SOURCE_EPISODES_PATH = "meta/openvima.parquet"
 
 PixelFormat = Literal["yuv444p", "yuv420p"]
-PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
-
 # Each episode begins with a frame that needs no other, and no frames are out of order, so reading one never
 # decodes those before.
 _ENCODING = {"preset": "superfast", "tune": "zerolatency", "forced-idr": "1"}
@@ -173,7 +172,7 @@ class LerobotWriter:
                 for name, entry in statistics.items():
                     row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in entry.items()}
                 rows.append(row)
-                tables.append(_table(values))
+                tables.append(pa.table({name: list_rows(column) for name, column in values.items()}))
                 self._values.append(values)
                 self._num_frames = end
         for pattern, table in (
@@ -281,15 +280,6 @@ def _place(prefix: str, number: int) -> dict[str, int]:
     return {f"{prefix}/chunk_index": 0, f"{prefix}/file_index": number}
 
 
-def _table(values: Mapping[str, np.ndarray]) -> pa.Table:
-    """Make a table of columns of numbers, shape (T,), (T, 1), or (T, D), which become lists."""
-    columns = {}
-    for name, numbers in values.items():
-        flat, width = pa.array(numbers.reshape(-1)), numbers.size // len(numbers)
-        columns[name] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
-    return pa.table(columns)
-
-
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Write the list of prompts; LeRobot reads it with pandas and expects the texts as its index."""
     columns = {"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())}
@@ -333,8 +323,8 @@ class LerobotConfig:
 
     def __post_init__(self) -> None:
         settle(self, paths=("data", "out"), names=("tasks",))
-        if self.pixels not in PIXEL_FORMATS:
-            raise ConfigError(f"pixels is {self.pixels!r}; allowed are {', '.join(PIXEL_FORMATS)}.")
+        if self.pixels not in _QUALITY:
+            raise ConfigError(f"pixels is {self.pixels!r}; allowed are {', '.join(_QUALITY)}.")
 
 
 def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:

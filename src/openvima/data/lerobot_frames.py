@@ -27,7 +27,8 @@ class Trajectory:
     Args:
         prompt: Text and images.
         rgb: View name to images before each action, shape (T or more, 3, 128, 256), uint8.
-        states: Numbers of `observation.state` before each action, shape (T, D), float32.
+        states: Numbers of `observation.state` before each action, float32, shape (T, D), or (T,) of the tool
+            alone.
         actions: Shape (T, 12 or 5), float32.
         success: Whether the episode was solved.
     """
@@ -175,11 +176,11 @@ def _within_bounds(values: np.ndarray) -> np.ndarray:
 def step_trajectory(demo: Demonstration, *, has_joints: bool) -> Trajectory:
     """Return a demonstration with a frame for each step; without joints its states are the tool alone."""
     tool = END_EFFECTORS.index(demo.end_effector)
-    joints = [path[0] for path in demo.joint_paths] if has_joints else [()] * demo.num_steps
+    states = [(*path[0], tool) for path in demo.joint_paths] if has_joints else [tool] * demo.num_steps
     return Trajectory(
         demo.prompt,
         demo.rgb,
-        np.array([(*each, tool) for each in joints], np.float32),
+        np.array(states, np.float32),
         np.concatenate([*action_arrays(demo).values()], axis=1),
         demo.outcome.success,
     )

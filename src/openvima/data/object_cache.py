@@ -18,6 +18,7 @@ import pyarrow as pa
 from xxhash import xxh3_64
 
 from openvima.atomic_io import atomic_write, folder_lock
+from openvima.data.encoding import list_rows
 from openvima.data.manifest import CACHE_FOLDER, joint_hash, split_index
 from openvima.data.preprocessed import FalsePositives, PreprocessedEpisode, preprocess
 from openvima.data.reader import Dataset, split_hashes
@@ -225,12 +226,7 @@ def _arrow_type(dtype: str) -> pa.DataType:
 
 def _pack(fields: Mapping[str, Sequence[np.ndarray]]) -> pa.Array:
     """Put arrays of each row, which differ in length from row to row, into a column of lists of records."""
-    columns = []
-    for arrays in fields.values():
-        joined = np.concatenate(arrays)
-        numbers = pa.array(joined.reshape(-1))
-        width = prod(joined.shape[1:])
-        columns.append(numbers if joined.ndim == 1 else pa.FixedSizeListArray.from_arrays(numbers, width))
+    columns = [list_rows(np.concatenate(arrays)) for arrays in fields.values()]
     ends = np.cumsum([0, *map(len, next(iter(fields.values())))])
     records = pa.StructArray.from_arrays(columns, [*fields])
     return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), records)

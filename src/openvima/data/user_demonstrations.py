@@ -132,10 +132,13 @@ def record_demonstration(
     with storage_errors(folder, list(folder.glob("*.arrow"))):
         folder.mkdir(parents=True, exist_ok=True)
         with folder_lock(folder, timeout_s=_LOCK_S):
-            return _append(folder, demo, env_config)
+            _append(folder, demo, env_config)
+            config, paths = {"level": LEVEL, "domain": DOMAIN}, sorted(folder.glob("*.arrow"))
+            finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions())
+            return read_manifest(folder)["counts"]["episodes"]
 
 
-def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
+def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> None:
     """Write a shard with one episode, so that those before stay as they are.
 
     Raises:
@@ -154,7 +157,7 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
         seeds = shard.table(["seed"]).column("seed").to_pylist()
         if shard.info.env_config == info.env_config and demo.seed in seeds:
             if not (folder / MANIFEST_NAME).is_file():
-                return _finish(folder)  # recording it was interrupted
+                return  # recording it was interrupted
             raise DatasetError(
                 f"{folder} holds a demonstration of this episode already ({demo.task}, seed {demo.seed}); "
                 "go on with another seed or scene."
@@ -162,14 +165,6 @@ def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
     (folder / MANIFEST_NAME).unlink(missing_ok=True)
     with ShardWriter(folder / info.file_name, info) as writer:
         writer.write(demo)
-    return _finish(folder)
-
-
-def _finish(folder: Path) -> int:
-    """Write index and manifest; return the number of demonstrations."""
-    config, paths = {"level": LEVEL, "domain": DOMAIN}, sorted(folder.glob("*.arrow"))
-    finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions())
-    return read_manifest(folder)["counts"]["episodes"]
 
 
 def _find_moved(before: Scene, after: Scene) -> int | None:
