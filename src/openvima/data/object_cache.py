@@ -66,7 +66,7 @@ _SCALARS = {
     "descriptions": pa.list_(pa.string()),  # one for each prompt image; "" where there is none
 }
 _CHECKSUM = "checksum"  # of a row, compared at every read
-LeftOut = tuple[str, int]  # task and seed of a demonstration that a cache leaves out: its row has no steps
+LeftOut = tuple[str, int]  # task and seed of a demonstration that a cache leaves out
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ def write_cache_file(
 
     Args:
         path: The file.
-        episodes: What to write.
+        episodes: What to write; a demonstration that is left out gets a row without steps.
         kind: What their images show.
         source: Content hash of the demonstrations that they were made of.
         variant: How the episodes differ from these, as in `Variant`; empty if they do not.
