@@ -17,7 +17,6 @@ from openvima.report.published import (
     models_by_task,
     published_rate,
     published_rows,
-    task_rate,
     unusual_settings,
 )
 from openvima.report.table import Estimate, Line, Table
@@ -67,7 +66,7 @@ def family_table(results: Results, *, published: bool = True) -> Table:
         "Success rates (%) by task family, means over the tasks of each family (their number in brackets), "
         "with 95 % intervals. A task of several families counts in each."
     )
-    elsewhere = (f"{' '.join(BESIDE)} (published)",) if published else ()
+    elsewhere = (f"{BESIDE} (published)",) if published else ()
     return Table("families", caption, ("family", "level", *policies, *elsewhere), tuple(lines))
 
 
@@ -176,14 +175,14 @@ def result_table(results: Results, *, published: bool = False) -> Table:
         tasks = results.tasks(level)
         for task in tasks:
             own = [_mean(results, policy, level, tasks=(task,)) for policy in policies]
-            elsewhere = [task_rate(model, level, task) for model in models]
+            elsewhere = [model.written_task(level, task) for model in models]
             starts = bool(lines) and task == tasks[0]
             lines.append(Line(task, (level, *own, *elsewhere), starts_group=starts))
         means = (_mean(results, policy, level) for policy in policies)
         lines.append(Line("mean", (level, *means, *["–"] * len(models))))
     control = f", control {results.config['control']}" if "control" in results.config else ""
     about = f". {BY_TASK}" if published else ""
-    columns = ("task", "level", *policies, *(f"{model} {size} (published)" for model, size in models))
+    columns = ("task", "level", *policies, *(f"{each.model} {each.size} (published)" for each in models))
     return Table("results", f"success rates in % (95 % interval){control}{about}", columns, tuple(lines))
 
 
