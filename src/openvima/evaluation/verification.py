@@ -10,11 +10,11 @@ import numpy as np
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import recorded_assets
 from openvima.data.chat import UNREADABLE
-from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
+from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OpenVimaError, echo
 from openvima.evaluation.ablations import ablated_environment
 from openvima.evaluation.actions import ActionReplay, read_actions
-from openvima.evaluation.config import EvaluationConfig, cells
+from openvima.evaluation.config import DEFAULT_DEVICE, EvaluationConfig, cells
 from openvima.evaluation.results import (
     FILE_NAME,
     EpisodeOutcome,
@@ -27,6 +27,7 @@ from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERR
 from openvima.evaluation.runner import Report
 from openvima.input_files import read_json
 from openvima.multiprocess import imap_unordered
+from openvima.policies.naming import ORACLE
 
 VERIFICATION_NAME = "verification.json"
 _SIMULATOR = ("environments", "mujoco")  # versions that decide what an action does
@@ -89,9 +90,9 @@ def verify_results(
     results, text = read_results(path)
     try:
         stated, problems = _stated(results, text)
-        problems += _row_problems(results)
+        config = recorded_config(results, assets)
+        problems += _row_problems(results, config)
         _check_simulator(path, results.versions)
-        env_config = recorded_env_config(results, assets)
         actions, sha256 = read_actions(folder, results.rows)
     except (TypeError, AttributeError, LookupError, ValueError, ArithmeticError, RecursionError) as error:
         if isinstance(error, OpenVimaError):
@@ -100,7 +101,7 @@ def verify_results(
     if sha256 != results.actions_sha256:
         problems.append("the actions are not those that results.json was written with")
     if not problems:
-        problems += _replay_all(results, actions, env_config, workers, report)
+        problems += _replay_all(results, actions, config.env_config, workers, report)
     episodes = sum(row.episodes for row in results.rows)
     found = VerifiedResults(episodes, tuple(problems), stated)
     if found.is_verified:
@@ -143,19 +144,8 @@ def _stated(results: Results, text: str) -> tuple[str, list[str]]:
     return sha256, ["the file was edited after it was written: its digest differs"]
 
 
-def _row_problems(results: Results) -> Iterator[str]:
+def _row_problems(results: Results, whole: EvaluationConfig) -> Iterator[str]:
     """Compare the rows with the settings: no task, level or seed is missing, added or doubled."""
-    config = results.config
-    whole = EvaluationConfig(
-        ("oracle",),
-        (*config["tasks"],),
-        (*config["levels"],),
-        int(config["episodes"]),
-        int(config["seed"]),
-        env_config=replace(EnvConfig.from_record(config), assets=DEFAULT_ENV_CONFIG.assets),
-        ablations=(*config.get("ablations", ()),),
-        boxes=config.get("boxes"),
-    )
     last = whole.seed + whole.episodes - 1
     played: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for row in results.rows:
@@ -169,7 +159,7 @@ def _row_problems(results: Results) -> Iterator[str]:
     if not {*whole.asked_ablations} <= ablations <= {*whole.all_ablations}:
         yield "the ablations of the rows are not those of the settings"
     named = {policy for policy, ablation in played if not ablation}
-    if named != set(config["policies"]) or named != set(results.policies):
+    if named != set(results.config["policies"]) or named != set(results.policies):
         yield "the policies of the rows are not those of the settings"
 
 
@@ -183,8 +173,8 @@ def _check_simulator(path: Path, found: Mapping[str, str]) -> None:
             )
 
 
-def recorded_env_config(results: Results, assets: str | None) -> EnvConfig:
-    """Return the settings of the environments; assets are recorded without their path.
+def recorded_config(results: Results, assets: str | None = None) -> EvaluationConfig:
+    """Return the settings of an evaluation, without its policies; assets are recorded without their path.
 
     Args:
         results: The results.
@@ -193,8 +183,21 @@ def recorded_env_config(results: Results, assets: str | None) -> EnvConfig:
     Raises:
         AssetError: The results name a function as their assets, which is not run.
     """
-    given = EnvConfig.from_record(results.config)
-    return replace(given, assets=recorded_assets(given.assets) if assets is None else assets)
+    config = results.config
+    env_config = EnvConfig.from_record(config)
+    assets = recorded_assets(env_config.assets) if assets is None else assets
+    return EvaluationConfig(
+        (ORACLE,),
+        (*config["tasks"],),
+        (*config["levels"],),
+        int(config["episodes"]),
+        int(config["seed"]),
+        env_config=replace(env_config, assets=assets),
+        device=config.get("device", DEFAULT_DEVICE),
+        precision=config.get("precision"),
+        ablations=(*config.get("ablations", ()),),
+        boxes=config.get("boxes"),
+    )
 
 
 def _replay_all(
