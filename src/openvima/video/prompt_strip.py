@@ -178,14 +178,15 @@ def cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
         segm: Object ids, shape (H, W), uint8.
     """
     shown = (segm != BACKGROUND_ID) & (pixels != 255).any(axis=2)
-    if not shown.any():
+    box = Image.fromarray(shown).getbbox()
+    if box is None:
         return pixels
-    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    left, top, right, bottom = box
     margin = 4
-    height = int(rows[-1] - rows[0]) + 1 + 2 * margin
-    width = max(int(columns[-1] - columns[0]) + 1 + 2 * margin, height)
+    height = bottom - top + 2 * margin
+    width = max(right - left + 2 * margin, height)
     height = max(height, width // 2)
-    top = int(rows[0] + rows[-1] + 1 - height) // 2
-    left = int(columns[0] + columns[-1] + 1 - width) // 2
-    padded = np.pad(pixels, ((height, height), (width, width), (0, 0)), constant_values=255)
-    return padded[top + height : top + 2 * height, left + width : left + 2 * width]
+    left, top = (left + right - width) // 2, (top + bottom - height) // 2
+    cut = Image.new("RGB", (width, height), PAPER)
+    cut.paste(Image.fromarray(pixels), (-left, -top))
+    return np.asarray(cut)
