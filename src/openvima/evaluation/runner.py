@@ -318,15 +318,14 @@ def _play_chats(batches: Sequence[Batch], num_threads: int) -> Iterator[tuple[Ba
 def _play_chat(batch: Batch, policy: VlmPolicy, seed: int) -> PlayedEpisode:
     chat = VlmRolloutPolicy(policy.new_session(), batch.ablation, name=batch.policy)
     with policy.client.turn:
-        env = batch.env_config.make(batch.task, batch.level, domain="eval")
-        (played,) = roll_out([env], [seed], chat, may_fail=batch.may_fail)
+        (played,) = roll_out([batch.make_env()], [seed], chat, may_fail=batch.may_fail)
     return replace(played, said=chat.said[0])
 
 
 def play_batch(batch: Batch, count: Callable[[int], None]) -> list[PlayedEpisode]:
     """Run one batch in a worker process, possibly on another machine."""
     with one_thread(batch):
-        envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+        envs = [batch.make_env() for _ in batch.seeds]
         played = roll_out(envs, batch.seeds, load_rollout_policy(batch), may_fail=batch.may_fail)
     count(len(played))
     return played
@@ -413,7 +412,7 @@ def score(
     begun: set[str] = set()
     with one_word_warning():
         for batch in plan(config):
-            envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+            envs = [batch.make_env() for _ in batch.seeds]
             given = policies.get(batch.policy)
             rollout_policy = (
                 load_rollout_policy(batch)

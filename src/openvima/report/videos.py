@@ -201,7 +201,7 @@ def record_clip(batch: Batch, count: Callable[[int], None]) -> Clip:
     from openvima.video.prompt_strip import thumbnail
     from openvima.video.recorder import SceneRenderer
 
-    env = batch.env_config.make(batch.task, batch.level, domain="eval", realtime=True)
+    env = batch.make_env(realtime=True)
     env.reset(seed=batch.first_seed)
     poster = png(Image.fromarray(SceneRenderer(env, enlarge=2).draw(env.scene)))
     prompt = tuple(part if isinstance(part, str) else png(thumbnail(part)) for part in env.prompt.sequence())
