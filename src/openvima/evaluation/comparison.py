@@ -9,7 +9,7 @@ from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.errors import ConfigError, UnknownPolicyError, brief_repr, unknown_name
 from openvima.evaluation.ablations import scenes_of
-from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.results import EpisodeOutcome, Results, Row, grouped
 from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.evaluation.statistics import Interval, PairCounts, holm, mcnemar, mean_difference
 
@@ -305,9 +305,9 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 
 def _rows_of(results: Results, name: str) -> Rows:
     """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
-    rows: dict[str, list[Row]] = {}
-    for row in results.rows:
-        rows.setdefault(ABLATION_SEPARATOR.join(filter(None, (row.policy, row.ablation))), []).append(row)
+    rows = grouped(
+        (ABLATION_SEPARATOR.join(filter(None, (row.policy, row.ablation))), row) for row in results.rows
+    )
     if name not in rows:
         raise UnknownPolicyError(unknown_name("policy", name, rows))
     order = results.levels()

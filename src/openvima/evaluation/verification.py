@@ -20,6 +20,7 @@ from openvima.evaluation.results import (
     EpisodeOutcome,
     Results,
     Row,
+    grouped,
     read_results,
     versions,
 )
@@ -147,9 +148,8 @@ def _stated(results: Results, text: str) -> tuple[str, list[str]]:
 def _row_problems(results: Results, whole: EvaluationConfig) -> Iterator[str]:
     """Compare the rows with the settings: no task, level or seed is missing, added or doubled."""
     last = whole.seed + whole.episodes - 1
-    played: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    played = grouped(((row.policy, row.ablation), (row.task, row.level)) for row in results.rows)
     for row in results.rows:
-        played.setdefault((row.policy, row.ablation), []).append((row.task, row.level))
         if [outcome.seed for outcome in row.outcomes] != [*range(whole.seed, last + 1)]:
             yield f"{_named(row)} has other seeds than {whole.seed} to {last}"
     for (policy, ablation), found in played.items():

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from openvima.evaluation.ablations import ablation_parts, scenes_of
-from openvima.evaluation.results import Results
+from openvima.evaluation.results import Results, grouped
 from openvima.evaluation.statistics import (
     Interval,
     PairCounts,
@@ -56,9 +56,7 @@ class Point:
 def study_points(plan: Plan) -> list[Point]:
     """Read the evaluations of a study; points in the order of runs, ablations and levels."""
     study = plan.study
-    found: dict[str, list[Results]] = {}
-    for evaluation in plan.evaluations:
-        found.setdefault(evaluation.run.label, []).append(Results.read(evaluation.config.out))
+    found = grouped((each.run.label, Results.read(each.config.out)) for each in plan.evaluations)
     points = []
     for run in study.runs:
         has_plain, results = (run.evaluation or study.evaluation).plain, found[run.label]
@@ -138,10 +136,7 @@ def _outcomes(scores: _Scores, level: str) -> list[dict[str, dict[int, bool]]]:
 
 def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:
     """Read the costs of the trainings, by label; those that others start from under an empty one."""
-    costs: dict[str, list[dict[str, Any]]] = {}
-    for training in plan.all_trainings:
-        costs.setdefault(training.run, []).append(read_json(training.config.out / COST_FILE))
-    return costs
+    return grouped((each.run, read_json(each.config.out / COST_FILE)) for each in plan.all_trainings)
 
 
 def study_page(
