@@ -16,7 +16,7 @@ from openvima.errors import MAX_CHARACTERS, DatasetError, brief_repr, cut, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
 from openvima.html import notebook_html
 from openvima.imports import versions_of
-from openvima.input_files import as_path, read_text
+from openvima.input_files import MALFORMED, as_path, read_text
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -295,7 +295,7 @@ def read_results(path: Path) -> tuple[Results, str]:
             rows = tuple(_row_from_record(record) for record in content["rows"])
             described = (content["config"], content["versions"], content["policies"])
             return Results(rows, *described, content.get("actions_sha256", "")), text
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except MALFORMED as error:
         raise DatasetError(
             f"{path} is damaged ({echo(repr(error))}); evaluate again with --force."
         ) from error

@@ -26,7 +26,7 @@ from openvima.evaluation.results import (
 )
 from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR, play
 from openvima.evaluation.runner import Report
-from openvima.input_files import read_json
+from openvima.input_files import MALFORMED, read_json
 from openvima.multiprocess import imap_unordered
 from openvima.policies.naming import ORACLE
 
@@ -95,7 +95,7 @@ def verify_results(
         problems += _row_problems(results, config)
         _check_simulator(path, results.versions)
         actions, sha256 = read_actions(folder, results.rows)
-    except (TypeError, AttributeError, LookupError, ValueError, ArithmeticError, RecursionError) as error:
+    except MALFORMED as error:
         if isinstance(error, OpenVimaError):
             raise
         raise DatasetError(f"{path} is damaged ({echo(repr(error))}).") from None
@@ -126,7 +126,7 @@ def is_marked_verified(path: Path) -> bool:
         if _stated(results, text) != (mark, []):
             return False
         return read_actions(folder, results.rows)[1] == results.actions_sha256
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
+    except (OSError, *MALFORMED):
         return False
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from openvima.errors import DatasetError
+from openvima.input_files import MALFORMED
 from openvima.policies.naming import METRICS_FILE
 
 Curve = Sequence[tuple[float, float]]
@@ -90,7 +91,7 @@ def read_charts(run: Path) -> list[Chart]:
             for name, value in record.items():
                 if isinstance(value, int | float) and not isinstance(value, bool):
                     stages.setdefault(stage, {}).setdefault(name, []).append((step, float(value)))
-        except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        except MALFORMED as error:
             raise DatasetError(f"{metrics}, line {number}, is no record with a step ({error!r}).") from error
     charts = []
     for stage, values in stages.items():

@@ -18,6 +18,7 @@ from PIL import Image
 from openvima.atomic_io import atomic_path, atomic_write_file
 from openvima.errors import DatasetError, ShapeError, echo
 from openvima.imports import import_extra
+from openvima.input_files import MALFORMED
 
 # Every browser plays 4:2:0 chroma subsampling; the rest keeps textures clear at about 100 kB for 5 s.
 _PIXELS, _OPTIONS = "yuv420p", {"crf": "21", "preset": "medium"}
@@ -198,7 +199,7 @@ def load_clips(folder: Path) -> tuple[Clip, ...]:
         return ()
     try:
         return tuple(_clip(record, index.parent) for record in json.loads(index.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, *MALFORMED) as error:
         raise DatasetError(
             f"{index} is damaged ({error}); delete {index.parent} and evaluate again."
         ) from error
