@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from openvima.data import GenerateConfig
 from openvima.data.subsets import SubsetConfig
 from openvima.errors import ConfigError
 from openvima.evaluation.config import DEFAULT_DEVICE, EvaluationConfig
@@ -67,7 +68,7 @@ class Plan:
         out: Its folder.
         how: `workers`, `engine` and `address` of the stages that run in parallel, as for `run_study`.
         device: Where networks are trained and act; None trains on a GPU if there is one, and acts on a CPU.
-        data: Folder of each data set.
+        data: Generation of each data set.
         subsets: Fractions of data sets, by folder.
         initial: Trainings that others start from, by folder.
         trainings: Trainings of the runs.
@@ -80,7 +81,7 @@ class Plan:
     out: Path
     how: Mapping[str, Any]
     device: str | None = None
-    data: dict[Demonstrations, Path] = field(default_factory=dict)
+    data: dict[Demonstrations, GenerateConfig] = field(default_factory=dict)
     subsets: dict[Path, Subset] = field(default_factory=dict)
     initial: dict[Path, Training] = field(default_factory=dict)
     trainings: list[Training] = field(default_factory=list)
@@ -144,7 +145,14 @@ def _plan_training(plan: Plan, run: Run, name: str, seed: int) -> Path:
     """Plan the training of a run and seed, with its demonstrations and initial weights; return its folder."""
     demonstrations = run.data or plan.study.data
     assert demonstrations is not None  # checked by `Study`
-    data = plan.data.setdefault(demonstrations, plan.out / "data" / str(1 + len(plan.data)))
+    generated = GenerateConfig(
+        out=plan.out / "data" / str(1 + len(plan.data)),
+        tasks=demonstrations.tasks,
+        episodes=demonstrations.episodes,
+        env_config=demonstrations.env_config,
+        **plan.how,
+    )
+    data = plan.data.setdefault(demonstrations, generated).out
     if run.data_fraction != 1:
         source, data = data, data.with_name(f"{data.name}-{run.data_fraction:g}-seed-{seed}")
         plan.subsets[data] = SubsetConfig(source, data, seed=seed), run.data_fraction

@@ -2,13 +2,13 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file, folder_lock, is_lock_file
 from openvima.catalog.packs import load_assets
-from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data import Dataset, generate
 from openvima.data.manifest import is_finished
 from openvima.data.subsets import sample
 from openvima.errors import ConfigError, InputFileError, differences
@@ -21,7 +21,7 @@ from openvima.policies.base import require_torch
 from openvima.report.videos import require_extra
 from openvima.studies.plan import COST_FILE, Plan, Training, plan_study, record_of
 from openvima.studies.results import study_costs, study_page, study_points
-from openvima.studies.study import Demonstrations, Study, StudyInputs
+from openvima.studies.study import Study, StudyInputs
 from openvima.training.config import flatten
 
 SETTINGS_FILE = "settings.json"
@@ -108,8 +108,8 @@ def check_plan(plan: Plan) -> None:
     """
     require_extra()
     load_assets(plan.inputs.assets)
-    for demonstrations, out in plan.data.items():
-        _generate_config(demonstrations, out).resolved_tasks()
+    for config in plan.data.values():
+        config.resolved_tasks()
     if plan.trainings:
         require_torch("training")
         from openvima.training.building import resolve
@@ -157,10 +157,10 @@ def _run_stages(plan: Plan, say: Callable[[str], None]) -> Iterator[str]:
     def counting(what: str) -> Report:
         return lambda done, total, _: say(f"{what}: {done:,} of {total:,}")
 
-    for demonstrations, out in plan.data.items():
-        if not is_finished(out):
-            generate(replace(_generate_config(demonstrations, out), **plan.how), counting("generating"))
-        yield f"demonstrations in {out.name}"
+    for config in plan.data.values():
+        if not is_finished(config.out):
+            generate(config, counting("generating"))
+        yield f"demonstrations in {config.out.name}"
     for out, subset in plan.subsets.items():
         if not is_finished(out):
             sample(*subset, report=counting("sampling"))
@@ -204,12 +204,3 @@ def train_one(training: Training, count: Callable[[int], None]) -> None:
         **read_costs(config.out),
     }
     atomic_write_file(config.out / COST_FILE, json.dumps(costs, indent=1) + "\n")
-
-
-def _generate_config(demonstrations: Demonstrations, out: Path) -> GenerateConfig:
-    return GenerateConfig(
-        out=out,
-        tasks=demonstrations.tasks,
-        episodes=demonstrations.episodes,
-        env_config=demonstrations.env_config,
-    )
