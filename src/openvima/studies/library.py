@@ -1,7 +1,6 @@
 """The studies of the package, which `studies.yaml` describes, and those of users."""
 
 import re
-from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from itertools import product
@@ -153,4 +152,4 @@ def _choices(value: Any, names: Mapping[str, Any]) -> Iterator[Mapping[str, Any]
     repeated = _fill(value.get("for", {}), names) if isinstance(value, dict) else {}
     for values in product(*repeated.values()):
         chosen = dict(zip(repeated, values, strict=True))
-        yield ChainMap(chosen, names)  # type: ignore[arg-type]  # names compute some values when asked
+        yield {**names, **chosen}
