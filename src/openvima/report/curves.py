@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.errors import DatasetError
@@ -45,11 +45,7 @@ def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
         DatasetError: A run has no record, or a damaged one.
     """
     labels = [f"{label} · " for label in run_labels(runs)] if len(runs) > 1 else [""] * len(runs)
-    return [
-        replace(chart, title=label + chart.title)
-        for label, run in zip(labels, runs, strict=True)
-        for chart in read_charts(run)
-    ]
+    return [chart for label, run in zip(labels, runs, strict=True) for chart in read_charts(run, label)]
 
 
 def run_labels(folders: Sequence[Path]) -> list[str]:
@@ -62,13 +58,14 @@ def run_labels(folders: Sequence[Path]) -> list[str]:
     return [f"{part[-1]} {number}" for number, part in enumerate(parts, start=1)]
 
 
-def read_charts(run: Path) -> list[Chart]:
+def read_charts(run: Path, label: str = "") -> list[Chart]:
     """Read the charts of a training run: losses and accuracies over the steps of each stage.
 
     Args:
         run: A run folder or its training record: a file with one JSON object a line, its "step", perhaps the
             "name" of its stage, and numbers. Those with "loss" or "accuracy" in their names are charted;
             "validation_" means held out.
+        label: Begins the titles.
 
     Returns:
         The charts.
@@ -99,7 +96,7 @@ def read_charts(run: Path) -> list[Chart]:
             chosen = _chosen(sorted(name for name in values if kind in name))
             if chosen:
                 curves: dict[str, Curve] = {_label(name, kind): values[name] for name in chosen}
-                charts.append(Chart(f"{_stage_title(stage)}: {kind}", curves, percent))
+                charts.append(Chart(f"{label}{_stage_title(stage)}: {kind}", curves, percent))
     return charts
 
 
