@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 from openvima.errors import UnknownTaskError
@@ -60,8 +61,14 @@ def family_table(results: Results, *, published: bool = True) -> Table:
             cells = [_mean(results, policy, level, tasks=tasks) for policy in policies]
             rate = published_rate(level, tasks) if published else None
             elsewhere = ["–" if rate is None else f"{rate:.1f}"] if published else []
-            name = f"{family_name(family)} ({len(tasks)})"
-            lines.append(Line(name, (level, *cells, *elsewhere), starts_group=index == 0 and bool(lines)))
+            name = family.replace("_", " ").replace("one shot", "one-shot")
+            lines.append(
+                Line(
+                    f"{name} ({len(tasks)})",
+                    (level, *cells, *elsewhere),
+                    starts_group=index == 0 and bool(lines),
+                )
+            )
     caption = (
         "Success rates (%) by task family, means over the tasks of each family (their number in brackets), "
         "with 95 % intervals. A task of several families counts in each."
@@ -74,16 +81,10 @@ def _tasks(results: Results, level: str) -> dict[str, list[str]]:
     """Evaluated tasks of each family at a level."""
     found: dict[str, list[str]] = {family: [] for family in FAMILIES}
     for task in results.tasks(level):
-        for family in _families(task):
-            found.setdefault(family, []).append(task)
+        with suppress(UnknownTaskError):  # not registered here
+            for family in task_spec(task).families:
+                found.setdefault(family, []).append(task)
     return {family: tasks for family, tasks in found.items() if tasks}
-
-
-def _families(task: str) -> tuple[str, ...]:
-    try:
-        return task_spec(task).families
-    except UnknownTaskError:
-        return ()
 
 
 def _mean(
@@ -97,11 +98,6 @@ def _mean(
     mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
     fewer = f"{len(rows)} of {len(tasks)} tasks" if len(rows) < len(tasks) else ""
     return Estimate(mean, interval, mark=fewer)
-
-
-def family_name(family: str) -> str:
-    """Name of a family as words."""
-    return family.replace("_", " ").replace("one shot", "one-shot")
 
 
 _CONFIRMED = "Measured outcomes are confirmed by replaying the recorded actions; who acted is declared."

@@ -1,4 +1,4 @@
-"""Sentences and numbers of the report: what levels and policies are, how rates are written."""
+"""Sentences and numbers of the report: what policies are, how rates are written."""
 
 from collections.abc import Iterable, Mapping
 from itertools import cycle
@@ -10,28 +10,6 @@ from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.report.published import PUBLISHED_SETTINGS, unusual_settings
 
-LEVEL_NAMES = {
-    "train": "As in training",
-    "L1": "Placement generalisation",
-    "L2": "Combinatorial generalisation",
-    "L3": "Novel objects",
-    "L4": "Novel tasks",
-    "L5": "Clutter",
-    "L6": "Composition",
-    "L7": "Language",
-    "L8": "Long horizon",
-}
-LEVEL_MEANINGS = {
-    "train": "Objects, textures and tasks of the training set, on fresh seeds.",
-    "L1": "Objects, textures and tasks of the training set, in new placements.",
-    "L2": "Training objects and textures in new combinations.",
-    "L3": "New shapes, and textures from the whole catalogue.",
-    "L4": "New kinds of prompts, with new objects and textures.",
-    "L5": "The training tasks with the objects of L3, among three to ten more with look-alikes.",
-    "L6": "Two and three instructions of trained tasks in one prompt.",
-    "L7": "Referring expressions: relations, superlatives, exceptions, numbers and alternatives.",
-    "L8": "Tasks of six to twelve steps, with all objects and textures.",
-}
 _ROLES = {
     "oracle": "Scripted solver with access to the scene: the upper bound.",
     "random": "Random actions: the lower bound.",
