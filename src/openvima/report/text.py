@@ -8,7 +8,6 @@ from openvima.evaluation.ablations import INPUT_ABLATIONS, names_in
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import TRAINED_KINDS
-from openvima.report.published import PUBLISHED_SETTINGS, unusual_settings
 
 _ROLES = {
     "oracle": "Scripted solver with access to the scene: the upper bound.",
@@ -20,7 +19,6 @@ _ROLES = {
     "remote": "Policy behind a server: observes the prompt and two camera images.",
 }
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
-_USUAL_ASSETS = {"assets": "procedural", "compat": False}
 _NUM_COLOURS = 6  # in the style sheet, for all other policies
 
 
@@ -62,24 +60,6 @@ def _segmentation(record: Mapping[str, Any]) -> str:
     if not isinstance(asked, list):
         return ""
     return " The segmentation was sent to it." if "segm" in asked else " It got no segmentation."
-
-
-def answers(results: Results, policy: str) -> str:
-    """Say what the answers of a vision-language model cost and what was wrong with them; empty for others."""
-    found = results.policies.get(policy, {}).get("answers")
-    if not isinstance(found, dict):
-        return ""
-    costs = (
-        f"{found['requests']:,} requests, {found['tokens_in']:,} tokens in and {found['tokens_out']:,} out, "
-        f"answered by {', '.join(map(str, found['models']))}."
-    )
-    groups = [
-        f"{group['kind']}"
-        + (f" (median {group['median']:g} {group['unit']})" if "unit" in group else "")
-        + f" {group['episodes']}"
-        for group in found["mistakes"]
-    ]
-    return costs + (f" First mistake of the failed episodes: {', '.join(groups)}." if groups else "")
 
 
 def series_colours(results: Results) -> dict[str, str]:
@@ -158,17 +138,6 @@ def headline(results: Results) -> str:
     first = (trained or means)[0]
     tasks = counted(len(first.tasks), "task")
     return f"{first.policy} solves {percent(first.mean)} of {first.level} episodes ({tasks})"
-
-
-def measured(results: Results) -> str:
-    """Counts of policies, tasks, levels and episodes as a sentence."""
-    return (
-        f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
-        f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, "
-        f"{episodes_each(results.rows)} each; "
-        f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
-        "never uses." + unusual_settings(results, {**PUBLISHED_SETTINGS, **_USUAL_ASSETS})
-    )
 
 
 def episodes_each(rows: Iterable[Row]) -> str:
