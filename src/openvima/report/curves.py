@@ -96,7 +96,9 @@ def read_charts(run: Path, label: str = "") -> list[Chart]:
             chosen = _chosen(sorted(name for name in values if kind in name))
             if chosen:
                 curves: dict[str, Curve] = {_label(name, kind): values[name] for name in chosen}
-                charts.append(Chart(f"{label}{_stage_title(stage)}: {kind}", curves, percent))
+                # "Cloning" for "2-cloning"
+                title = stage.lstrip("0123456789-").capitalize() or stage
+                charts.append(Chart(f"{label}{title}: {kind}", curves, percent))
     return charts
 
 
@@ -104,11 +106,6 @@ def _chosen(names: list[str]) -> list[str]:
     """All metrics of a kind, or the held-out ones alone where all would be too many."""
     held_out = [name for name in names if name.startswith(_HELD_OUT)]
     return held_out[:_MOST_CURVES] if held_out and len(names) > _MOST_CURVES else names[:_MOST_CURVES]
-
-
-def _stage_title(name: str) -> str:
-    """Name of a stage without its number, such as "Cloning" for "2-cloning"."""
-    return name.lstrip("0123456789-").capitalize() or name
 
 
 def _label(name: str, kind: str) -> str:

@@ -181,11 +181,11 @@ def save_clips(clips: Sequence[Clip], folder: Path) -> Path:
     records = []
     for clip in clips:
         atomic_write_file(folder / clip.file_name, clip.video)
-        prompt = [part if isinstance(part, str) else {"png": _text(part)} for part in clip.prompt]
-        record = asdict(clip) | {"prompt": prompt, "poster": _text(clip.poster)}
+        record = asdict(clip) | {"poster": _text(clip.poster)}
         del record["video"]
         records.append(record)
-    return atomic_write_file(folder / _INDEX, json.dumps(records, indent=1, ensure_ascii=False) + "\n")
+    content = json.dumps(records, indent=1, ensure_ascii=False, default=lambda image: {"png": _text(image)})
+    return atomic_write_file(folder / _INDEX, content + "\n")
 
 
 def load_clips(folder: Path) -> tuple[Clip, ...]:

@@ -84,9 +84,9 @@ def draw_prompt_strip(
     """
     margin = max(6, font_size // 2)
     typeface = font(font_size)
-    pieces = [_piece(part, image_height, typeface, font_size) for part in prompt_pieces(prompt)]
+    pieces = [_piece(part, image_height, font_size) for part in prompt_pieces(prompt)]
     if any(len(row) > len(pieces) for _, row in weights):
-        pieces.append(_piece("(end)", image_height, typeface, font_size))
+        pieces.append(_piece("(end)", image_height, font_size))
     lines = _wrap(pieces, width - 2 * margin)
     heights = [max((piece.height for piece in line), default=1) for line in lines]
     attended = _ROW_HEIGHT * len(weights) + (4 if weights else 0)
@@ -148,10 +148,10 @@ def font(size: int, *, bold: bool = False) -> "ImageFont.FreeTypeFont | ImageFon
     return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", name), size)
 
 
-def _piece(part: "str | PromptImage", image_height: int, typeface, font_size: int) -> _Piece:
+def _piece(part: "str | PromptImage", image_height: int, font_size: int) -> _Piece:
     space = font_size // 3
     if isinstance(part, str):
-        width = int(np.ceil(typeface.getlength(part)))
+        width = math.ceil(font(font_size).getlength(part))
         return _Piece(part, width, font_size, 0 if part[0] in _CLOSING else space)
     picture = thumbnail(part, image_height)
     return _Piece(picture, picture.width, picture.height, space)
