@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import recorded_assets
 from openvima.data.chat import UNREADABLE
 from openvima.env.config import EnvConfig
-from openvima.errors import DatasetError, OpenVimaError, echo
+from openvima.errors import DatasetError, OpenVimaError, differences, echo
 from openvima.evaluation.ablations import ablated_environment
 from openvima.evaluation.actions import ActionReplay, read_actions
 from openvima.evaluation.config import DEFAULT_DEVICE, EvaluationConfig, cells
@@ -232,7 +232,7 @@ def replay_episodes(job: _Replay, count: Callable[[int], None]) -> list[str]:
     again = play(envs, seeds, ActionReplay(job.actions))
     count(len(again))
     return [
-        f"{_named(row)}, seed {given.seed}: {difference}"
+        f"{_named(row)}, seed {given.seed}, replayed: {difference}"
         for given, own in zip(row.outcomes, again, strict=True)
         if (difference := _difference(given, own))
     ]
@@ -243,10 +243,7 @@ def _difference(given: EpisodeOutcome, own: EpisodeOutcome) -> str:
     if own.kind == NO_ORACLE_ACTION and given.kind.startswith(_ENDED_EARLY):
         own = replace(own, kind=given.kind, reason=given.reason)
     own = replace(own, near_ties=given.near_ties)
-    names = [field.name for field in fields(own) if getattr(own, field.name) != getattr(given, field.name)]
-    return ", ".join(
-        f"{name} is {echo(str(getattr(given, name)))}, replayed {getattr(own, name)}" for name in names
-    )
+    return ", ".join(differences(asdict(given), asdict(own)))
 
 
 def _named(row: Row) -> str:
