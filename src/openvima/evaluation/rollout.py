@@ -63,7 +63,6 @@ class EpisodeSlot:
         self.near_ties = 0
         self.outcome: EpisodeOutcome | None = None
         self.observation: dict[str, Any] | None = begin_episode(env, start)  # None once the episode is over
-        self.seed = start.seed if isinstance(start, Episode) else start
 
     def step(self, decision: Decision) -> None:
         """Take one step, unless there is no usable action; then the episode has failed."""
@@ -111,7 +110,7 @@ class EpisodeSlot:
     def _outcome(self, success: bool, reason: str = "", kind: str = "") -> EpisodeOutcome:
         episode = self.env.episode
         return EpisodeOutcome(
-            self.seed,
+            episode.seed,
             success,
             len(self.actions),
             reason,
