@@ -80,7 +80,7 @@ class EpisodeRecorder(ExitStack):
         self._renderer, self._title, self._width = SceneRenderer(env), title, 256 * ENLARGE
         self._path, self._explain = path, explain
         self._panel: np.ndarray | None = None
-        self._strip: np.ndarray | None = None
+        self._strip = np.zeros((0, self._width, 3), np.uint8)
         self._write_frame: WriteFrame | None = None  # once the video is open
         self._last = VideoFrame(env.scene, HOME)
         if with_prompt:
@@ -111,12 +111,11 @@ class EpisodeRecorder(ExitStack):
         self._write(self._compose(outcome, colour), _STILL_END_S)
 
     def _compose(self, outcome: str = "", colour: Colour = MUTED) -> np.ndarray:
-        caption = _caption(self._title, self._width, outcome, colour)
         scene = self._renderer.draw(self._last.scene, self._last.joints)
+        shown = np.concatenate([scene, _caption(self._title, self._width, outcome, colour)])
         if self._panel is not None:
-            parts = [scene] if caption is None else [scene, caption]
-            scene, caption = _beside(np.concatenate(parts), self._panel), None
-        return np.concatenate([part for part in (self._strip, scene, caption) if part is not None])
+            shown = _beside(shown, self._panel)
+        return np.concatenate([self._strip, shown])
 
     def _draw_explanation(
         self, env: TabletopEnv, explanation: Explanation, *, is_decided: bool = True
@@ -147,10 +146,9 @@ def _beside(scene: np.ndarray, panel: np.ndarray) -> np.ndarray:
     return both
 
 
-def _caption(title: str, width: int, outcome: str, colour: Colour) -> np.ndarray | None:
-    if not title:
-        return None
-    line = Image.new("RGB", (width, 32), PAPER)
+def _caption(title: str, width: int, outcome: str, colour: Colour) -> np.ndarray:
+    """Draw title and outcome in a line; without a title it has no height."""
+    line = Image.new("RGB", (width, 32 if title else 0), PAPER)
     draw = ImageDraw.Draw(line)
     draw.text((11, 16), title, font=font(15), fill=MUTED, anchor="lm")
     if outcome:
