@@ -329,17 +329,10 @@ def _difference(level: str, task: str, pairs: tuple[PairCounts, ...]) -> Differe
     difference, interval = mean_difference(pairs)
     total = PairCounts.sum(pairs)
     p_value, p_mid = mcnemar(total.only_a, total.only_b)
+    rate_a = sum((pair.both + pair.only_a) / pair.episodes for pair in pairs) / len(pairs)
+    rate_b = sum((pair.both + pair.only_b) / pair.episodes for pair in pairs) / len(pairs)
     return Difference(
-        level=level,
-        task=task,
-        pairs=pairs,
-        rate_a=sum((pair.both + pair.only_a) / pair.episodes for pair in pairs) / len(pairs),
-        rate_b=sum((pair.both + pair.only_b) / pair.episodes for pair in pairs) / len(pairs),
-        difference=difference,
-        interval=interval,
-        p_value=p_value,
-        p_mid=p_mid,
-        p_holm=p_value,
+        level, task, pairs, rate_a, rate_b, difference, interval, p_value, p_mid, p_holm=p_value
     )
 
 

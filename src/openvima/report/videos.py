@@ -214,18 +214,8 @@ def record_clip(batch: Batch, count: Callable[[int], None]) -> Clip:
         )
         video = path.read_bytes()
     count(1)
-    return Clip(
-        policy=batch.policy,
-        task=batch.task,
-        level=batch.level,
-        seed=batch.first_seed,
-        success=outcome.success,
-        steps=outcome.steps,
-        reason=outcome.reason,
-        prompt=prompt,
-        video=video,
-        poster=poster,
-    )
+    ended = (outcome.success, outcome.steps, outcome.reason)
+    return Clip(*batch.episode, *ended, prompt=prompt, video=video, poster=poster)
 
 
 def find_metrics(sources: Sequence[PolicySource]) -> list[Path]:
