@@ -11,7 +11,7 @@ import openvima
 from openvima.catalog import Pool
 from openvima.evaluation.recording import save_episode_image
 from openvima.evaluation.statistics import wilson_interval
-from openvima.report.published import models_by_task, published_tasks, task_rate
+from openvima.report.published import models_by_task
 from openvima.tasks import TaskSpec, list_tasks, task_spec
 from openvima.tasks.registry import oracle_record
 
@@ -151,9 +151,9 @@ def score_table(spec: TaskSpec, scores: Mapping[str, Mapping[tuple[str, str], Sc
     for policy, rates in scores.items():
         lines.append(f"| {policy} | {' | '.join(rated(rates.get((spec.name, level))) for level in levels)} |")
     for model in models_by_task():
-        rates = [task_rate(model, level, spec.name) for level in levels]
-        if any(published_tasks(level, model).get(spec.name) is not None for level in levels):
-            lines.append(f"| {' '.join(model)}, published | {' | '.join(rates)} |")
+        rates = [model.written_task(level, spec.name) for level in levels]
+        if any(rate != "–" for rate in rates):
+            lines.append(f"| {model.model} {model.size}, published | {' | '.join(rates)} |")
     return lines
 
 

@@ -91,6 +91,8 @@ def cache_dir() -> Path:
 if TYPE_CHECKING:
     import PIL.Image
 
+# What a record of any content raises where it is not of the form that is read.
+MALFORMED = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 MAX_TEXT_BYTES = 64 * 1024  # of a config; the longest of the package has 10 kB
 
 

@@ -33,7 +33,7 @@ class Env:
         self.progress = SimpleNamespace(open_goals=(1,))
 
     def reset(self, seed):
-        self.steps = 0
+        self.steps, self.episode.seed = 0, seed
         return {"seed": seed, "step": 0}, {}
 
     def observe(self):

@@ -14,7 +14,7 @@ from openvima.evaluation.results import POLICY_ERROR, EpisodeOutcome, Results, R
 from openvima.report import write_report
 from openvima.report.curves import read_charts, read_run_charts
 from openvima.report.page import default_command
-from openvima.report.published import published_tasks
+from openvima.report.published import beside
 from openvima.report.text import role
 from openvima.video.encoder import load_clips, save_clips
 from small_data_sets import outcomes
@@ -163,7 +163,7 @@ def test_ablations_stand_beside_the_score(results, tmp_path):
 
 def rows_of_all_tasks(results, level):
     """Rows as if a policy had been evaluated on all tasks of a level."""
-    return tuple(replace(results.rows[0], task=task, level=level) for task in published_tasks(level))
+    return tuple(replace(results.rows[0], task=task, level=level) for task in beside().tasks[level])
 
 
 def test_published_means_are_those_of_the_same_tasks(text, results, tmp_path):

@@ -44,7 +44,7 @@ def study_of(*runs: Run, **values: object) -> Study:
 def test_fractions_differ_by_seed_and_share_their_source() -> None:
     study = study_of(Run("all"), Run("tenth", data_fraction=0.1))
     plan = plan_study(study, INPUTS, OUT, seeds=2)
-    assert list(plan.data.values()) == [OUT / "data/1"]
+    assert [config.out for config in plan.data.values()] == [OUT / "data/1"]
     assert [(s.out.name, s.seed) for s, _ in plan.subsets.values()] == [
         ("1-0.1-seed-0", 0),
         ("1-0.1-seed-1", 1),

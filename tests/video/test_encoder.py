@@ -9,7 +9,7 @@ import pytest
 
 from openvima.errors import ShapeError
 from openvima.scene import RenderedPrompt
-from openvima.video.encoder import VideoWriter
+from openvima.video.encoder import open_video
 from openvima.video.prompt_strip import draw_prompt_strip, prompt_pieces, thumbnail
 from small_data_sets import frames_of
 
@@ -19,9 +19,9 @@ def plain(colour: tuple[int, int, int], height: int = 48, width: int = 64) -> np
 
 
 def write_video(path: Path, frames: Sequence[np.ndarray]) -> Path:
-    with VideoWriter(path, frames[0].shape[1], frames[0].shape[0]) as video:
+    with open_video(path, frames[0].shape[1], frames[0].shape[0], frames_per_second=30) as write_frame:
         for frame in frames:
-            video.write(frame)
+            write_frame(frame)
     return path
 
 
@@ -46,8 +46,8 @@ def test_videos_suit_browsers(tmp_path):
 
 
 def test_a_frame_can_be_repeated(tmp_path):
-    with VideoWriter(tmp_path / "still.mp4", 64, 48) as video:
-        video.write(plain((1, 2, 3)), repeat=7)
+    with open_video(tmp_path / "still.mp4", 64, 48, frames_per_second=30) as write_frame:
+        write_frame(plain((1, 2, 3)), repeat=7)
     assert len(frames_of(tmp_path / "still.mp4")) == 7
 
 
@@ -60,8 +60,8 @@ def test_odd_sizes_are_refused_before_a_file_is_made(tmp_path):
 def test_an_interrupted_video_leaves_the_earlier_one(tmp_path):
     path = write_video(tmp_path / "video.mp4", [plain((9, 9, 9))] * 3)
     whole = path.read_bytes()
-    with pytest.raises(KeyboardInterrupt), VideoWriter(path, 64, 48) as video:
-        video.write(plain((200, 9, 9)))
+    with pytest.raises(KeyboardInterrupt), open_video(path, 64, 48, frames_per_second=30) as write_frame:
+        write_frame(plain((200, 9, 9)))
         raise KeyboardInterrupt
     assert path.read_bytes() == whole
     assert list(tmp_path.iterdir()) == [path]

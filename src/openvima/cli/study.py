@@ -98,10 +98,8 @@ def _print_plan(plan: "Plan") -> None:
     from openvima.evaluation.config import plan as plan_evaluation
 
     table = Table("stage", "folder")
-    for demonstrations, out in plan.data.items():
-        table.add_row(
-            f"{demonstrations.episodes:,} demonstrations of {len(demonstrations.tasks)} tasks", f"{out}"
-        )
+    for config in plan.data.values():
+        table.add_row(f"{config.episodes:,} demonstrations of {len(config.tasks)} tasks", f"{config.out}")
     for training in plan.all_trainings:
         table.add_row(f"training of {training.config.preset}", f"{training.config.out}")
     for evaluation in plan.evaluations:

@@ -34,7 +34,7 @@ from openvima.input_files import settle
 from openvima.multiprocess import Report
 from openvima.render import channels_last
 from openvima.scene.action import END_EFFECTOR
-from openvima.video.encoder import VideoWriter, import_av
+from openvima.video.encoder import WriteFrame, import_av, open_video
 
 CODEBASE_VERSION = "v3.0"
 ROBOT_TYPE = "ur5"
@@ -245,9 +245,9 @@ class LerobotWriter:
             "task_index": np.full_like(steps, task_index),
         }
 
-    def _video(self, key: str, number: int) -> VideoWriter:
+    def _video(self, key: str, number: int) -> contextlib.AbstractContextManager[WriteFrame]:
         height, width = IMAGE_SHAPE
-        return VideoWriter(
+        return open_video(
             self._path(VIDEO_PATH, number, video_key=key),
             width,
             height,
@@ -256,13 +256,13 @@ class LerobotWriter:
             options={**_ENCODING, **_QUALITY[self._pixels]},
         )
 
-    def _write_pictures(self, demo: Trajectory, videos: Mapping[str, VideoWriter]) -> dict[str, Statistics]:
+    def _write_pictures(self, demo: Trajectory, videos: Mapping[str, WriteFrame]) -> dict[str, Statistics]:
         statistics = {}
         views = {view: images[: demo.num_steps] for view, images in demo.rgb.items()}
         for key, pictures in self._layout.pictures(views, demo.prompt).items():
             for index, picture in enumerate(pictures):
                 repeat = demo.num_steps // len(pictures)
-                videos[key].write(channels_last(picture), repeat=repeat, is_key=index == 0)
+                videos[key](channels_last(picture), repeat=repeat, is_key=index == 0)
             counts = count_pixels(pictures, demo.num_steps)
             self._pixel_counts[key] += counts
             statistics[key] = pixel_statistics(counts, demo.num_steps)

@@ -63,9 +63,9 @@ def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]], *, contro
     seeds = np.array([seed for seed, _ in records], np.int64)
     width = _WIDTHS[control]
     numbers = np.array([step for _, step in records], np.float32).reshape(-1, width)
-    column = pa.FixedSizeListArray.from_arrays(pa.array(numbers.reshape(-1)), width)
-    with atomic_write(folder / ACTIONS_NAME) as sink, pa.ipc.new_file(sink, _SCHEMAS[width]) as writer:
-        writer.write_table(pa.table([pa.array(seeds), column], schema=_SCHEMAS[width]))
+    table = pa.table({"seed": seeds, "action": list(numbers)}, schema=_SCHEMAS[width])
+    with atomic_write(folder / ACTIONS_NAME) as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
     return _digest(seeds, numbers)
 
 

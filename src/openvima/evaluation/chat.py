@@ -27,8 +27,8 @@ from openvima.evaluation.prompt_ablations import settings_of
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.html import render_page
 from openvima.perception.objects import ObjectExtractor
-from openvima.render.labels import CELL_M, LABEL_SHAPE, label_raster
-from openvima.scene import WORKSPACE_LOW, Action, AtPose
+from openvima.render.raycast import object_below
+from openvima.scene import Action, AtPose
 from openvima.scene.action import pose_after
 from openvima.scene.goal import object_of, oracle_move
 from openvima.serving.chat import Answer
@@ -88,10 +88,7 @@ def mistake_in(env: TabletopEnv, action: Action) -> dict[str, Any] | None:
     stage = problem.stage_of(progress.open_goals[0])
     open_goals = [problem.goals[index] for index in progress.open_goals if index in stage]
     goals = [goal for goal in problem.prerequisites if not goal.is_met(scene)] or open_goals
-    x, y = action.pose0_position
-    cell = (int((y - WORKSPACE_LOW[1]) / CELL_M), int((x - WORKSPACE_LOW[0]) / CELL_M))
-    row, column = (min(place, size - 1) for place, size in zip(cell, LABEL_SHAPE, strict=True))
-    picked = int(label_raster(scene, env.assets)[row, column])
+    picked = object_below(scene.placements, action.pose0_position, env.assets)
     if picked not in {object_of(goal) for goal in goals}:
         return {"kind": _OTHER if picked else _NOTHING}
     move = next(oracle_move(goal, scene) for goal in goals if object_of(goal) == picked)

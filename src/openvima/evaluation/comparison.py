@@ -9,7 +9,7 @@ from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.errors import ConfigError, UnknownPolicyError, brief_repr, unknown_name
 from openvima.evaluation.ablations import scenes_of
-from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.results import Results, Row, grouped
 from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.evaluation.statistics import Interval, PairCounts, holm, mcnemar, mean_difference
 
@@ -103,34 +103,31 @@ def _is_same(policy: str, evaluations: Sequence[Results]) -> bool:
 
 def _rows(evaluations: Mapping[str, Results], names: Mapping[str, Mapping[str, str]]) -> tuple[Row, ...]:
     """All rows under their new names, in the order policy, ablation, level, task."""
-    joined: dict[tuple[str, str, str, str], Row] = {}
-    for label, results in evaluations.items():
-        for row in results.rows:
-            row = replace(row, policy=names[label][row.policy])
-            key = (row.policy, row.ablation, row.level, row.task)
-            joined[key] = _join_rows(joined[key], row) if key in joined else row
-    policies = list(dict.fromkeys(row.policy for row in joined.values()))
-    ablations = list(dict.fromkeys(row.ablation for row in joined.values()))
+    cells = grouped(
+        ((names[label][row.policy], row.ablation, row.level, row.task), row)
+        for label, results in evaluations.items()
+        for row in results.rows
+    )
+    joined = [_join_rows(policy, rows) for (policy, *_), rows in cells.items()]
+    policies = list(dict.fromkeys(row.policy for row in joined))
+    ablations = list(dict.fromkeys(row.ablation for row in joined))
 
     def place(row: Row) -> tuple[int, ...]:
         level = LEVELS.index(row.level) if row.level in LEVELS else len(LEVELS)
         return policies.index(row.policy), ablations.index(row.ablation), level
 
-    return tuple(sorted(joined.values(), key=place))
+    return tuple(sorted(joined, key=place))
 
 
-def _join_rows(one: Row, other: Row) -> Row:
-    outcomes: dict[int, EpisodeOutcome] = {o.seed: o for o in (*one.outcomes, *other.outcomes)}
-    return replace(one, outcomes=tuple(outcomes[seed] for seed in sorted(outcomes)))
+def _join_rows(policy: str, rows: Sequence[Row]) -> Row:
+    outcomes = {outcome.seed: outcome for row in rows for outcome in row.outcomes}
+    return replace(rows[0], policy=policy, outcomes=tuple(outcomes[seed] for seed in sorted(outcomes)))
 
 
 def _versions(found: Sequence[Results]) -> tuple[dict[str, str], tuple[str, ...]]:
     """Versions of all evaluations, and a note if they differ."""
-    packages = dict.fromkeys(package for results in found for package in results.versions)
-    versions = {
-        package: " / ".join(dict.fromkeys(r.versions[package] for r in found if package in r.versions))
-        for package in packages
-    }
+    all_versions = grouped(item for results in found for item in results.versions.items())
+    versions = {package: " / ".join(dict.fromkeys(each)) for package, each in all_versions.items()}
     differing = [f"{package} {text}" for package, text in versions.items() if " / " in text]
     if not differing:
         return versions, ()
@@ -305,9 +302,9 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 
 def _rows_of(results: Results, name: str) -> Rows:
     """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
-    rows: dict[str, list[Row]] = {}
-    for row in results.rows:
-        rows.setdefault(ABLATION_SEPARATOR.join(filter(None, (row.policy, row.ablation))), []).append(row)
+    rows = grouped(
+        (ABLATION_SEPARATOR.join(filter(None, (row.policy, row.ablation))), row) for row in results.rows
+    )
     if name not in rows:
         raise UnknownPolicyError(unknown_name("policy", name, rows))
     order = results.levels()
@@ -332,17 +329,10 @@ def _difference(level: str, task: str, pairs: tuple[PairCounts, ...]) -> Differe
     difference, interval = mean_difference(pairs)
     total = PairCounts.sum(pairs)
     p_value, p_mid = mcnemar(total.only_a, total.only_b)
+    rate_a = sum((pair.both + pair.only_a) / pair.episodes for pair in pairs) / len(pairs)
+    rate_b = sum((pair.both + pair.only_b) / pair.episodes for pair in pairs) / len(pairs)
     return Difference(
-        level=level,
-        task=task,
-        pairs=pairs,
-        rate_a=sum((pair.both + pair.only_a) / pair.episodes for pair in pairs) / len(pairs),
-        rate_b=sum((pair.both + pair.only_b) / pair.episodes for pair in pairs) / len(pairs),
-        difference=difference,
-        interval=interval,
-        p_value=p_value,
-        p_mid=p_mid,
-        p_holm=p_value,
+        level, task, pairs, rate_a, rate_b, difference, interval, p_value, p_mid, p_holm=p_value
     )
 
 

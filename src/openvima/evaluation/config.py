@@ -15,6 +15,7 @@ from typing import Literal
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
+from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ConfigError, brief_repr, unknown_name
 from openvima.evaluation.ablations import (
     ABLATIONS,
@@ -297,6 +298,10 @@ class Batch:
     def seeds(self) -> range:
         """Seeds of the episodes."""
         return range(self.first_seed, self.first_seed + self.episodes)
+
+    def make_env(self, *, realtime: bool = False) -> TabletopEnv:
+        """Build an environment for one of the episodes, which records `frames` if it is `realtime`."""
+        return self.env_config.make(self.task, self.level, domain="eval", realtime=realtime)
 
     @property
     def key(self) -> str:

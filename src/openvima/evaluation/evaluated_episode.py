@@ -1,19 +1,18 @@
 """One episode of an evaluation, with the exact settings to play it again live."""
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from openvima.errors import DatasetError, OpenVimaError, PolicyError, brief_repr, echo
-from openvima.evaluation.ablations import DETECTED_BOXES, ablated_environment
 from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
-from openvima.evaluation.config import DEFAULT_DEVICE, Batch
+from openvima.evaluation.config import Batch
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_own_rollout_policy
-from openvima.evaluation.sources import NAMED_POLICIES, weights_hash
-from openvima.evaluation.verification import recorded_env_config
+from openvima.evaluation.sources import NAMED_POLICIES, PolicySource, weights_hash
+from openvima.evaluation.verification import recorded_config
 from openvima.policies.naming import BUNDLED, CHECKPOINTS_FOLDER, UNTRAINED
 from openvima.policies.presets import PRESETS
 from openvima.scene import Episode
@@ -97,7 +96,6 @@ def evaluated_episode(
     *,
     ablation: str = "",
     source: str | None = None,
-    assets: str | None = None,
     trust_code: bool = False,
 ) -> EvaluatedEpisode:
     """Return an episode of an evaluation and the settings to play it again.
@@ -110,34 +108,22 @@ def evaluated_episode(
         seed: Seed of the episode.
         ablation: Input ablation; empty for the plain score.
         source: Where the policy is, as for `openvima evaluate --policy`; None: as `find_source` finds it.
-        assets: Assets, where the results were obtained with a function of one's own.
         trust_code: Run the code that a run folder names.
 
     Raises:
         DatasetError: There are no such results.
-        AssetError: The results name a function as their assets; pass it as `assets`.
+        AssetError: The results name a function as their assets, which is not run.
     """
     folder = Path(folder)
     results = Results.read(folder)
     row = results.row(policy, task, level, ablation)
     assert row is not None  # chosen among those that there are, as the seed
-    place, config = [outcome.seed for outcome in row.outcomes].index(seed), results.config
-    if config.get("control", PRIMITIVES) != PRIMITIVES:
-        raise DatasetError(f"{folder} has control {echo(str(config['control']))}; only primitives are shown.")
-    batch = Batch(
-        policy,
-        (find_source(folder, results, policy) or "") if source is None else source,
-        task,
-        level,
-        first_seed=seed,
-        episodes=1,
-        env_config=ablated_environment(ablation, recorded_env_config(results, assets)),
-        device=str(config.get("device", DEFAULT_DEVICE)),
-        ablation=ablation,
-        precision=str(config.get("precision") or ""),
-        boxes=str(config.get("boxes") or "") if DETECTED_BOXES in ablation else "",
-        trust_code=trust_code,
-    )
+    place = [outcome.seed for outcome in row.outcomes].index(seed)
+    if (control := results.config.get("control", PRIMITIVES)) != PRIMITIVES:
+        raise DatasetError(f"{folder} has control {echo(str(control))}; only primitives are shown.")
+    source = (find_source(folder, results, policy) or "") if source is None else source
+    config = replace(recorded_config(results), trust_code=trust_code)
+    batch = config.batch_of(PolicySource(policy, source), ablation, task, level, seed, 1)
     recorded, actions = folder if folder.is_dir() else folder.parent, None
     if (recorded / ACTIONS_NAME).is_file():
         actions = read_actions(recorded, results.rows)[0][results.rows.index(row)][place]

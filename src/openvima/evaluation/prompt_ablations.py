@@ -20,7 +20,7 @@ frame … frame". It contains the answer, so this measures whether a policy repr
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -50,8 +50,7 @@ def masked(text: str, rate: float, rng: np.random.Generator) -> str:
         >>> masked("Put the {a} into it.", 1, np.random.default_rng(0))
         '<unknown> <unknown> {a} <unknown> <unknown>.'
     """
-    words = _words(text)
-    return _with_words(text, [UNKNOWN if rng.random() < rate else word.group() for word in words])
+    return _replace_words(text, lambda word: UNKNOWN if rng.random() < rate else word)
 
 
 def swapped(text: str, rate: float, rng: np.random.Generator) -> str:
@@ -64,29 +63,31 @@ def swapped(text: str, rate: float, rng: np.random.Generator) -> str:
         >>> swapped("Put the {a} into it.", 1, np.random.default_rng(0))
         'the Put {a} it into.'
     """
-    places = _words(text)
+    places = [found for found in _SLOT_OR_WORD.finditer(text) if found.group()[0] != "{"]
     words = [place.group() for place in places]
     for i in range(len(words) - 1):
         are_neighbours = not text[places[i].end() : places[i + 1].start()].strip()
         if are_neighbours and rng.random() < rate:
             words[i], words[i + 1] = words[i + 1], words[i]
-    return _with_words(text, words)
+    left = iter(words)
+    return _replace_words(text, lambda _: next(left))
 
 
 def gibberish(text: str, rng: np.random.Generator) -> str:
     """Replace the letters of each word by random ones, in each place of a word by the same."""
-    known: dict[str, str] = {}
+
+    @cache
+    def drawn(word: str) -> str:
+        letters = iter(rng.choice(list(_LETTERS), len(word)).tolist())
+        return "".join(next(letters) if letter != "-" else "-" for letter in word)
 
     def replaced(word: str) -> str:
         if word.isdecimal() or word == UNKNOWN:
             return word
-        if word.lower() not in known:
-            drawn = iter(rng.choice(list(_LETTERS), len(word)).tolist())
-            known[word.lower()] = "".join(next(drawn) if letter != "-" else "-" for letter in word)
-        new = known[word.lower()]
+        new = drawn(word.lower())
         return new.capitalize() if word[0].isupper() else new
 
-    return _with_words(text, [replaced(word.group()) for word in _words(text)])
+    return _replace_words(text, replaced)
 
 
 def scrambled(text: str, rng: np.random.Generator) -> str:
@@ -111,14 +112,9 @@ def names_attribute(task: str) -> bool:
     return _COMPARED.search(task_spec(task).template) is not None
 
 
-def _words(text: str) -> list[re.Match[str]]:
-    return [found for found in _SLOT_OR_WORD.finditer(text) if found.group()[0] != "{"]
-
-
-def _with_words(text: str, words: list[str]) -> str:
-    """Put other words in the places of a text's words."""
-    left: Iterator[str] = iter(words)
-    return _SLOT_OR_WORD.sub(lambda found: found.group() if found.group()[0] == "{" else next(left), text)
+def _replace_words(text: str, change: Callable[[str], str]) -> str:
+    """Replace the words of a text from left to right; image slots stay."""
+    return _SLOT_OR_WORD.sub(lambda found: found[0] if found[0][0] == "{" else change(found[0]), text)
 
 
 @cache

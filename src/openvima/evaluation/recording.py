@@ -129,7 +129,11 @@ class OnlineEval:
     def __call__(self, checkpoint: Path) -> dict[str, float]:
         """Return the success rate of each task, and their mean as "success"."""
         policy = load_policy(str(checkpoint), trust_code=True)  # the training runs it
-        rates = {task: self._rate(task, policy) for task in self.tasks}
+        rates, seeds = {}, range(self.episodes)
+        for task in self.tasks:
+            envs = [self.env_config.make(task, ONLINE_EVAL_LEVEL, domain=_DOMAIN) for _ in seeds]
+            outcomes = play(envs, seeds, PromptedRolloutPolicy(policy))
+            rates[task] = sum(outcome.success for outcome in outcomes) / len(outcomes)
         return {"success": sum(rates.values()) / len(rates), **rates}
 
     def animate(self, checkpoint: Path) -> list[Animation]:
@@ -152,9 +156,3 @@ class OnlineEval:
         prompt = draw_prompt_strip(env.prompt, width=_PROMPT_WIDTH)
         rate = FRAMES_PER_SECOND // _FRAME_STRIDE
         return Animation(task, caption, prompt, np.stack(frames), rate)
-
-    def _rate(self, task: str, policy: object) -> float:
-        seeds = range(self.episodes)
-        envs = [self.env_config.make(task, ONLINE_EVAL_LEVEL, domain=_DOMAIN) for _ in seeds]
-        outcomes = play(envs, seeds, PromptedRolloutPolicy(policy))
-        return sum(outcome.success for outcome in outcomes) / len(outcomes)

@@ -5,10 +5,10 @@ import json
 import platform
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from openvima.atomic_io import atomic_write_file
 from openvima.env.registration import ENVIRONMENT_VERSION
@@ -16,7 +16,10 @@ from openvima.errors import MAX_CHARACTERS, DatasetError, brief_repr, cut, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
 from openvima.html import notebook_html
 from openvima.imports import versions_of
-from openvima.input_files import as_path, read_text
+from openvima.input_files import MALFORMED, as_path, read_text
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 SCHEMA = 1
 FILE_NAME = "results.json"
@@ -158,10 +161,10 @@ class Results:
     actions_sha256: str = ""
 
     def __repr__(self) -> str:
-        rates: dict[str, list[str]] = {}
-        for mean in self.level_means():
-            name = f"{mean.policy}, {mean.ablation}" if mean.ablation else mean.policy
-            rates.setdefault(name, []).append(f"{100 * mean.mean:.1f} % on {mean.level}")
+        rates = grouped(
+            (f"{each.policy}, {each.ablation}".removesuffix(", "), f"{100 * each.mean:.1f} % on {each.level}")
+            for each in self.level_means()
+        )
         shown = "; ".join(f"{name}: {', '.join(means)}" for name, means in rates.items())
         episodes = sum(row.episodes for row in self.rows)
         return cut(f"Results(episodes: {episodes:,}; tasks: {len(self.tasks())}; {shown})", MAX_CHARACTERS)
@@ -196,9 +199,7 @@ class Results:
 
     def means(self) -> dict[tuple[str, str, str], LevelMean]:
         """The same means by policy, ablation and level; the ablation is empty for the plain score."""
-        cells: dict[tuple[str, str, str], list[Row]] = {}
-        for row in self.rows:
-            cells.setdefault((row.policy, row.ablation, row.level), []).append(row)
+        cells = grouped(((row.policy, row.ablation, row.level), row) for row in self.rows)
         means = {}
         for (policy, ablation, level), rows in cells.items():
             mean = mean_of_rates([(row.successes, row.episodes) for row in rows])
@@ -266,6 +267,14 @@ class Results:
         return read_results(as_path(path))[0]
 
 
+def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+    """Collect the values of each key, both in the order in which they come."""
+    groups: dict[K, list[V]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
+
+
 def read_results(path: Path) -> tuple[Results, str]:
     """Read a `results.json`, or the one of an evaluation's folder.
 
@@ -286,7 +295,7 @@ def read_results(path: Path) -> tuple[Results, str]:
             rows = tuple(_row_from_record(record) for record in content["rows"])
             described = (content["config"], content["versions"], content["policies"])
             return Results(rows, *described, content.get("actions_sha256", "")), text
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except MALFORMED as error:
         raise DatasetError(
             f"{path} is damaged ({echo(repr(error))}); evaluate again with --force."
         ) from error

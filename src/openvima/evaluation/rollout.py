@@ -63,7 +63,6 @@ class EpisodeSlot:
         self.near_ties = 0
         self.outcome: EpisodeOutcome | None = None
         self.observation: dict[str, Any] | None = begin_episode(env, start)  # None once the episode is over
-        self.seed = start.seed if isinstance(start, Episode) else start
 
     def step(self, decision: Decision) -> None:
         """Take one step, unless there is no usable action; then the episode has failed."""
@@ -80,7 +79,7 @@ class EpisodeSlot:
         self.after_step(self.env)
         self.grasped |= {info["grasped"]} - {0}
         if info["success"]:
-            self.observation, self.outcome = None, self._outcome(True)
+            self.end()
         elif terminated:
             self.end(info["reason"], failure_kind(info["reason"]))
         elif truncated:
@@ -103,16 +102,12 @@ class EpisodeSlot:
         needed = problem.num_required or len(problem.goals)
         return f"{OUT_OF_STEPS}: {num_met} of {needed} goals were met", OUT_OF_STEPS
 
-    def end(self, reason: str, kind: str) -> None:
-        """End the episode as a failure."""
-        self.observation = None
-        self.outcome = self._outcome(False, reason, kind)
-
-    def _outcome(self, success: bool, reason: str = "", kind: str = "") -> EpisodeOutcome:
-        episode = self.env.episode
-        return EpisodeOutcome(
-            self.seed,
-            success,
+    def end(self, reason: str = "", kind: str = "") -> None:
+        """End the episode, as a failure if there is a reason."""
+        episode, self.observation = self.env.episode, None
+        self.outcome = EpisodeOutcome(
+            episode.seed,
+            not kind,
             len(self.actions),
             reason,
             kind,

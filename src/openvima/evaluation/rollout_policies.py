@@ -234,10 +234,20 @@ def load_rollout_policy(batch: Batch) -> RolloutPolicy:
         trust_code=batch.trust_code,
         vlm=batch.vlm,
     )
-    return _rollout_policy(policy, batch.ablation, batch.policy)
+    return as_rollout_policy(policy, batch.ablation, batch.policy)
 
 
-def _rollout_policy(policy: Any, ablation: str, name: str) -> RolloutPolicy:
+def as_rollout_policy(policy: Any, ablation: str = "", name: str = "policy") -> RolloutPolicy:
+    """Return what plays episodes by a policy; a control does so itself.
+
+    Args:
+        policy: A policy, or a rollout policy.
+        ablation: Input ablation; empty for none.
+        name: Name of the policy, for errors.
+
+    Raises:
+        PolicyError: It is neither, or an ablation cannot change what it reads.
+    """
     if reads_environments(policy):
         if ablation:
             raise PolicyError(f"{name} reads environments, which {ablation!r} does not change; leave it out.")
@@ -282,7 +292,7 @@ def load_own_rollout_policy(
     """
     PolicySource(source, source).check(trust_code=trust_code)
     policy = build_policy(source, trust_code=trust_code, **options)
-    return _rollout_policy(policy, ablation, name or source)
+    return as_rollout_policy(policy, ablation, name or source)
 
 
 @lru_cache(maxsize=1)

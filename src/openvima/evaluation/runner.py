@@ -33,7 +33,7 @@ from openvima.evaluation.rollout_policies import (
     one_thread,
 )
 from openvima.evaluation.sources import object_record
-from openvima.input_files import names_of
+from openvima.input_files import MALFORMED, names_of
 from openvima.multiprocess import Report, imap_with_engine
 from openvima.policies.base import Policy
 from openvima.policies.naming import PolicyRef
@@ -160,12 +160,10 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         played = _play_all(prepared, report)
-        rows = _join_rows({batch: played[batch] for batch in prepared.batches})
-        episodes = (  # in the order of the rows
-            (episode.outcome.seed, episode.actions) for batch in prepared.batches for episode in played[batch]
-        )
+        episodes = ((each.outcome.seed, each.actions) for batch in played.values() for each in batch)
         digest = write_actions(config.out, episodes, control=config.env_config.control)
         policies, median_s = _add_answers(prepared, played)
+        rows = _join_rows(played)
         results = replace(prepared.results, rows=rows, policies=policies, actions_sha256=digest)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started, median_s)
@@ -199,9 +197,9 @@ def _add_answers(
     """Write what models said; return the records of the policies with its summary, and a median time."""
     policies, steps = dict(prepared.results.policies), []
     episodes: dict[str, list[tuple[EpisodeOutcome, Said]]] = {}
-    for batch in prepared.batches:
+    for batch, of_batch in played.items():
         where = {name: getattr(batch, name) for name in ("policy", "task", "level", "ablation")}
-        for episode in played[batch]:
+        for episode in of_batch:
             if episode.said is not None:
                 at = where | {"seed": episode.outcome.seed}
                 episodes.setdefault(batch.policy, []).append((episode.outcome, episode.said))
@@ -235,7 +233,7 @@ def _collect_settings(results: Results) -> dict[str, object]:
 
 
 def _play_all(prepared: PreparedEvaluation, report: Report | None) -> Played:
-    """Run the batches that are not finished yet."""
+    """Run the batches that are not finished yet; return all, in their order."""
     config, batches = prepared.config, prepared.batches
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
@@ -256,7 +254,7 @@ def _play_all(prepared: PreparedEvaluation, report: Report | None) -> Played:
         done += batch.episodes
         if report is not None:
             report(done, total, " ".join(filter(None, batch.cell)))
-    return finished
+    return {batch: finished[batch] for batch in batches}
 
 
 def _part(batch: Batch, config: EvaluationConfig) -> Path:
@@ -268,7 +266,7 @@ def _read_finished(prepared: PreparedEvaluation) -> Played:
     """Return the batches of an interrupted run; parts that cannot be used are left out."""
     finished: Played = {}
     for batch in prepared.batches:
-        with suppress(OSError, ValueError, TypeError, LookupError):
+        with suppress(OSError, *MALFORMED):
             record = json.loads(_part(batch, prepared.config).read_text(encoding="utf-8"))
             finished[batch] = [
                 PlayedEpisode(EpisodeOutcome(**episode["outcome"]), episode["actions"], episode["said"])
@@ -282,12 +280,10 @@ def _play_missing(
 ) -> Iterator[tuple[Batch, list[PlayedEpisode]]]:
     """Run batches on the configured engine and yield them as they finish."""
     chats = [batch for batch in batches if PolicyRef.parse(batch.source).kind == "vlm"]
-    if chats:
-        yield from _play_chats(chats, config.vlm.options.concurrency)
-        batches = [batch for batch in batches if batch not in chats]
-        if not batches:
-            return
-    yield from imap_with_engine(config.engine, play_batch, batches, config.workers, address=config.address)
+    others = [batch for batch in batches if batch not in chats]
+    yield from _play_chats(chats, config.vlm.options.concurrency)
+    if others:  # else no cluster is needed
+        yield from imap_with_engine(config.engine, play_batch, others, config.workers, address=config.address)
 
 
 def _play_chats(batches: Sequence[Batch], num_threads: int) -> Iterator[tuple[Batch, list[PlayedEpisode]]]:
@@ -318,15 +314,14 @@ def _play_chats(batches: Sequence[Batch], num_threads: int) -> Iterator[tuple[Ba
 def _play_chat(batch: Batch, policy: VlmPolicy, seed: int) -> PlayedEpisode:
     chat = VlmRolloutPolicy(policy.new_session(), batch.ablation, name=batch.policy)
     with policy.client.turn:
-        env = batch.env_config.make(batch.task, batch.level, domain="eval")
-        (played,) = roll_out([env], [seed], chat, may_fail=batch.may_fail)
+        (played,) = roll_out([batch.make_env()], [seed], chat, may_fail=batch.may_fail)
     return replace(played, said=chat.said[0])
 
 
 def play_batch(batch: Batch, count: Callable[[int], None]) -> list[PlayedEpisode]:
     """Run one batch in a worker process, possibly on another machine."""
     with one_thread(batch):
-        envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+        envs = [batch.make_env() for _ in batch.seeds]
         played = roll_out(envs, batch.seeds, load_rollout_policy(batch), may_fail=batch.may_fail)
     count(len(played))
     return played
@@ -413,7 +408,7 @@ def score(
     begun: set[str] = set()
     with one_word_warning():
         for batch in plan(config):
-            envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+            envs = [batch.make_env() for _ in batch.seeds]
             given = policies.get(batch.policy)
             rollout_policy = (
                 load_rollout_policy(batch)

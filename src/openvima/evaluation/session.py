@@ -26,8 +26,8 @@ from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import EpisodeSlot
 from openvima.evaluation.rollout_policies import (
     Decision,
-    PromptedRolloutPolicy,
     RolloutPolicy,
+    as_rollout_policy,
     explainer_of,
     load_own_rollout_policy,
 )
@@ -120,7 +120,7 @@ class EpisodeSession:
     ) -> None:
         self.episode = episode
         self.env = TabletopEnv(HOST_TASK, assets=assets, compat=compat, realtime=record)
-        self._policy = _as_rollout_policy(policy)
+        self._policy = None if policy is None else as_rollout_policy(policy)
         self._record, self._explains = record, explain
         self.steps: list[SessionStep] = []
         self._restart()
@@ -152,7 +152,7 @@ class EpisodeSession:
 
     @policy.setter
     def policy(self, policy: Policy | RolloutPolicy | None) -> None:
-        self._policy = _as_rollout_policy(policy)
+        self._policy = None if policy is None else as_rollout_policy(policy)
         self.back(self.num_steps)
 
     def summary(self) -> str:
@@ -290,12 +290,6 @@ def first_difference(first: Sequence[SessionStep], second: Sequence[SessionStep]
 
 def _rotation(action: Action) -> float:
     return action.yaw1_rad - action.yaw0_rad
-
-
-def _as_rollout_policy(policy: Policy | RolloutPolicy | None) -> RolloutPolicy | None:
-    if policy is None or hasattr(policy, "decide"):
-        return policy  # type: ignore[return-value]  # told apart by the method
-    return PromptedRolloutPolicy(policy)
 
 
 @dataclass(frozen=True, slots=True)

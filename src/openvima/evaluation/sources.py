@@ -126,28 +126,28 @@ class PolicySource:
             PolicyError: A folder here is named like a bundled checkpoint and holds a checkpoint, too.
             ServerError: No policy server answers at the address.
         """
-        kind = self.kind
+        kind, about = self.kind, dict[str, Any]()
         if kind == "vlm":
-            return {"kind": "vlm", **vlm.record(self.ref.model)}
-        if kind == "remote":
-            return {"kind": "remote", "metadata": describe(self.source)}
-        if kind == "code":
-            policy = policy_of_code(self.source)
-            return {"kind": "code", **_code_record(self.source), **object_record(policy)}
-        if kind == "run":
-            if self.source in BUNDLED:
-                return {"kind": "run", "bundled": self.source, "sha256": weights_hash(self.source)}
+            about = vlm.record(self.ref.model)
+        elif kind == "remote":
+            about = {"metadata": describe(self.source)}
+        elif kind == "code":
+            about = {**_code_record(self.source), **object_record(policy_of_code(self.source))}
+        elif self.source in BUNDLED:
+            about = {"bundled": self.source, "sha256": weights_hash(self.source)}
+        elif kind == "run":
             code = self.learner
-            about = {
+            declared = {
                 "code": code and _code_record(code.source),
                 "excluded_tasks": tasks_left_out(self.source),
                 "held_out_data": held_out_data(self.source),
                 "hub": hub_commit(self.source),
             }
-            known = {name: value for name, value in about.items() if value}
-            return {"kind": "run", "sha256": weights_hash(self.source), **known}
-        is_preset = kind == UNTRAINED and self.source != UNTRAINED
-        return {"kind": kind} | ({"preset": self.ref.preset} if is_preset else {})
+            known = {name: value for name, value in declared.items() if value}
+            about = {"sha256": weights_hash(self.source), **known}
+        elif kind == UNTRAINED and self.source != UNTRAINED:
+            about = {"preset": self.ref.preset}
+        return {"kind": kind, **about}
 
 
 def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:

@@ -15,18 +15,24 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist, fmean, stdev
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 Interval = tuple[float, float]
 Counts = Sequence[tuple[int, int]]  # (successes, episodes) of each task
-Fit = Callable[[float], list[tuple[float, float]]]
+C = TypeVar("C")  # outcomes on one task
 
 _CONFIDENCE = 0.95
 _HALVINGS = 36  # of the range of multipliers; ends are then exact to about 1e-10
 _Z = NormalDist().inv_cdf(0.5 + _CONFIDENCE / 2)
 
 
-def _lower_end(estimate: float, least: float, played: Sequence[int], fit: Fit) -> float:
+def _lower_end(
+    estimate: float,
+    least: float,
+    counts: Sequence[C],
+    played: Sequence[int],
+    likely: Callable[[C, float], tuple[float, float]],
+) -> float:
     """Find the lower end of a score interval for an unweighted mean over tasks.
 
     With one number fitted to each of k tasks and one constraint over all, k - 1 numbers follow the data and
@@ -35,9 +41,10 @@ def _lower_end(estimate: float, least: float, played: Sequence[int], fit: Fit) -
     Args:
         estimate: The mean without constraint.
         least: The least possible one.
+        counts: Outcomes on each task.
         played: Episodes of each task.
-        fit: Gives for a multiplier above 0 the constrained fit: mean and variance of a single episode, for
-            each task. The larger the multiplier, the smaller the mean.
+        likely: Gives for a task's outcomes and a multiplier above 0 the constrained fit: mean and variance of
+            a single episode. The larger the multiplier, the smaller the mean.
 
     Returns:
         The value that lies `_Z` of its own standard errors below the estimate.
@@ -47,7 +54,7 @@ def _lower_end(estimate: float, least: float, played: Sequence[int], fit: Fit) -
     num_tasks = len(played)
 
     def constrained(multiplier: float) -> tuple[float, float]:
-        fitted = fit(multiplier)
+        fitted = [likely(count, multiplier) for count in counts]
         mean = sum(value for value, _ in fitted) / num_tasks
         spread = sum(v / (n - 1 + 1 / num_tasks) for (_, v), n in zip(fitted, played, strict=True))
         return mean, spread / num_tasks**2
@@ -112,30 +119,24 @@ def mean_of_rates(counts: Counts) -> tuple[float, Interval]:
         docs/reports.md.
     """
     failures = [(episodes - successes, episodes) for successes, episodes in counts]
-    return _mean_rate(counts), (_lowest_mean(counts), 1 - _lowest_mean(failures))
+    played = [episodes for _, episodes in counts]
+    low, lost = (_lower_end(_mean_rate(each), 0.0, each, played, _likely_rate) for each in (counts, failures))
+    return _mean_rate(counts), (low, 1 - lost)
 
 
 def _mean_rate(counts: Counts) -> float:
     return sum(successes / episodes for successes, episodes in counts) / len(counts)
 
 
-def _lowest_mean(counts: Counts) -> float:
-    """Lower end of the interval of a mean."""
-
-    def fit(multiplier: float) -> list[tuple[float, float]]:
-        rates = [_likely_rate(*count, multiplier) for count in counts]
-        return [(rate, rate * (1 - rate)) for rate in rates]
-
-    return _lower_end(_mean_rate(counts), 0.0, [episodes for _, episodes in counts], fit)
-
-
-def _likely_rate(successes: int, episodes: int, multiplier: float) -> float:
-    """Most likely rate of a task, given the mean of all.
+def _likely_rate(count: tuple[int, int], multiplier: float) -> tuple[float, float]:
+    """Most likely rate of a task, given the mean of all, and its variance.
 
     It is the rate p with `(successes - episodes p) / (p (1 - p)) = multiplier`, the same for all tasks.
     """
+    successes, episodes = count
     total = multiplier + episodes
-    return 2 * successes / (total + math.sqrt(total * total - 4 * multiplier * successes))
+    rate = 2 * successes / (total + math.sqrt(total * total - 4 * multiplier * successes))
+    return rate, rate * (1 - rate)
 
 
 _NEWTON_STEPS = 60  # it needs about 8; more only where an end is nearly -1 or 1
@@ -201,7 +202,11 @@ def mean_difference(counts: Sequence[PairCounts]) -> tuple[float, Interval]:
         paired-sample design", 1998; for several tasks the same principle with one constraint over all.
     """
     swapped = [PairCounts(both, only_b, only_a, neither) for both, only_a, only_b, neither in counts]
-    return _mean_of_differences(counts), (_lowest_difference(counts), -_lowest_difference(swapped))
+    played = [count.episodes for count in counts]
+    low, lost = (
+        _lower_end(_mean_of_differences(each), -1.0, each, played, _likely_pair) for each in (counts, swapped)
+    )
+    return _mean_of_differences(counts), (low, -lost)
 
 
 def mcnemar(only_a: int, only_b: int) -> tuple[float, float]:
@@ -237,20 +242,11 @@ def _mean_of_differences(counts: Sequence[PairCounts]) -> float:
     return sum(count.difference for count in counts) / len(counts)
 
 
-def _lowest_difference(counts: Sequence[PairCounts]) -> float:
-    """Lower end of the interval of a mean difference."""
-
-    def fit(multiplier: float) -> list[tuple[float, float]]:
-        likely = [_likely_pair(count, multiplier) for count in counts]
-        return [(a - b, max(0.0, a + b - (a - b) ** 2)) for a, b in likely]
-
-    return _lower_end(_mean_of_differences(counts), -1.0, [count.episodes for count in counts], fit)
-
-
 def _likely_pair(counts: PairCounts, multiplier: float) -> tuple[float, float]:
-    """Most likely probabilities that only a, and that only b solves an episode, given the mean difference.
+    """Most likely difference of two rates on a task, given the mean difference, and its variance.
 
-    With A and B for these and C for the rest, the optimum has `only_a / A = s + multiplier`,
+    With A and B for the probabilities that only a, and that only b solves an episode, and C for the rest, the
+    optimum has `only_a / A = s + multiplier`,
     `only_b / B = s - multiplier` and `same / C = s` for a number s of each task, such that A + B + C = 1.
     Where only_b is 0, s may be as small as the multiplier, and B takes what A and C leave.
 
@@ -259,7 +255,7 @@ def _likely_pair(counts: PairCounts, multiplier: float) -> tuple[float, float]:
         multiplier: Above 0, the same for all tasks; the larger, the smaller is A - B.
 
     Returns:
-        A and B.
+        A - B and the variance of a single episode.
     """
     same = counts.both + counts.neither
     # The sum falls with s and is convex; each of these bounds makes one term 1, so no step of Newton's
@@ -274,7 +270,8 @@ def _likely_pair(counts: PairCounts, multiplier: float) -> tuple[float, float]:
             break
         s += step
     a = counts.only_a / (s + multiplier)
-    return a, min(1.0, max(0.0, 1 - a - same / s))
+    b = min(1.0, max(0.0, 1 - a - same / s))
+    return a - b, max(0.0, a + b - (a - b) ** 2)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

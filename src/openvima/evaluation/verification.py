@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,23 +10,25 @@ import numpy as np
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import recorded_assets
 from openvima.data.chat import UNREADABLE
-from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.errors import DatasetError, OpenVimaError, echo
+from openvima.env.config import EnvConfig
+from openvima.errors import DatasetError, OpenVimaError, differences, echo
 from openvima.evaluation.ablations import ablated_environment
 from openvima.evaluation.actions import ActionReplay, read_actions
-from openvima.evaluation.config import EvaluationConfig, cells
+from openvima.evaluation.config import DEFAULT_DEVICE, EvaluationConfig, cells
 from openvima.evaluation.results import (
     FILE_NAME,
     EpisodeOutcome,
     Results,
     Row,
+    grouped,
     read_results,
     versions,
 )
 from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, POLICY_ERROR, play
 from openvima.evaluation.runner import Report
-from openvima.input_files import read_json
+from openvima.input_files import MALFORMED, read_json
 from openvima.multiprocess import imap_unordered
+from openvima.policies.naming import ORACLE
 
 VERIFICATION_NAME = "verification.json"
 _SIMULATOR = ("environments", "mujoco")  # versions that decide what an action does
@@ -89,18 +91,18 @@ def verify_results(
     results, text = read_results(path)
     try:
         stated, problems = _stated(results, text)
-        problems += _row_problems(results)
+        config = recorded_config(results, assets)
+        problems += _row_problems(results, config)
         _check_simulator(path, results.versions)
-        env_config = recorded_env_config(results, assets)
         actions, sha256 = read_actions(folder, results.rows)
-    except (TypeError, AttributeError, LookupError, ValueError, ArithmeticError, RecursionError) as error:
+    except MALFORMED as error:
         if isinstance(error, OpenVimaError):
             raise
         raise DatasetError(f"{path} is damaged ({echo(repr(error))}).") from None
     if sha256 != results.actions_sha256:
         problems.append("the actions are not those that results.json was written with")
     if not problems:
-        problems += _replay_all(results, actions, env_config, workers, report)
+        problems += _replay_all(results, actions, config.env_config, workers, report)
     episodes = sum(row.episodes for row in results.rows)
     found = VerifiedResults(episodes, tuple(problems), stated)
     if found.is_verified:
@@ -124,7 +126,7 @@ def is_marked_verified(path: Path) -> bool:
         if _stated(results, text) != (mark, []):
             return False
         return read_actions(folder, results.rows)[1] == results.actions_sha256
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
+    except (OSError, *MALFORMED):
         return False
 
 
@@ -143,23 +145,11 @@ def _stated(results: Results, text: str) -> tuple[str, list[str]]:
     return sha256, ["the file was edited after it was written: its digest differs"]
 
 
-def _row_problems(results: Results) -> Iterator[str]:
+def _row_problems(results: Results, whole: EvaluationConfig) -> Iterator[str]:
     """Compare the rows with the settings: no task, level or seed is missing, added or doubled."""
-    config = results.config
-    whole = EvaluationConfig(
-        ("oracle",),
-        (*config["tasks"],),
-        (*config["levels"],),
-        int(config["episodes"]),
-        int(config["seed"]),
-        env_config=replace(EnvConfig.from_record(config), assets=DEFAULT_ENV_CONFIG.assets),
-        ablations=(*config.get("ablations", ()),),
-        boxes=config.get("boxes"),
-    )
     last = whole.seed + whole.episodes - 1
-    played: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    played = grouped(((row.policy, row.ablation), (row.task, row.level)) for row in results.rows)
     for row in results.rows:
-        played.setdefault((row.policy, row.ablation), []).append((row.task, row.level))
         if [outcome.seed for outcome in row.outcomes] != [*range(whole.seed, last + 1)]:
             yield f"{_named(row)} has other seeds than {whole.seed} to {last}"
     for (policy, ablation), found in played.items():
@@ -169,7 +159,7 @@ def _row_problems(results: Results) -> Iterator[str]:
     if not {*whole.asked_ablations} <= ablations <= {*whole.all_ablations}:
         yield "the ablations of the rows are not those of the settings"
     named = {policy for policy, ablation in played if not ablation}
-    if named != set(config["policies"]) or named != set(results.policies):
+    if named != set(results.config["policies"]) or named != set(results.policies):
         yield "the policies of the rows are not those of the settings"
 
 
@@ -183,8 +173,8 @@ def _check_simulator(path: Path, found: Mapping[str, str]) -> None:
             )
 
 
-def recorded_env_config(results: Results, assets: str | None) -> EnvConfig:
-    """Return the settings of the environments; assets are recorded without their path.
+def recorded_config(results: Results, assets: str | None = None) -> EvaluationConfig:
+    """Return the settings of an evaluation, without its policies; assets are recorded without their path.
 
     Args:
         results: The results.
@@ -193,8 +183,21 @@ def recorded_env_config(results: Results, assets: str | None) -> EnvConfig:
     Raises:
         AssetError: The results name a function as their assets, which is not run.
     """
-    given = EnvConfig.from_record(results.config)
-    return replace(given, assets=recorded_assets(given.assets) if assets is None else assets)
+    config = results.config
+    env_config = EnvConfig.from_record(config)
+    assets = recorded_assets(env_config.assets) if assets is None else assets
+    return EvaluationConfig(
+        (ORACLE,),
+        (*config["tasks"],),
+        (*config["levels"],),
+        int(config["episodes"]),
+        int(config["seed"]),
+        env_config=replace(env_config, assets=assets),
+        device=config.get("device", DEFAULT_DEVICE),
+        precision=config.get("precision"),
+        ablations=(*config.get("ablations", ()),),
+        boxes=config.get("boxes"),
+    )
 
 
 def _replay_all(
@@ -229,7 +232,7 @@ def replay_episodes(job: _Replay, count: Callable[[int], None]) -> list[str]:
     again = play(envs, seeds, ActionReplay(job.actions))
     count(len(again))
     return [
-        f"{_named(row)}, seed {given.seed}: {difference}"
+        f"{_named(row)}, seed {given.seed}, replayed: {difference}"
         for given, own in zip(row.outcomes, again, strict=True)
         if (difference := _difference(given, own))
     ]
@@ -240,10 +243,7 @@ def _difference(given: EpisodeOutcome, own: EpisodeOutcome) -> str:
     if own.kind == NO_ORACLE_ACTION and given.kind.startswith(_ENDED_EARLY):
         own = replace(own, kind=given.kind, reason=given.reason)
     own = replace(own, near_ties=given.near_ties)
-    names = [field.name for field in fields(own) if getattr(own, field.name) != getattr(given, field.name)]
-    return ", ".join(
-        f"{name} is {echo(str(getattr(given, name)))}, replayed {getattr(own, name)}" for name in names
-    )
+    return ", ".join(differences(asdict(given), asdict(own)))
 
 
 def _named(row: Row) -> str:

@@ -2,10 +2,11 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.errors import DatasetError
+from openvima.input_files import MALFORMED
 from openvima.policies.naming import METRICS_FILE
 
 Curve = Sequence[tuple[float, float]]
@@ -44,11 +45,7 @@ def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
         DatasetError: A run has no record, or a damaged one.
     """
     labels = [f"{label} · " for label in run_labels(runs)] if len(runs) > 1 else [""] * len(runs)
-    return [
-        replace(chart, title=label + chart.title)
-        for label, run in zip(labels, runs, strict=True)
-        for chart in read_charts(run)
-    ]
+    return [chart for label, run in zip(labels, runs, strict=True) for chart in read_charts(run, label)]
 
 
 def run_labels(folders: Sequence[Path]) -> list[str]:
@@ -61,13 +58,14 @@ def run_labels(folders: Sequence[Path]) -> list[str]:
     return [f"{part[-1]} {number}" for number, part in enumerate(parts, start=1)]
 
 
-def read_charts(run: Path) -> list[Chart]:
+def read_charts(run: Path, label: str = "") -> list[Chart]:
     """Read the charts of a training run: losses and accuracies over the steps of each stage.
 
     Args:
         run: A run folder or its training record: a file with one JSON object a line, its "step", perhaps the
             "name" of its stage, and numbers. Those with "loss" or "accuracy" in their names are charted;
             "validation_" means held out.
+        label: Begins the titles.
 
     Returns:
         The charts.
@@ -90,7 +88,7 @@ def read_charts(run: Path) -> list[Chart]:
             for name, value in record.items():
                 if isinstance(value, int | float) and not isinstance(value, bool):
                     stages.setdefault(stage, {}).setdefault(name, []).append((step, float(value)))
-        except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        except MALFORMED as error:
             raise DatasetError(f"{metrics}, line {number}, is no record with a step ({error!r}).") from error
     charts = []
     for stage, values in stages.items():
@@ -98,7 +96,9 @@ def read_charts(run: Path) -> list[Chart]:
             chosen = _chosen(sorted(name for name in values if kind in name))
             if chosen:
                 curves: dict[str, Curve] = {_label(name, kind): values[name] for name in chosen}
-                charts.append(Chart(f"{_stage_title(stage)}: {kind}", curves, percent))
+                # "Cloning" for "2-cloning"
+                title = stage.lstrip("0123456789-").capitalize() or stage
+                charts.append(Chart(f"{label}{title}: {kind}", curves, percent))
     return charts
 
 
@@ -106,11 +106,6 @@ def _chosen(names: list[str]) -> list[str]:
     """All metrics of a kind, or the held-out ones alone where all would be too many."""
     held_out = [name for name in names if name.startswith(_HELD_OUT)]
     return held_out[:_MOST_CURVES] if held_out and len(names) > _MOST_CURVES else names[:_MOST_CURVES]
-
-
-def _stage_title(name: str) -> str:
-    """Name of a stage without its number, such as "Cloning" for "2-cloning"."""
-    return name.lstrip("0123456789-").capitalize() or name
 
 
 def _label(name: str, kind: str) -> str:

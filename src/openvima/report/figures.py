@@ -13,6 +13,7 @@ from typing import Any
 
 from openvima.evaluation.statistics import Interval
 from openvima.html import render_page
+from openvima.report.curves import Chart
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,35 +128,31 @@ def rate_chart(rates: RateFigure, title: str, name: str, colours: Mapping[str, s
     return _themed(figure, name, f"{rates.caption} {title}", [colours[policy] for policy, _ in curves])
 
 
-def curve_chart(
-    curves: Mapping[str, Sequence[tuple[float, float]]], *, title: str, name: str, percent: bool = False
-) -> str:
-    """Draw curves over training steps.
+def curve_chart(chart: Chart, name: str) -> str:
+    """Draw curves over training steps; fractions on an axis from 0 to 100 %.
 
     Args:
-        curves: Name of each curve to its (step, value) points.
-        title: Title of the chart.
+        chart: The curves.
         name: Put before the names of its elements; no other chart of the page may have it.
-        percent: Whether values are fractions, drawn on an axis from 0 to 100 %.
 
     Returns:
         An `<svg>` element.
     """
-    variables = [f"--series-{index + 1}" for index in range(len(curves))]
+    variables = [f"--series-{index + 1}" for index in range(len(chart.curves))]
     figure, axes = _panel(2.5)
-    for (label, points), variable in zip(curves.items(), variables, strict=True):
+    for (label, points), variable in zip(chart.curves.items(), variables, strict=True):
         steps, values = zip(*points, strict=True)
         marker = "o" if len(points) < 30 else ""
         style: Any = {"marker": marker, "markersize": 3.5, "color": _series(variable), "linewidth": 1.8}
-        axes.plot(steps, _percent(values) if percent else values, label=label, **style)
-    if percent:
+        axes.plot(steps, _percent(values) if chart.percent else values, label=label, **style)
+    if chart.percent:
         axes.set_ylim(-2, 102)
         axes.set_yticks(*_PERCENT_TICKS)
-    axes.set_title(title, loc="left", fontsize=10, color=_INK)
+    axes.set_title(chart.title, loc="left", fontsize=10, color=_INK)
     axes.set_xlabel("step")
-    if len(curves) > 1:
+    if len(variables) > 1:
         axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
-    return _themed(figure, name, title, variables)
+    return _themed(figure, name, chart.title, variables)
 
 
 def _percent(fractions: Iterable[float]) -> list[float]:

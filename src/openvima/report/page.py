@@ -124,6 +124,7 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
     policies = policies or [
         _policy_word(name, results.policies.get(name, {})) for name in results.policy_names()
     ]
+    vlm = next((what for what in results.policies.values() if what.get("kind") == "vlm"), None)
     words = [
         f"openvima evaluate --policy {shlex.quote(','.join(policies))}",
         *[
@@ -132,7 +133,8 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
             if name in config and config[name] != _USUAL.get(name)
         ],
         *(["--trust-code"] if any("code" in what for what in results.policies.values()) else []),
-        *[word for what in list(filter(_is_vlm, results.policies.values()))[:1] for word in _vlm_words(what)],
+        *([] if vlm is None else ["--base-url URL"]),  # the address of its server is not in results
+        *[_option(option, vlm[name]) for name, option in _VLM_OPTIONS.items() if vlm and vlm.get(name)],
         "--out DIR",
     ]
     return " ".join(words)
@@ -143,21 +145,11 @@ def _option(name: str, value: Any) -> str:
     return f"--{name}" if value is True else f"--{name} {shlex.quote(text)}"
 
 
-def _is_vlm(what: Mapping[str, Any]) -> bool:
-    return what.get("kind") == "vlm"
-
-
-def _vlm_words(what: Mapping[str, Any]) -> list[str]:
-    """Name the settings of a vision-language model; the address of its server is not in results."""
-    words = [_option(option, what[name]) for name, option in _VLM_OPTIONS.items() if what.get(name)]
-    return ["--base-url URL", *words]
-
-
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:
     """Name a policy for `--policy`, with a placeholder for the path of its weights."""
     kind = what.get("kind")
     preset = what.get("preset")
-    if _is_vlm(what):
+    if kind == "vlm":
         return f"{name}={VLM}{what.get('model', 'MODEL')}"
     named = f"{UNTRAINED}:{preset}" if preset else what.get("bundled") or what.get("source")
     source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))

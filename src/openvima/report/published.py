@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
@@ -10,8 +10,7 @@ from openvima.evaluation.results import Results
 from openvima.scene.action import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 
-# The only model whose success by task was published for all levels.
-BESIDE = ("VIMA", "200M")
+BESIDE = "VIMA 200M"  # the only model whose success by task was published for all levels
 RELIABILITY = (
     "Published numbers, not measured here. Reliability A (*): printed by the authors. B (†): quoted by "
     "public re-implementations. C (no mark): read off figures of the VIMA and MIDAS papers, to about 0.2 "
@@ -44,9 +43,10 @@ class PublishedModel:
         size: Parameters of its controller, such as "200M".
         data_fraction: Fraction of the demonstrations that it was trained on.
         levels: Success rate at each level (%).
-        rough: Levels whose number is read off to half a point only.
+        rough: Levels whose number is read off to half a point only, and tasks with a rounded one.
         grade: Reliability of the numbers: "A", "B", "C" or "D", see `RELIABILITY`.
         aside: Whether it is a variant or another kind of model, outside curves and leading models.
+        tasks: Success rates by task (%), of the tasks for which they were published, at each level.
     """
 
     model: str
@@ -56,6 +56,7 @@ class PublishedModel:
     rough: tuple[str, ...] = ()
     grade: str = "C"
     aside: bool = False
+    tasks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -79,10 +80,19 @@ class PublishedModel:
         mark = self.mark(level)
         return f"~{rate:.1f}" if mark == "~" else f"{rate:.1f}{mark}"
 
+    def written_task(self, level: str, task: str) -> str:
+        """Write the rate on a task; "–" where none was published."""
+        rate = self.tasks.get(level, {}).get(task)
+        return "–" if rate is None else f"{'~' if task in self.rough else ''}{rate:.1f}"
 
+
+@cache
 def published_models() -> tuple[PublishedModel, ...]:
-    """All models whose level means were published."""
-    return tuple(PublishedModel(**record) for record in _content()["levels"])
+    """All models whose success was published."""
+    file = resources.files("openvima.report").joinpath("published.json")
+    return tuple(
+        PublishedModel(**record) for record in json.loads(file.read_text(encoding="utf-8"))["models"]
+    )
 
 
 def leading_models() -> list[PublishedModel]:
@@ -91,41 +101,31 @@ def leading_models() -> list[PublishedModel]:
     return list({row.model: row for row in whole}.values())  # sizes ascend
 
 
-def published_tasks(level: str, model: tuple[str, str] = BESIDE) -> Mapping[str, float]:
-    """Success rates by task (%) of a model at a level: of VIMA 200M for all tasks, of others for a few."""
-    return _by_task().get((*model, level), {}).get("tasks", {})
+def models_by_task() -> list[PublishedModel]:
+    """Models with published rates by task."""
+    return [model for model in published_models() if model.tasks]
 
 
-def models_by_task() -> list[tuple[str, str]]:
-    """Name and size of the models with published rates by task."""
-    return list(dict.fromkeys((model, size) for model, size, _ in _by_task()))
+def beside() -> PublishedModel:
+    """The model `BESIDE`."""
+    return next(model for model in published_models() if model.name == BESIDE)
 
 
 def has_published_tasks(results: Results) -> bool:
-    """Whether the rate of an evaluated task was published."""
-    return any(row.task in published_tasks(row.level) for row in results.rows)
-
-
-def task_rate(model: tuple[str, str], level: str, task: str) -> str:
-    """Write the published rate of a model on a task; "–" where there is none."""
-    rate = published_tasks(level, model).get(task)
-    rough = task in _by_task().get((*model, level), {}).get("rough", ())
-    return "–" if rate is None else f"{'~' if rough else ''}{rate:.1f}"
+    """Whether `BESIDE` was evaluated on one of the tasks of these results."""
+    return any(row.task in beside().tasks.get(row.level, {}) for row in results.rows)
 
 
 def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | None = None) -> float | None:
-    """Mean rate (%) of a model, by default VIMA 200M, over tasks of a level; None if it was not published.
+    """Mean rate (%) of a model, by default `BESIDE`, over tasks of a level; None if it was not published.
 
     Over all tasks it is the published mean of the level.
     """
-    model = model or next(m for m in published_models() if (m.model, m.size, m.data_fraction) == (*BESIDE, 1))
-    whole = published_tasks(level)
-    if whole and whole.keys() == set(tasks):
+    model = model or beside()
+    if beside().tasks.get(level, {}).keys() == set(tasks):
         return model.levels.get(level)
-    is_known = model.data_fraction == 1 or model.aside  # rates by task are of one fraction of each model
-    rates = published_tasks(level, (model.model, model.size)) if is_known else {}
-    known = tasks and rates.keys() >= set(tasks)
-    return sum(rates[task] for task in tasks) / len(tasks) if known else None
+    rates = model.tasks.get(level, {})
+    return sum(rates[task] for task in tasks) / len(tasks) if rates.keys() >= set(tasks) else None
 
 
 def is_comparable(results: Results) -> bool:
@@ -156,14 +156,3 @@ def published_rows(results: Results, models: Sequence[PublishedModel]) -> list[t
         if set(means) != {"–"}:
             rows.append((model.name, means))
     return rows
-
-
-def _by_task() -> dict[tuple[str, str, str], dict]:
-    """Records by model, size and level."""
-    return {(each["model"], each["size"], each["level"]): each for each in _content()["tasks"]}
-
-
-@cache
-def _content() -> dict[str, list[dict]]:
-    file = resources.files("openvima.report").joinpath("published.json")
-    return json.loads(file.read_text(encoding="utf-8"))

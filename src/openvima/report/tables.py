@@ -2,11 +2,12 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 from openvima.errors import UnknownTaskError
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
-from openvima.evaluation.results import Results
+from openvima.evaluation.results import Results, grouped
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.report.published import (
     BESIDE,
@@ -17,7 +18,6 @@ from openvima.report.published import (
     models_by_task,
     published_rate,
     published_rows,
-    task_rate,
     unusual_settings,
 )
 from openvima.report.table import Estimate, Line, Table
@@ -61,13 +61,19 @@ def family_table(results: Results, *, published: bool = True) -> Table:
             cells = [_mean(results, policy, level, tasks=tasks) for policy in policies]
             rate = published_rate(level, tasks) if published else None
             elsewhere = ["–" if rate is None else f"{rate:.1f}"] if published else []
-            name = f"{family_name(family)} ({len(tasks)})"
-            lines.append(Line(name, (level, *cells, *elsewhere), starts_group=index == 0 and bool(lines)))
+            name = family.replace("_", " ").replace("one shot", "one-shot")
+            lines.append(
+                Line(
+                    f"{name} ({len(tasks)})",
+                    (level, *cells, *elsewhere),
+                    starts_group=index == 0 and bool(lines),
+                )
+            )
     caption = (
         "Success rates (%) by task family, means over the tasks of each family (their number in brackets), "
         "with 95 % intervals. A task of several families counts in each."
     )
-    elsewhere = (f"{' '.join(BESIDE)} (published)",) if published else ()
+    elsewhere = (f"{BESIDE} (published)",) if published else ()
     return Table("families", caption, ("family", "level", *policies, *elsewhere), tuple(lines))
 
 
@@ -75,16 +81,10 @@ def _tasks(results: Results, level: str) -> dict[str, list[str]]:
     """Evaluated tasks of each family at a level."""
     found: dict[str, list[str]] = {family: [] for family in FAMILIES}
     for task in results.tasks(level):
-        for family in _families(task):
-            found.setdefault(family, []).append(task)
+        with suppress(UnknownTaskError):  # not registered here
+            for family in task_spec(task).families:
+                found.setdefault(family, []).append(task)
     return {family: tasks for family, tasks in found.items() if tasks}
-
-
-def _families(task: str) -> tuple[str, ...]:
-    try:
-        return task_spec(task).families
-    except UnknownTaskError:
-        return ()
 
 
 def _mean(
@@ -98,11 +98,6 @@ def _mean(
     mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
     fewer = f"{len(rows)} of {len(tasks)} tasks" if len(rows) < len(tasks) else ""
     return Estimate(mean, interval, mark=fewer)
-
-
-def family_name(family: str) -> str:
-    """Name of a family as words."""
-    return family.replace("_", " ").replace("one shot", "one-shot")
 
 
 _CONFIRMED = "Measured outcomes are confirmed by replaying the recorded actions; who acted is declared."
@@ -176,24 +171,20 @@ def result_table(results: Results, *, published: bool = False) -> Table:
         tasks = results.tasks(level)
         for task in tasks:
             own = [_mean(results, policy, level, tasks=(task,)) for policy in policies]
-            elsewhere = [task_rate(model, level, task) for model in models]
+            elsewhere = [model.written_task(level, task) for model in models]
             starts = bool(lines) and task == tasks[0]
             lines.append(Line(task, (level, *own, *elsewhere), starts_group=starts))
         means = (_mean(results, policy, level) for policy in policies)
         lines.append(Line("mean", (level, *means, *["–"] * len(models))))
     control = f", control {results.config['control']}" if "control" in results.config else ""
     about = f". {BY_TASK}" if published else ""
-    columns = ("task", "level", *policies, *(f"{model} {size} (published)" for model, size in models))
+    columns = ("task", "level", *policies, *(f"{each.model} {each.size} (published)" for each in models))
     return Table("results", f"success rates in % (95 % interval){control}{about}", columns, tuple(lines))
 
 
 def ablations_by_policy(results: Results) -> dict[str, list[str]]:
     """Return the input ablations that each policy was evaluated with; without any it is left out."""
-    found: dict[str, list[str]] = {}
-    for policy, ablation in dict.fromkeys((row.policy, row.ablation) for row in results.rows):
-        if ablation:
-            found.setdefault(policy, []).append(ablation)
-    return found
+    return grouped(dict.fromkeys((row.policy, row.ablation) for row in results.rows if row.ablation))
 
 
 def ablation_tables(results: Results) -> list[Table]:

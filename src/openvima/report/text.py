@@ -1,4 +1,4 @@
-"""Sentences and numbers of the report: what levels and policies are, how rates are written."""
+"""Sentences and numbers of the report: what policies are, how rates are written."""
 
 from collections.abc import Iterable, Mapping
 from itertools import cycle
@@ -8,30 +8,7 @@ from openvima.evaluation.ablations import INPUT_ABLATIONS, names_in
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import TRAINED_KINDS
-from openvima.report.published import PUBLISHED_SETTINGS, unusual_settings
 
-LEVEL_NAMES = {
-    "train": "As in training",
-    "L1": "Placement generalisation",
-    "L2": "Combinatorial generalisation",
-    "L3": "Novel objects",
-    "L4": "Novel tasks",
-    "L5": "Clutter",
-    "L6": "Composition",
-    "L7": "Language",
-    "L8": "Long horizon",
-}
-LEVEL_MEANINGS = {
-    "train": "Objects, textures and tasks of the training set, on fresh seeds.",
-    "L1": "Objects, textures and tasks of the training set, in new placements.",
-    "L2": "Training objects and textures in new combinations.",
-    "L3": "New shapes, and textures from the whole catalogue.",
-    "L4": "New kinds of prompts, with new objects and textures.",
-    "L5": "The training tasks with the objects of L3, among three to ten more with look-alikes.",
-    "L6": "Two and three instructions of trained tasks in one prompt.",
-    "L7": "Referring expressions: relations, superlatives, exceptions, numbers and alternatives.",
-    "L8": "Tasks of six to twelve steps, with all objects and textures.",
-}
 _ROLES = {
     "oracle": "Scripted solver with access to the scene: the upper bound.",
     "random": "Random actions: the lower bound.",
@@ -42,7 +19,6 @@ _ROLES = {
     "remote": "Policy behind a server: observes the prompt and two camera images.",
 }
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
-_USUAL_ASSETS = {"assets": "procedural", "compat": False}
 _NUM_COLOURS = 6  # in the style sheet, for all other policies
 
 
@@ -84,24 +60,6 @@ def _segmentation(record: Mapping[str, Any]) -> str:
     if not isinstance(asked, list):
         return ""
     return " The segmentation was sent to it." if "segm" in asked else " It got no segmentation."
-
-
-def answers(results: Results, policy: str) -> str:
-    """Say what the answers of a vision-language model cost and what was wrong with them; empty for others."""
-    found = results.policies.get(policy, {}).get("answers")
-    if not isinstance(found, dict):
-        return ""
-    costs = (
-        f"{found['requests']:,} requests, {found['tokens_in']:,} tokens in and {found['tokens_out']:,} out, "
-        f"answered by {', '.join(map(str, found['models']))}."
-    )
-    groups = [
-        f"{group['kind']}"
-        + (f" (median {group['median']:g} {group['unit']})" if "unit" in group else "")
-        + f" {group['episodes']}"
-        for group in found["mistakes"]
-    ]
-    return costs + (f" First mistake of the failed episodes: {', '.join(groups)}." if groups else "")
 
 
 def series_colours(results: Results) -> dict[str, str]:
@@ -180,17 +138,6 @@ def headline(results: Results) -> str:
     first = (trained or means)[0]
     tasks = counted(len(first.tasks), "task")
     return f"{first.policy} solves {percent(first.mean)} of {first.level} episodes ({tasks})"
-
-
-def measured(results: Results) -> str:
-    """Counts of policies, tasks, levels and episodes as a sentence."""
-    return (
-        f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
-        f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, "
-        f"{episodes_each(results.rows)} each; "
-        f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
-        "never uses." + unusual_settings(results, {**PUBLISHED_SETTINGS, **_USUAL_ASSETS})
-    )
 
 
 def episodes_each(rows: Iterable[Row]) -> str:

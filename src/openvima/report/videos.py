@@ -201,7 +201,7 @@ def record_clip(batch: Batch, count: Callable[[int], None]) -> Clip:
     from openvima.video.prompt_strip import thumbnail
     from openvima.video.recorder import SceneRenderer
 
-    env = batch.env_config.make(batch.task, batch.level, domain="eval", realtime=True)
+    env = batch.make_env(realtime=True)
     env.reset(seed=batch.first_seed)
     poster = png(Image.fromarray(SceneRenderer(env, enlarge=2).draw(env.scene)))
     prompt = tuple(part if isinstance(part, str) else png(thumbnail(part)) for part in env.prompt.sequence())
@@ -214,18 +214,8 @@ def record_clip(batch: Batch, count: Callable[[int], None]) -> Clip:
         )
         video = path.read_bytes()
     count(1)
-    return Clip(
-        policy=batch.policy,
-        task=batch.task,
-        level=batch.level,
-        seed=batch.first_seed,
-        success=outcome.success,
-        steps=outcome.steps,
-        reason=outcome.reason,
-        prompt=prompt,
-        video=video,
-        poster=poster,
-    )
+    ended = (outcome.success, outcome.steps, outcome.reason)
+    return Clip(*batch.episode, *ended, prompt=prompt, video=video, poster=poster)
 
 
 def find_metrics(sources: Sequence[PolicySource]) -> list[Path]:

@@ -1,7 +1,6 @@
 """The studies of the package, which `studies.yaml` describes, and those of users."""
 
 import re
-from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from itertools import product
@@ -27,7 +26,6 @@ from openvima.studies.study import (
 )
 from openvima.user_code import is_code, load_function
 
-_T5_SIZES = ("t5-small", "t5-base", "t5-large")
 _DESCRIPTIONS: Mapping[str, dict[str, Any]] = yaml.safe_load(
     resources.files("openvima.studies").joinpath("studies.yaml").read_text(encoding="utf-8")
 )
@@ -70,7 +68,7 @@ def make_study(name: str, inputs: StudyInputs) -> Study:
         raise ConfigError(unknown_name("study", name, STUDIES))
     if name == "published":
         _check_published(inputs)
-    values = _fill({k: v for k, v in _DESCRIPTIONS[name].items() if k != "summary"}, _Names(inputs))
+    values = _fill({k: v for k, v in _DESCRIPTIONS[name].items() if k != "summary"}, _names(inputs))
     runs = tuple(run if isinstance(run, Run) else Run(**run) for run in values.pop("runs"))
     tasks, evaluation = values.pop("tasks", ()), values.pop("evaluation", {})
     if evaluation.pop("compat", False):
@@ -97,58 +95,39 @@ def _check_published(inputs: StudyInputs) -> None:
         )
 
 
-class _Names(dict[str, Any]):
+def _names(inputs: StudyInputs) -> dict[str, Any]:
     """What texts of `studies.yaml` can name."""
-
-    def __init__(self, inputs: StudyInputs) -> None:
-        scale, tasks = inputs.scale, (*TRAINING_TASKS, *L4_TASKS)
-        whole = [model for model in published_models() if model.data_fraction == 1]
-        sized = [model for model in whole if not model.aside]
-        fewer = {(m.model, m.size) for m in published_models() if m.data_fraction < 1 and not m.aside}
-        super().__init__(
-            inputs=inputs,
-            scale=scale,
-            checkpoint=inputs.checkpoint,
-            num_tasks=len(scale.tasks),
-            all_tasks=tasks,
-            distractor_tasks=tuple(task for task in tasks if task != "pick_in_order_then_restore"),
-            in_context_tasks=IN_CONTEXT_TASKS,
-            left_out=",".join(IN_CONTEXT_TASKS),
-            architectures=PUBLISHED,
-            sizes=[
-                SimpleNamespace(name=size, parameters=1e6 * int(size.removesuffix("m")))
-                for size in SIZE_NAMES[1 : SIZE_NAMES.index(scale.name) + 1]
-            ],
-            size_ticks={model.num_parameters: model.size for model in sized},
-            published_sizes=published_points(
-                sized, series=lambda model: model.model, x=lambda model: model.num_parameters
-            ),
-            published_fractions=published_points(
-                (m for m in published_models() if (m.model, m.size) in fewer), x=lambda m: m.data_fraction
-            ),
-            published_leading=published_points(leading_models()),
-            published_vima=published_points(m for m in whole if m.model == "VIMA"),
-            published_midas=published_points(
-                (m for m in whole if m.model.startswith("MIDAS") and m.size == "92M"),
-                x=lambda model: "autoregressive, residual",
-            ),
-        )
-
-    def __missing__(self, name: str) -> Any:  # what needs an option, or fails without it
-        inputs: StudyInputs = self["inputs"]
-        if name == "policies":
-            return inputs.policy_runs()
-        if name not in ("t5", "t5_folder"):
-            raise KeyError(name)
-        where = inputs.needed_t5()
-        if name == "t5":
-            return where
-        if where.rstrip("/").endswith(_T5_SIZES) and "/" in where:
-            raise ConfigError(
-                f"--t5 is {where!r}; this study needs several sizes: give the folder that holds "
-                f"{', '.join(_T5_SIZES)}, or 't5-base' to fetch them from the Hugging Face Hub."
-            )
-        return "" if where in _T5_SIZES else f"{where}/"
+    tasks = (*TRAINING_TASKS, *L4_TASKS)
+    whole = [model for model in published_models() if model.data_fraction == 1]
+    sized = [model for model in whole if not model.aside]
+    fewer = {(m.model, m.size) for m in published_models() if m.data_fraction < 1 and not m.aside}
+    return {
+        "inputs": inputs,
+        "policies": inputs.policy_runs(),
+        "num_tasks": len(inputs.scale.tasks),
+        "all_tasks": tasks,
+        "distractor_tasks": tuple(task for task in tasks if task != "pick_in_order_then_restore"),
+        "in_context_tasks": IN_CONTEXT_TASKS,
+        "left_out": ",".join(IN_CONTEXT_TASKS),
+        "architectures": PUBLISHED,
+        "sizes": [
+            SimpleNamespace(name=size, parameters=1e6 * int(size.removesuffix("m")))
+            for size in SIZE_NAMES[1 : SIZE_NAMES.index(inputs.scale.name) + 1]
+        ],
+        "size_ticks": {model.num_parameters: model.size for model in sized},
+        "published_sizes": published_points(
+            sized, series=lambda model: model.model, x=lambda model: model.num_parameters
+        ),
+        "published_fractions": published_points(
+            (m for m in published_models() if (m.model, m.size) in fewer), x=lambda m: m.data_fraction
+        ),
+        "published_leading": published_points(leading_models()),
+        "published_vima": published_points(m for m in whole if m.model == "VIMA"),
+        "published_midas": published_points(
+            (m for m in whole if m.model.startswith("MIDAS") and m.size == "92M"),
+            x=lambda model: "autoregressive, residual",
+        ),
+    }
 
 
 def _fill(value: Any, names: Mapping[str, Any]) -> Any:
@@ -164,7 +143,7 @@ def _fill(value: Any, names: Mapping[str, Any]) -> Any:
     own = {**value, **value.get("nano" if inputs.scale.is_nano else "papers", {})}
     filled = {key: _fill(each, names) for key, each in own.items() if key not in ("nano", "papers", "for")}
     if (network := filled.pop("network", None)) is not None:
-        filled |= NANO_POINTER if network == "pointer" else inputs.network(network)
+        filled = {**(NANO_POINTER if network == "pointer" else inputs.network(network)), **filled}
     return filled
 
 
@@ -173,4 +152,4 @@ def _choices(value: Any, names: Mapping[str, Any]) -> Iterator[Mapping[str, Any]
     repeated = _fill(value.get("for", {}), names) if isinstance(value, dict) else {}
     for values in product(*repeated.values()):
         chosen = dict(zip(repeated, values, strict=True))
-        yield ChainMap(chosen, names)  # type: ignore[arg-type]  # names compute some values when asked
+        yield {**names, **chosen}

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from openvima.data import GenerateConfig
 from openvima.data.subsets import SubsetConfig
 from openvima.errors import ConfigError
 from openvima.evaluation.config import DEFAULT_DEVICE, EvaluationConfig
@@ -67,11 +68,12 @@ class Plan:
         out: Its folder.
         how: `workers`, `engine` and `address` of the stages that run in parallel, as for `run_study`.
         device: Where networks are trained and act; None trains on a GPU if there is one, and acts on a CPU.
-        data: Folder of each data set.
+        data: Generation of each data set.
         subsets: Fractions of data sets, by folder.
         initial: Trainings that others start from, by folder.
         trainings: Trainings of the runs.
         evaluations: Evaluations of the runs.
+        initial_kinds: Settings and demonstrations of those in `initial`, in the order of their numbers.
     """
 
     study: Study
@@ -79,12 +81,12 @@ class Plan:
     out: Path
     how: Mapping[str, Any]
     device: str | None = None
-    data: dict[Demonstrations, Path] = field(default_factory=dict)
+    data: dict[Demonstrations, GenerateConfig] = field(default_factory=dict)
     subsets: dict[Path, Subset] = field(default_factory=dict)
     initial: dict[Path, Training] = field(default_factory=dict)
     trainings: list[Training] = field(default_factory=list)
     evaluations: list[Evaluation] = field(default_factory=list)
-    _kinds: list[tuple[Settings, Demonstrations]] = field(default_factory=list)  # of initial trainings
+    initial_kinds: list[tuple[Settings, Demonstrations]] = field(default_factory=list)
 
     @property
     def all_trainings(self) -> list[Training]:
@@ -95,61 +97,6 @@ class Plan:
     def num_stages(self) -> int:
         """Number of stages."""
         return sum(map(len, (self.data, self.subsets, self.all_trainings, self.evaluations)))
-
-    def add(self, run: Run, name: str, seed: int) -> None:
-        """Plan a run and seed. Runs of one seed play the same episodes, each seed its own."""
-        policy = run.policy
-        if policy is None:
-            policy = f"{name}={self._training(run, name, seed)}"
-        settings = run.evaluation or self.study.evaluation
-        config = EvaluationConfig(
-            policies=(policy,),
-            tasks=settings.tasks,
-            levels=settings.levels,
-            episodes=settings.episodes,
-            seed=seed * settings.episodes,
-            out=self.out / "evaluations" / name / f"seed-{seed}",
-            env_config=settings.env_config,
-            ablations=settings.ablations,
-            device=self.device or DEFAULT_DEVICE,
-            **self.how,
-        )
-        self.evaluations.append(Evaluation(run, seed, config))
-
-    def _training(self, run: Run, name: str, seed: int) -> Path:
-        demonstrations = run.data or self.study.data
-        assert demonstrations is not None  # checked by `Study`
-        data = self._subset(demonstrations, run.data_fraction, seed)
-        settings = dict(run.settings)
-        if run.init is not None:
-            settings["init_from"] = str(self._initial(run.init, demonstrations, data, seed))
-        out = self.out / "runs" / name / f"seed-{seed}"
-        self.trainings.append(Training(self._config(settings, data, out, seed), run.label))
-        return out
-
-    def _initial(self, settings: Settings, of: Demonstrations, data: Path, seed: int) -> Path:
-        kind = (settings, of)
-        if kind not in self._kinds:
-            self._kinds.append(kind)
-        out = self.out / "initial" / str(1 + self._kinds.index(kind)) / f"seed-{seed}"
-        self.initial[out] = Training(self._config(settings, data, out, seed))
-        return out
-
-    def _subset(self, demonstrations: Demonstrations, fraction: float, seed: int) -> Path:
-        source = self.data.setdefault(demonstrations, self.out / "data" / str(1 + len(self.data)))
-        if fraction == 1:
-            return source
-        out = source.with_name(f"{source.name}-{fraction:g}-seed-{seed}")
-        self.subsets[out] = SubsetConfig(source, out, seed=seed), fraction
-        return out
-
-    def _config(self, settings: Settings, data: Path, out: Path, seed: int) -> TrainingConfig:
-        scale, inputs = self.inputs.scale, self.inputs
-        merged: dict[str, Any] = recipe_settings(scale.recipe)
-        for others in (scale.settings, self.study.settings, settings):
-            merged = override(merged, others)
-        here = {"data": data, "out": out, "seed": seed, "assets": inputs.assets}
-        return TrainingConfig.of({**merged, **here, "runtime.device": self.device or "auto"})
 
 
 def plan_study(
@@ -175,9 +122,60 @@ def plan_study(
         raise ConfigError(f"labels {', '.join(names)} give the same folders; choose others.")
     plan = Plan(study, inputs, out, how, device)
     for run in study.runs:
+        name, settings = names[run.label], run.evaluation or study.evaluation
         for seed in range(seeds if run.policy is None else 1):
-            plan.add(run, names[run.label], seed)
+            # Runs of one seed play the same episodes, each seed its own.
+            config = EvaluationConfig(
+                policies=(run.policy or f"{name}={_plan_training(plan, run, name, seed)}",),
+                tasks=settings.tasks,
+                levels=settings.levels,
+                episodes=settings.episodes,
+                seed=seed * settings.episodes,
+                out=out / "evaluations" / name / f"seed-{seed}",
+                env_config=settings.env_config,
+                ablations=settings.ablations,
+                device=device or DEFAULT_DEVICE,
+                **how,
+            )
+            plan.evaluations.append(Evaluation(run, seed, config))
     return plan
+
+
+def _plan_training(plan: Plan, run: Run, name: str, seed: int) -> Path:
+    """Plan the training of a run and seed, with its demonstrations and initial weights; return its folder."""
+    demonstrations = run.data or plan.study.data
+    assert demonstrations is not None  # checked by `Study`
+    generated = GenerateConfig(
+        out=plan.out / "data" / str(1 + len(plan.data)),
+        tasks=demonstrations.tasks,
+        episodes=demonstrations.episodes,
+        env_config=demonstrations.env_config,
+        **plan.how,
+    )
+    data = plan.data.setdefault(demonstrations, generated).out
+    if run.data_fraction != 1:
+        source, data = data, data.with_name(f"{data.name}-{run.data_fraction:g}-seed-{seed}")
+        plan.subsets[data] = SubsetConfig(source, data, seed=seed), run.data_fraction
+    settings = dict(run.settings)
+    if run.init is not None:
+        kind = (run.init, demonstrations)
+        if kind not in plan.initial_kinds:
+            plan.initial_kinds.append(kind)
+        initial = plan.out / "initial" / str(1 + plan.initial_kinds.index(kind)) / f"seed-{seed}"
+        plan.initial[initial] = Training(_training_config(plan, run.init, data, initial, seed))
+        settings["init_from"] = str(initial)
+    out = plan.out / "runs" / name / f"seed-{seed}"
+    plan.trainings.append(Training(_training_config(plan, settings, data, out, seed), run.label))
+    return out
+
+
+def _training_config(plan: Plan, settings: Settings, data: Path, out: Path, seed: int) -> TrainingConfig:
+    scale = plan.inputs.scale
+    merged: dict[str, Any] = recipe_settings(scale.recipe)
+    for others in (scale.settings, plan.study.settings, settings):
+        merged = override(merged, others)
+    here = {"data": data, "out": out, "seed": seed, "assets": plan.inputs.assets}
+    return TrainingConfig.of({**merged, **here, "runtime.device": plan.device or "auto"})
 
 
 def _folder_name(label: str) -> str:

@@ -1,11 +1,11 @@
 """Results of a study: means over training seeds, differences and costs, and the page that shows them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from openvima.evaluation.ablations import ablation_parts, scenes_of
-from openvima.evaluation.results import Results
+from openvima.evaluation.results import Results, grouped
 from openvima.evaluation.statistics import (
     Interval,
     PairCounts,
@@ -56,9 +56,7 @@ class Point:
 def study_points(plan: Plan) -> list[Point]:
     """Read the evaluations of a study; points in the order of runs, ablations and levels."""
     study = plan.study
-    found: dict[str, list[Results]] = {}
-    for evaluation in plan.evaluations:
-        found.setdefault(evaluation.run.label, []).append(Results.read(evaluation.config.out))
+    found = grouped((each.run.label, Results.read(each.config.out)) for each in plan.evaluations)
     points = []
     for run in study.runs:
         has_plain, results = (run.evaluation or study.evaluation).plain, found[run.label]
@@ -138,10 +136,7 @@ def _outcomes(scores: _Scores, level: str) -> list[dict[str, dict[int, bool]]]:
 
 def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:
     """Read the costs of the trainings, by label; those that others start from under an empty one."""
-    costs: dict[str, list[dict[str, Any]]] = {}
-    for training in plan.all_trainings:
-        costs.setdefault(training.run, []).append(read_json(training.config.out / COST_FILE))
-    return costs
+    return grouped((each.run, read_json(each.config.out / COST_FILE)) for each in plan.all_trainings)
 
 
 def study_page(
@@ -170,8 +165,8 @@ def study_page(
         num_seeds=max(len(point.score.seeds) for point in points),
         levels=levels,
         figure=rate_figure_html(figure),
-        rows=_rows(points),
-        published_rows=_published_rows(study, figure),
+        rows=_by_level(((point.run, point.ablation), point) for point in points),
+        published_rows=_by_level((_published_name(point, figure), point) for point in study.published),
         tasks={level: max((p.tasks for p in points if p.level == level), key=len) for level in levels},
         points=points,
         costs=costs,
@@ -187,25 +182,25 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
 
     Values of the quantity that are names are numbered in the order in which they appear.
     """
-    values = list(dict.fromkeys([p.x for p in points] + [p.x for p in study.published]))
+    shown = (*points, *study.published)
+    values = list(dict.fromkeys(point.x for point in shown))
     named = any(isinstance(value, str) for value in values)
-    panels: dict[str, dict[tuple[str, bool], list[RatePoint]]] = {}
+
+    def placed(point: Point | PublishedPoint) -> tuple[tuple[str, bool], RatePoint]:
+        """Return the curve of a point, and its place."""
+        x = float(values.index(point.x) if named else point.x)
+        if isinstance(point, PublishedPoint):
+            return (point.series, True), RatePoint(x, point.rate)
+        score = point.score
+        seeds = tuple(mean for mean, _ in score.seeds) if len(score.seeds) > 1 else ()
+        return (point.series or "this study", False), RatePoint(x, score.mean, score.interval, seeds)
+
+    panels = {}
     for level in [""] if study.x_axis == "level" else dict.fromkeys(point.level for point in points):
-        curves = panels.setdefault(level or "All levels", {})
-        for point in (*points, *study.published):
-            if level not in ("", point.level):
-                continue
-            x = float(values.index(point.x) if named else point.x)
-            if isinstance(point, Point):
-                means = tuple(mean for mean, _ in point.score.seeds)
-                seeds = means if len(means) > 1 else ()
-                found = RatePoint(x, point.score.mean, point.score.interval, seeds)
-                curve = point.series or "this study", False
-            else:
-                found, curve = RatePoint(x, point.rate), (point.series, True)
-            curves.setdefault(curve, []).append(found)
-        for of_name in curves.values():
-            of_name.sort(key=lambda point: point.x)
+        curves = grouped(placed(point) for point in shown if level in ("", point.level))
+        panels[level or "All levels"] = {
+            name: sorted(found, key=lambda point: point.x) for name, found in curves.items()
+        }
     return RateFigure(
         caption=study.question,
         quantity=study.quantity,
@@ -216,19 +211,11 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
     )
 
 
-def _rows(points: Sequence[Point]) -> dict[tuple[str, str], dict[str, Point]]:
-    """Points by run and ablation, then by level."""
-    rows: dict[tuple[str, str], dict[str, Point]] = {}
-    for point in points:
-        rows.setdefault((point.run, point.ablation), {})[point.level] = point
-    return rows
+def _by_level(named: Iterable[tuple[Hashable, Point | PublishedPoint]]) -> Mapping[Hashable, Mapping]:
+    """Arrange points by the name of their row, then by level."""
+    return {name: {point.level: point for point in found} for name, found in grouped(named).items()}
 
 
-def _published_rows(study: Study, figure: RateFigure) -> dict[str, dict[str, PublishedPoint]]:
-    """Published numbers by the name of their row, then by level."""
-    rows: dict[str, dict[str, PublishedPoint]] = {}
-    for point in study.published:
-        x = point.x if isinstance(point.x, str) else figure.tick(point.x)
-        name = point.series if x == point.level else f"{point.series} · {x}"
-        rows.setdefault(name, {})[point.level] = point
-    return rows
+def _published_name(point: PublishedPoint, figure: RateFigure) -> str:
+    x = point.x if isinstance(point.x, str) else figure.tick(point.x)
+    return point.series if x == point.level else f"{point.series} · {x}"

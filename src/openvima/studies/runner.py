@@ -1,14 +1,14 @@
 """Running a study: stage after stage, each of which resumes after any kill."""
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file, folder_lock, is_lock_file
 from openvima.catalog.packs import load_assets
-from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data import Dataset, generate
 from openvima.data.manifest import is_finished
 from openvima.data.subsets import sample
 from openvima.errors import ConfigError, InputFileError, differences
@@ -21,7 +21,7 @@ from openvima.policies.base import require_torch
 from openvima.report.videos import require_extra
 from openvima.studies.plan import COST_FILE, Plan, Training, plan_study, record_of
 from openvima.studies.results import study_costs, study_page, study_points
-from openvima.studies.study import Demonstrations, Study, StudyInputs
+from openvima.studies.study import Study, StudyInputs
 from openvima.training.config import flatten
 
 SETTINGS_FILE = "settings.json"
@@ -73,10 +73,18 @@ def run_study(
     how: dict[str, Any] = {"workers": workers, "engine": engine, "address": address}
     plan = plan_study(study, inputs, out, seeds=seeds, device=device, **how)
     check_plan(plan)
+    done = 0
+
+    def say(note: str) -> None:
+        if report is not None:
+            report(done, plan.num_stages, note)
+
     with folder_lock(out):
         record = record_of(plan)
         _claim(out, record)
-        _Runner(plan, report or (lambda *_: None)).run()
+        for note in _run_stages(plan, say):
+            done += 1
+            say(note)
         points, costs = study_points(plan), study_costs(plan)
         versions = Results.read(plan.evaluations[0].config.out).versions
         content = {
@@ -100,8 +108,8 @@ def check_plan(plan: Plan) -> None:
     """
     require_extra()
     load_assets(plan.inputs.assets)
-    for demonstrations, out in plan.data.items():
-        _generate_config(demonstrations, out).resolved_tasks()
+    for config in plan.data.values():
+        config.resolved_tasks()
     if plan.trainings:
         require_torch("training")
         from openvima.training.building import resolve
@@ -135,48 +143,50 @@ def _claim(out: Path, record: dict[str, Any]) -> None:
         raise ConfigError(f"{out} holds another study: {shown}. Give another --out.")
 
 
-class _Runner:
-    """Runs the stages that are not done."""
+def _run_stages(plan: Plan, say: Callable[[str], None]) -> Iterator[str]:
+    """Run the stages that are not done.
 
-    def __init__(self, plan: Plan, report: Report) -> None:
-        self.plan, self.report, self.done = plan, report, 0
+    Args:
+        plan: The stages.
+        say: Called with notes on the stage that runs.
 
-    def run(self) -> None:
-        for demonstrations, out in self.plan.data.items():
-            if not is_finished(out):
-                config = replace(_generate_config(demonstrations, out), **self.plan.how)
-                generate(config, self._counting("generating"))
-            self._finish(f"demonstrations in {out.name}")
-        for out, subset in self.plan.subsets.items():
-            if not is_finished(out):
-                sample(*subset, report=self._counting("sampling"))
-            self._finish(out.name)
-        self._train(list(self.plan.initial.values()))
-        self._train(self.plan.trainings)
-        for evaluation in self.plan.evaluations:
-            name = f"{evaluation.run.label}, seed {evaluation.seed}"
-            evaluate(evaluation.config, self._counting(f"evaluating {name}"))
-            self._finish(f"evaluated {name}")
+    Yields:
+        A note after each stage.
+    """
 
-    def _counting(self, what: str) -> Report:
-        return lambda done, total, _: self._say(f"{what}: {done:,} of {total:,}")
+    def counting(what: str) -> Report:
+        return lambda done, total, _: say(f"{what}: {done:,} of {total:,}")
 
-    def _finish(self, note: str) -> None:
-        self.done += 1
-        self._say(note)
+    for config in plan.data.values():
+        if not is_finished(config.out):
+            generate(config, counting("generating"))
+        yield f"demonstrations in {config.out.name}"
+    for out, subset in plan.subsets.items():
+        if not is_finished(out):
+            sample(*subset, report=counting("sampling"))
+        yield out.name
+    yield from _train_missing([*plan.initial.values()], plan.how, say)
+    yield from _train_missing(plan.trainings, plan.how, say)
+    for evaluation in plan.evaluations:
+        name = f"{evaluation.run.label}, seed {evaluation.seed}"
+        evaluate(evaluation.config, counting(f"evaluating {name}"))
+        yield f"evaluated {name}"
 
-    def _say(self, note: str) -> None:
-        self.report(self.done, self.plan.num_stages, note)
 
-    def _train(self, trainings: Sequence[Training]) -> None:
-        missing = [each for each in trainings if not (each.config.out / COST_FILE).is_file()]
-        for _ in range(len(trainings) - len(missing)):
-            self._finish("trained before")
-        how, steps = self.plan.how, lambda steps: self._say(f"training, {steps:,} steps")
-        for training, _ in imap_with_engine(
-            how["engine"], train_one, missing, how["workers"], address=how["address"], report=steps
-        ):
-            self._finish(f"training {training.run or 'initial weights'}, seed {training.config.seed}")
+def _train_missing(
+    trainings: Sequence[Training], how: Mapping[str, Any], say: Callable[[str], None]
+) -> Iterator[str]:
+    missing = [each for each in trainings if not (each.config.out / COST_FILE).is_file()]
+    yield from ["trained before"] * (len(trainings) - len(missing))
+    for training, _ in imap_with_engine(
+        how["engine"],
+        train_one,
+        missing,
+        how["workers"],
+        address=how["address"],
+        report=lambda steps: say(f"training, {steps:,} steps"),
+    ):
+        yield f"training {training.run or 'initial weights'}, seed {training.config.seed}"
 
 
 def train_one(training: Training, count: Callable[[int], None]) -> None:
@@ -194,12 +204,3 @@ def train_one(training: Training, count: Callable[[int], None]) -> None:
         **read_costs(config.out),
     }
     atomic_write_file(config.out / COST_FILE, json.dumps(costs, indent=1) + "\n")
-
-
-def _generate_config(demonstrations: Demonstrations, out: Path) -> GenerateConfig:
-    return GenerateConfig(
-        out=out,
-        tasks=demonstrations.tasks,
-        episodes=demonstrations.episodes,
-        env_config=demonstrations.env_config,
-    )

@@ -28,6 +28,7 @@ TRAINING_TASKS = (  # of the papers
     "manipulate_old_neighbor",
     "pick_in_order_then_restore",
 )
+_T5_SIZES = ("t5-small", "t5-base", "t5-large")
 L4_TASKS = ("novel_adj_and_noun", "follow_motion", "sweep_without_touching", "same_texture")
 
 
@@ -175,6 +176,21 @@ class StudyInputs:
                 "'t5-base' to fetch it from the Hugging Face Hub."
             )
         return self.t5
+
+    @property
+    def t5_folder(self) -> str:
+        """Folder of T5 in all sizes, with a slash; empty where they are fetched.
+
+        Raises:
+            ConfigError: T5 is not given, or as a folder of one size.
+        """
+        where = self.needed_t5()
+        if where.rstrip("/").endswith(_T5_SIZES) and "/" in where:
+            raise ConfigError(
+                f"--t5 is {where!r}; this study needs several sizes: give the folder that holds "
+                f"{', '.join(_T5_SIZES)}, or 't5-base' to fetch them from the Hugging Face Hub."
+            )
+        return "" if where in _T5_SIZES else f"{where}/"
 
     def demonstrations(self, tasks: tuple[str, ...] = ()) -> Demonstrations:
         """Return the demonstrations of the scale; of its tasks if none are named."""

@@ -7,7 +7,7 @@ import base64
 import contextlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ from PIL import Image
 from openvima.atomic_io import atomic_path, atomic_write_file
 from openvima.errors import DatasetError, ShapeError, echo
 from openvima.imports import import_extra
+from openvima.input_files import MALFORMED
 
-FRAMES_PER_SECOND = 30
 # Every browser plays 4:2:0 chroma subsampling; the rest keeps textures clear at about 100 kB for 5 s.
 _PIXELS, _OPTIONS = "yuv420p", {"crf": "21", "preset": "medium"}
 
@@ -33,8 +33,20 @@ def import_av() -> Any:
     return import_extra("av", "videos need PyAV; install it with: pip install 'openvima[report]'")
 
 
-class VideoWriter:
-    """Writes one video, frame by frame; a context manager.
+WriteFrame = Callable[..., None]  # as `open_video` yields it
+
+
+@contextlib.contextmanager
+def open_video(
+    path: Path,
+    width: int,
+    height: int,
+    *,
+    frames_per_second: int,
+    pixels: str = _PIXELS,
+    options: Mapping[str, str] = _OPTIONS,
+) -> Iterator[WriteFrame]:
+    """Write one video, frame by frame.
 
     The file is H.264 with its index at the front. It appears under its name once it is complete; if the block
     raises, a file of that name is left as it was.
@@ -47,73 +59,50 @@ class VideoWriter:
         pixels: Pixel format.
         options: Options of x264, such as quality.
 
+    Yields:
+        A function that appends a frame of shape (height, width, 3), uint8. With `repeat` it does so as many
+        times, with `is_key` the first of these is encoded without others.
+
     Raises:
         MissingExtraError: PyAV is not installed.
-        ShapeError: A size is odd.
+        ShapeError: A size is odd, or a frame has another size or dtype.
 
     Example:
-        >>> with VideoWriter(Path("video.mp4"), 768, 384) as video:  # doctest: +SKIP
-        ...     video.write(frame)
+        >>> with open_video(Path("video.mp4"), 768, 384, frames_per_second=30) as write:  # doctest: +SKIP
+        ...     write(frame)
     """
-
-    def __init__(
-        self,
-        path: Path,
-        width: int,
-        height: int,
-        *,
-        frames_per_second: int = FRAMES_PER_SECOND,
-        pixels: str = _PIXELS,
-        options: Mapping[str, str] = _OPTIONS,
-    ) -> None:
-        if width % 2 or height % 2:
-            raise ShapeError(f"a video of {width} × {height} pixels cannot be encoded; both must be even.")
-        self._av = import_av()  # before a folder is made
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._shape = (height, width, 3)
-        with contextlib.ExitStack() as closing:
-            partial = closing.enter_context(atomic_path(path))
-            flags = {"movflags": "+faststart", "fflags": "+bitexact"}
-            self._container = self._av.open(str(partial), "w", format="mp4", options=flags)
-            self._stream = self._container.add_stream("libx264", rate=frames_per_second)
-            self._closing = closing.pop_all()
-        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, pixels
+    if width % 2 or height % 2:
+        raise ShapeError(f"a video of {width} × {height} pixels cannot be encoded; both must be even.")
+    av = import_av()  # before a folder is made
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as partial:
+        flags = {"movflags": "+faststart", "fflags": "+bitexact"}
+        container = av.open(str(partial), "w", format="mp4", options=flags)
+        stream = container.add_stream("libx264", rate=frames_per_second)
+        stream.width, stream.height, stream.pix_fmt = width, height, pixels
         # x264's macroblock tree gave other bytes in about 1 of 200 equal runs, in one thread as well
-        self._stream.options = {**options, "threads": "1", "x264-params": "mbtree=0"}
+        stream.options = {**options, "threads": "1", "x264-params": "mbtree=0"}
 
-    def write(self, frame: np.ndarray, *, repeat: int = 1, is_key: bool = False) -> None:
-        """Append a frame.
+        def write(frame: np.ndarray, *, repeat: int = 1, is_key: bool = False) -> None:
+            shape = (height, width, 3)
+            if frame.shape != shape or frame.dtype != np.uint8:
+                raise ShapeError(
+                    f"got a frame of {frame.shape} {frame.dtype}; the video takes {shape} uint8."
+                )
+            for number in range(repeat):
+                encoded = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+                if is_key and not number:
+                    encoded.pict_type = av.video.frame.PictureType.I
+                container.mux(stream.encode(encoded))
 
-        Args:
-            frame: Shape (height, width, 3), uint8.
-            repeat: How many times to append it.
-            is_key: Whether to encode the first of these without others.
-
-        Raises:
-            ShapeError: The frame has another size or dtype.
-        """
-        if frame.shape != self._shape or frame.dtype != np.uint8:
-            raise ShapeError(
-                f"got a frame of {frame.shape} {frame.dtype}; the video takes {self._shape} uint8."
-            )
-        for number in range(repeat):
-            encoded = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-            if is_key and not number:
-                encoded.pict_type = self._av.video.frame.PictureType.I
-            self._container.mux(self._stream.encode(encoded))
-
-    def __enter__(self) -> "VideoWriter":
-        return self
-
-    def __exit__(self, *exception: Any) -> None:  # kind, error and trace, as of any context manager
-        if exception[0] is not None:
+        try:
+            yield write
+            container.mux(stream.encode(None))
+        except BaseException:
             with contextlib.suppress(OSError):  # a container without frames cannot be finished
-                self._container.close()
-            self._closing.__exit__(*exception)
-            return
-        with self._closing:
-            self._container.mux(self._stream.encode(None))
-            self._container.close()
+                container.close()
+            raise
+        container.close()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,11 +181,11 @@ def save_clips(clips: Sequence[Clip], folder: Path) -> Path:
     records = []
     for clip in clips:
         atomic_write_file(folder / clip.file_name, clip.video)
-        prompt = [part if isinstance(part, str) else {"png": _text(part)} for part in clip.prompt]
-        record = asdict(clip) | {"prompt": prompt, "poster": _text(clip.poster)}
+        record = asdict(clip) | {"poster": _text(clip.poster)}
         del record["video"]
         records.append(record)
-    return atomic_write_file(folder / _INDEX, json.dumps(records, indent=1, ensure_ascii=False) + "\n")
+    content = json.dumps(records, indent=1, ensure_ascii=False, default=lambda image: {"png": _text(image)})
+    return atomic_write_file(folder / _INDEX, content + "\n")
 
 
 def load_clips(folder: Path) -> tuple[Clip, ...]:
@@ -210,7 +199,7 @@ def load_clips(folder: Path) -> tuple[Clip, ...]:
         return ()
     try:
         return tuple(_clip(record, index.parent) for record in json.loads(index.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, *MALFORMED) as error:
         raise DatasetError(
             f"{index} is damaged ({error}); delete {index.parent} and evaluate again."
         ) from error

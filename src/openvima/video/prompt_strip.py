@@ -84,9 +84,9 @@ def draw_prompt_strip(
     """
     margin = max(6, font_size // 2)
     typeface = font(font_size)
-    pieces = [_piece(part, image_height, typeface, font_size) for part in prompt_pieces(prompt)]
+    pieces = [_piece(part, image_height, font_size) for part in prompt_pieces(prompt)]
     if any(len(row) > len(pieces) for _, row in weights):
-        pieces.append(_piece("(end)", image_height, typeface, font_size))
+        pieces.append(_piece("(end)", image_height, font_size))
     lines = _wrap(pieces, width - 2 * margin)
     heights = [max((piece.height for piece in line), default=1) for line in lines]
     attended = _ROW_HEIGHT * len(weights) + (4 if weights else 0)
@@ -148,10 +148,10 @@ def font(size: int, *, bold: bool = False) -> "ImageFont.FreeTypeFont | ImageFon
     return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", name), size)
 
 
-def _piece(part: "str | PromptImage", image_height: int, typeface, font_size: int) -> _Piece:
+def _piece(part: "str | PromptImage", image_height: int, font_size: int) -> _Piece:
     space = font_size // 3
     if isinstance(part, str):
-        width = int(np.ceil(typeface.getlength(part)))
+        width = math.ceil(font(font_size).getlength(part))
         return _Piece(part, width, font_size, 0 if part[0] in _CLOSING else space)
     picture = thumbnail(part, image_height)
     return _Piece(picture, picture.width, picture.height, space)
@@ -178,14 +178,15 @@ def cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
         segm: Object ids, shape (H, W), uint8.
     """
     shown = (segm != BACKGROUND_ID) & (pixels != 255).any(axis=2)
-    if not shown.any():
+    box = Image.fromarray(shown).getbbox()
+    if box is None:
         return pixels
-    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    left, top, right, bottom = box
     margin = 4
-    height = int(rows[-1] - rows[0]) + 1 + 2 * margin
-    width = max(int(columns[-1] - columns[0]) + 1 + 2 * margin, height)
+    height = bottom - top + 2 * margin
+    width = max(right - left + 2 * margin, height)
     height = max(height, width // 2)
-    top = int(rows[0] + rows[-1] + 1 - height) // 2
-    left = int(columns[0] + columns[-1] + 1 - width) // 2
-    padded = np.pad(pixels, ((height, height), (width, width), (0, 0)), constant_values=255)
-    return padded[top + height : top + 2 * height, left + width : left + 2 * width]
+    left, top = (left + right - width) // 2, (top + bottom - height) // 2
+    cut = Image.new("RGB", (width, height), PAPER)
+    cut.paste(Image.fromarray(pixels), (-left, -top))
+    return np.asarray(cut)

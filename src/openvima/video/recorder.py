@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from openvima.scene.explanation import Explanation
 from openvima.sim.arm_view import arm_drawables
 from openvima.sim.primitive_state import FRAMES_PER_SECOND
 from openvima.sim.ur5 import HOME
-from openvima.video.encoder import VideoWriter
+from openvima.video.encoder import WriteFrame, open_video
 from openvima.video.explanation import attention_rows, draw_panel
 from openvima.video.prompt_strip import MUTED, PAPER, Colour, draw_prompt_strip, font
 
@@ -54,7 +55,7 @@ class SceneRenderer:
         return np.ascontiguousarray(channels_last(images["front"].rgb))
 
 
-class EpisodeRecorder:
+class EpisodeRecorder(ExitStack):
     """Records one episode of an environment in real time; a context manager.
 
     Args:
@@ -75,11 +76,12 @@ class EpisodeRecorder:
         with_prompt: bool = True,
         explain: Callable[[], Explanation] | None = None,
     ) -> None:
+        super().__init__()
         self._renderer, self._title, self._width = SceneRenderer(env), title, 256 * ENLARGE
         self._path, self._explain = path, explain
         self._panel: np.ndarray | None = None
-        self._strip: np.ndarray | None = None
-        self._video: VideoWriter | None = None
+        self._strip = np.zeros((0, self._width, 3), np.uint8)
+        self._write_frame: WriteFrame | None = None  # once the video is open
         self._last = VideoFrame(env.scene, HOME)
         if with_prompt:
             self._strip = draw_prompt_strip(env.prompt, width=self._width)
@@ -90,7 +92,7 @@ class EpisodeRecorder:
         """Append the frames of the environment's last step, with an explanation after a still of it."""
         if self._explain is not None:
             explanation = self._explain()
-            if self._video is None:
+            if self._write_frame is None:
                 nothing = {kind: 0 * row for kind, row in explanation.attention.items()}
                 self._draw_explanation(env, replace(explanation, attention=nothing), is_decided=False)
                 self._start()
@@ -104,17 +106,16 @@ class EpisodeRecorder:
         taken = f"{steps} step{'' if steps == 1 else 's'}"
         outcome = taken if success is None else f"solved in {taken}" if success else "not solved"
         colour = MUTED if success is None else _GOOD if success else _BAD
-        if self._video is None:  # no step was taken that could be explained
+        if self._write_frame is None:  # no step was taken that could be explained
             self._start()
         self._write(self._compose(outcome, colour), _STILL_END_S)
 
     def _compose(self, outcome: str = "", colour: Colour = MUTED) -> np.ndarray:
-        caption = _caption(self._title, self._width, outcome, colour)
         scene = self._renderer.draw(self._last.scene, self._last.joints)
+        shown = np.concatenate([scene, _caption(self._title, self._width, outcome, colour)])
         if self._panel is not None:
-            parts = [scene] if caption is None else [scene, caption]
-            scene, caption = _beside(np.concatenate(parts), self._panel), None
-        return np.concatenate([part for part in (self._strip, scene, caption) if part is not None])
+            shown = _beside(shown, self._panel)
+        return np.concatenate([self._strip, shown])
 
     def _draw_explanation(
         self, env: TabletopEnv, explanation: Explanation, *, is_decided: bool = True
@@ -128,21 +129,13 @@ class EpisodeRecorder:
     def _start(self) -> None:
         """Open the video, and write a still of the start."""
         first = self._compose()
-        self._video = VideoWriter(
-            self._path, first.shape[1], first.shape[0], frames_per_second=FRAMES_PER_SECOND
-        )
+        video = open_video(self._path, first.shape[1], first.shape[0], frames_per_second=FRAMES_PER_SECOND)
+        self._write_frame = self.enter_context(video)
         self._write(first, _STILL_START_S)
 
     def _write(self, frame: np.ndarray, seconds: float = 0.0) -> None:
-        assert self._video is not None  # it was started
-        self._video.write(frame, repeat=max(1, math.ceil(seconds * FRAMES_PER_SECOND)))
-
-    def __enter__(self) -> "EpisodeRecorder":
-        return self
-
-    def __exit__(self, *exception) -> None:
-        if self._video is not None:
-            self._video.__exit__(*exception)
+        assert self._write_frame is not None  # it was started
+        self._write_frame(frame, repeat=max(1, math.ceil(seconds * FRAMES_PER_SECOND)))
 
 
 def _beside(scene: np.ndarray, panel: np.ndarray) -> np.ndarray:
@@ -153,10 +146,9 @@ def _beside(scene: np.ndarray, panel: np.ndarray) -> np.ndarray:
     return both
 
 
-def _caption(title: str, width: int, outcome: str, colour: Colour) -> np.ndarray | None:
-    if not title:
-        return None
-    line = Image.new("RGB", (width, 32), PAPER)
+def _caption(title: str, width: int, outcome: str, colour: Colour) -> np.ndarray:
+    """Draw title and outcome in a line; without a title it has no height."""
+    line = Image.new("RGB", (width, 32 if title else 0), PAPER)
     draw = ImageDraw.Draw(line)
     draw.text((11, 16), title, font=font(15), fill=MUTED, anchor="lm")
     if outcome:

@@ -17,7 +17,7 @@ from openvima.data.lerobot_frames import FrameLayout, step_trajectory
 from openvima.errors import ActionError
 from openvima.scene import END_EFFECTORS, Action
 from openvima.scene.action import ToolCommand
-from openvima.video.encoder import VideoWriter
+from openvima.video.encoder import open_video
 
 
 @pytest.mark.parametrize("has_joints", [True, False])
@@ -111,10 +111,10 @@ def pictures(number: int, seed: int = 0) -> np.ndarray:
 
 def write(path: Path, episodes: list[np.ndarray], *, fps: int) -> Path:
     height, width = episodes[0].shape[2:]
-    with VideoWriter(path, width, height, frames_per_second=fps, pixels="yuv444p") as video:
+    with open_video(path, width, height, frames_per_second=fps, pixels="yuv444p") as write_frame:
         for episode in episodes:
             for step, picture in enumerate(episode):
-                video.write(np.moveaxis(picture, 0, -1), is_key=step == 0)
+                write_frame(np.moveaxis(picture, 0, -1), is_key=step == 0)
     return path
 
 
