@@ -194,7 +194,9 @@ def test_harder_episodes_are_replayed_with_their_own_environment(tmp_path):
     rows = tuple(replace(row, ablation=row.ablation.replace("6", "2")) for row in results.rows)
     settings = {**results.config, "ablations": ["num_distractors:2", "paraphrased_prompts"]}
     path.write_text(replace(results, rows=rows, config=settings).to_json())
-    assert "num_distractors:2), rotate, L1, seed 0, replayed: reason is" in verify_results(tmp_path).problems[0]
+    assert (
+        "num_distractors:2), rotate, L1, seed 0, replayed: reason is" in verify_results(tmp_path).problems[0]
+    )
     path.write_text(replace(results, rows=rows).to_json())
     assert "the ablations of the rows are not those of the settings" in verify_results(tmp_path).problems
     for row in results.rows:  # under an ablation that does not exist, or for another task
