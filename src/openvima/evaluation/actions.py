@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
+from openvima.data.encoding import list_rows
 from openvima.data.shard import DAMAGE_ERRORS
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import DatasetError, OracleError, one_line
@@ -63,7 +64,7 @@ def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]], *, contro
     seeds = np.array([seed for seed, _ in records], np.int64)
     width = _WIDTHS[control]
     numbers = np.array([step for _, step in records], np.float32).reshape(-1, width)
-    table = pa.table({"seed": seeds, "action": list(numbers)}, schema=_SCHEMAS[width])
+    table = pa.table([pa.array(seeds), list_rows(numbers)], schema=_SCHEMAS[width])
     with atomic_write(folder / ACTIONS_NAME) as sink, pa.ipc.new_file(sink, table.schema) as writer:
         writer.write_table(table)
     return _digest(seeds, numbers)
