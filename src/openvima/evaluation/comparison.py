@@ -9,7 +9,7 @@ from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.errors import ConfigError, UnknownPolicyError, brief_repr, unknown_name
 from openvima.evaluation.ablations import scenes_of
-from openvima.evaluation.results import Results, Row, grouped
+from openvima.evaluation.results import Results, Row, group_by_key
 from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.evaluation.statistics import Interval, PairCounts, holm, mcnemar, mean_difference
 
@@ -103,7 +103,7 @@ def _is_same(policy: str, evaluations: Sequence[Results]) -> bool:
 
 def _rows(evaluations: Mapping[str, Results], names: Mapping[str, Mapping[str, str]]) -> tuple[Row, ...]:
     """All rows under their new names, in the order policy, ablation, level, task."""
-    cells = grouped(
+    cells = group_by_key(
         ((names[label][row.policy], row.ablation, row.level, row.task), row)
         for label, results in evaluations.items()
         for row in results.rows
@@ -126,7 +126,7 @@ def _join_rows(policy: str, rows: Sequence[Row]) -> Row:
 
 def _versions(found: Sequence[Results]) -> tuple[dict[str, str], tuple[str, ...]]:
     """Versions of all evaluations, and a note if they differ."""
-    all_versions = grouped(item for results in found for item in results.versions.items())
+    all_versions = group_by_key(item for results in found for item in results.versions.items())
     versions = {package: " / ".join(dict.fromkeys(each)) for package, each in all_versions.items()}
     differing = [f"{package} {text}" for package, text in versions.items() if " / " in text]
     if not differing:
@@ -302,7 +302,7 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 
 def _rows_of(results: Results, name: str) -> Rows:
     """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
-    rows = grouped(
+    rows = group_by_key(
         (ABLATION_SEPARATOR.join(filter(None, (row.policy, row.ablation))), row) for row in results.rows
     )
     if name not in rows:

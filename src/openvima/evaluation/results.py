@@ -161,7 +161,7 @@ class Results:
     actions_sha256: str = ""
 
     def __repr__(self) -> str:
-        rates = grouped(
+        rates = group_by_key(
             (f"{each.policy}, {each.ablation}".removesuffix(", "), f"{100 * each.mean:.1f} % on {each.level}")
             for each in self.level_means()
         )
@@ -199,7 +199,7 @@ class Results:
 
     def means(self) -> dict[tuple[str, str, str], LevelMean]:
         """The same means by policy, ablation and level; the ablation is empty for the plain score."""
-        cells = grouped(((row.policy, row.ablation, row.level), row) for row in self.rows)
+        cells = group_by_key(((row.policy, row.ablation, row.level), row) for row in self.rows)
         means = {}
         for (policy, ablation, level), rows in cells.items():
             mean = mean_of_rates([(row.successes, row.episodes) for row in rows])
@@ -267,7 +267,7 @@ class Results:
         return read_results(as_path(path))[0]
 
 
-def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+def group_by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
     """Collect the values of each key, both in the order in which they come."""
     groups: dict[K, list[V]] = {}
     for key, value in pairs:

@@ -20,7 +20,7 @@ from openvima.evaluation.results import (
     EpisodeOutcome,
     Results,
     Row,
-    grouped,
+    group_by_key,
     read_results,
     versions,
 )
@@ -148,7 +148,7 @@ def _stated(results: Results, text: str) -> tuple[str, list[str]]:
 def _row_problems(results: Results, whole: EvaluationConfig) -> Iterator[str]:
     """Compare the rows with the settings: no task, level or seed is missing, added or doubled."""
     last = whole.seed + whole.episodes - 1
-    played = grouped(((row.policy, row.ablation), (row.task, row.level)) for row in results.rows)
+    played = group_by_key(((row.policy, row.ablation), (row.task, row.level)) for row in results.rows)
     for row in results.rows:
         if [outcome.seed for outcome in row.outcomes] != [*range(whole.seed, last + 1)]:
             yield f"{_named(row)} has other seeds than {whole.seed} to {last}"

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from openvima.errors import UnknownTaskError
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
-from openvima.evaluation.results import Results, grouped
+from openvima.evaluation.results import Results, group_by_key
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.report.published import (
     BESIDE,
@@ -184,7 +184,7 @@ def result_table(results: Results, *, published: bool = False) -> Table:
 
 def ablations_by_policy(results: Results) -> dict[str, list[str]]:
     """Return the input ablations that each policy was evaluated with; without any it is left out."""
-    return grouped(dict.fromkeys((row.policy, row.ablation) for row in results.rows if row.ablation))
+    return group_by_key(dict.fromkeys((row.policy, row.ablation) for row in results.rows if row.ablation))
 
 
 def ablation_tables(results: Results) -> list[Table]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from openvima.evaluation.ablations import ablation_parts, scenes_of
-from openvima.evaluation.results import Results, grouped
+from openvima.evaluation.results import Results, group_by_key
 from openvima.evaluation.statistics import (
     Interval,
     PairCounts,
@@ -56,7 +56,7 @@ class Point:
 def study_points(plan: Plan) -> list[Point]:
     """Read the evaluations of a study; points in the order of runs, ablations and levels."""
     study = plan.study
-    found = grouped((each.run.label, Results.read(each.config.out)) for each in plan.evaluations)
+    found = group_by_key((each.run.label, Results.read(each.config.out)) for each in plan.evaluations)
     points = []
     for run in study.runs:
         has_plain, results = (run.evaluation or study.evaluation).plain, found[run.label]
@@ -136,7 +136,7 @@ def _outcomes(scores: _Scores, level: str) -> list[dict[str, dict[int, bool]]]:
 
 def study_costs(plan: Plan) -> dict[str, list[dict[str, Any]]]:
     """Read the costs of the trainings, by label; those that others start from under an empty one."""
-    return grouped((each.run, read_json(each.config.out / COST_FILE)) for each in plan.all_trainings)
+    return group_by_key((each.run, read_json(each.config.out / COST_FILE)) for each in plan.all_trainings)
 
 
 def study_page(
@@ -197,7 +197,7 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
 
     panels = {}
     for level in [""] if study.x_axis == "level" else dict.fromkeys(point.level for point in points):
-        curves = grouped(placed(point) for point in shown if level in ("", point.level))
+        curves = group_by_key(placed(point) for point in shown if level in ("", point.level))
         panels[level or "All levels"] = {
             name: sorted(found, key=lambda point: point.x) for name, found in curves.items()
         }
@@ -213,7 +213,7 @@ def study_figure(study: Study, points: Sequence[Point]) -> RateFigure:
 
 def _by_level(named: Iterable[tuple[Hashable, Point | PublishedPoint]]) -> Mapping[Hashable, Mapping]:
     """Arrange points by the name of their row, then by level."""
-    return {name: {point.level: point for point in found} for name, found in grouped(named).items()}
+    return {name: {point.level: point for point in found} for name, found in group_by_key(named).items()}
 
 
 def _published_name(point: PublishedPoint, figure: RateFigure) -> str:
