@@ -54,9 +54,12 @@ def main(
     for module in ("viser", "trimesh"):
         import_extra(module, f"the studio needs {module}; install it with: pip install 'openvima[studio]'")
     from openvima.env import EnvConfig
+    from openvima.errors import ConfigError
     from openvima.studio.app import Studio
     from openvima.studio.browser_session import StudioConfig
 
+    if path is not None and not path.exists():
+        raise ConfigError(f"there is no {path}; name the folder of an evaluation or of demonstrations.")
     config = StudioConfig(
         path,
         parse_list(policies),
