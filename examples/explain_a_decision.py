@@ -23,9 +23,10 @@ while True:
         print(f"  pick   {each.probability:6.1%}  {names['texture']} {names['object']}")
     for place in sorted(explanation.places, key=lambda place: -place.probability)[:2]:
         print(f"  place  {place.probability:6.1%}  {place.kind}, {np.round(place.position, 2)} m")
-    best = explanation.yaw_probabilities.argmax()
-    angle = np.rad2deg(explanation.yaw_rad[best])
-    print(f"  rotate {explanation.yaw_probabilities[best]:6.1%}  {angle:.0f}°, counter-clockwise above 0")
+    if len(explanation.yaw_rad):  # openvima-vima rotates by `bins`
+        best = explanation.yaw_probabilities.argmax()
+        angle = np.rad2deg(explanation.yaw_rad[best])
+        print(f"  rotate {explanation.yaw_probabilities[best]:6.1%}  {angle:.0f}°, counter-clockwise above 0")
     for kind, weights in explanation.attention.items():
         print(f"  the {kind} attends to {explanation.prompt[weights.argmax()]} most: {weights.max():.0%}")
     observation, _, terminated, truncated, info = env.step(action)

@@ -38,17 +38,16 @@ def main(
         out: MP4 file to write.
         seed: Number of the episode.
         level: train, L1 to L8; by default the task's first.
-        policy: oracle, openvima-small (bundled), random, untrained, untrained:PRESET (random weights), the
-            folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
-            a published file, OWNER/NAME[@REVISION] on the Hub, a policy server (ws://HOST:PORT), or a
-            vision-language model (vlm:MODEL), whose words are drawn beside the video.
+        policy: oracle, openvima-small or openvima-vima (bundled), random, untrained, untrained:PRESET (random
+            weights), the folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of
+            your own, a published file, OWNER/NAME[@REVISION] on the Hub, a policy server (ws://HOST:PORT), or
+            a vision-language model (vlm:MODEL), whose words are drawn beside the video.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
         trust_code: Run the code that a run folder names, as that of a learner of your own does.
         explain: Draw beside the video what the policy considers at each step: probabilities of objects,
-            places and rotations, and attention to the prompt. For openvima-small, nano, nano-bins, small,
-            vima-* and flamingo-*.
+            places and rotations, and attention to the prompt. See docs/explain.md for what explains itself.
         base_url: Address of the OpenAI-compatible server of a model vlm:MODEL, such as
             http://127.0.0.1:8000/v1; by default that of OPENAI_BASE_URL, else OpenAI's own.
         view: Camera that it sees, and in whose picture it points; top+front shows both.

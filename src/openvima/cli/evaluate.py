@@ -148,13 +148,13 @@ def main(
     Example: openvima evaluate --policy mine=runs/first --ablations all --levels L1,L2 --workers 2
 
     Args:
-        policy: One or more of openvima-small (a bundled checkpoint), oracle, random, untrained,
+        policy: One or more of openvima-small and openvima-vima (bundled), oracle, random, untrained,
             untrained:PRESET (random weights), folders of training runs, FILE.py:FUNCTION or MODULE:FUNCTION
             that makes a policy of your own, published files, OWNER/NAME[@REVISION] on the Hub, policy servers
             (ws://HOST:PORT, see `openvima serve`), LeRobot policies (lerobot:PATH or
             lerobot:OWNER/NAME[@REVISION], see --python) and vision-language models (vlm:MODEL, see
-            --base-url), with commas in between; NAME=FOLDER,
-            NAME=FILE.py:FUNCTION and so on give another name.
+            --base-url), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give another
+            name.
         tasks: Names of tasks with commas in between; all; or heldout, the four tasks of L4 that training
             does not see. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1 to L8; from L5 on they are beyond the benchmark.

@@ -31,9 +31,9 @@ def main(
     Example: openvima serve runs/first --port 8000
 
     Args:
-        policy: openvima-small (bundled), the folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION
-            that makes a policy of your own, a published file, OWNER/NAME[@REVISION] on the Hub,
-            random, untrained or untrained:PRESET (random weights).
+        policy: openvima-small or openvima-vima (bundled), the folder of a training run, FILE.py:FUNCTION or
+            MODULE:FUNCTION that makes a policy of your own, a published file, OWNER/NAME[@REVISION] on the
+            Hub, random, untrained or untrained:PRESET (random weights).
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
         host: Interface to listen on. Any but the loopback interface needs a token, a word that clients must
             know: that of the environment variable OPENVIMA_SERVE_TOKEN. Clients read it from there, too.

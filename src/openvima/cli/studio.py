@@ -37,8 +37,8 @@ def main(
         path: Folder of an evaluation or of demonstrations to browse.
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
         open: Open the page in a browser.
-        policies: Policies to offer besides openvima-small, oracle, random and you, with commas between them:
-            what `openvima evaluate --policy` takes.
+        policies: Policies to offer besides the bundled ones, oracle, random and you, with commas between
+            them: what `openvima evaluate --policy` takes.
         record_demonstrations: Folder to which own successes are written as demonstrations of domain "user".
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
@@ -54,9 +54,12 @@ def main(
     for module in ("viser", "trimesh"):
         import_extra(module, f"the studio needs {module}; install it with: pip install 'openvima[studio]'")
     from openvima.env import EnvConfig
+    from openvima.errors import ConfigError
     from openvima.studio.app import Studio
     from openvima.studio.browser_session import StudioConfig
 
+    if path is not None and not path.exists():
+        raise ConfigError(f"there is no {path}; name the folder of an evaluation or of demonstrations.")
     config = StudioConfig(
         path,
         parse_list(policies),

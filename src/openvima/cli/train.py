@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """Train a policy on demonstrations by behaviour cloning, or resume an interrupted run.
 
-With nano, nano-bins and small, contrastive pretraining of the crop encoder on rendered scenes comes first.
+With nano, nano-bins, small, vima-nano and midas-nano, crops are pretrained on rendered scenes first.
 The same command resumes an interrupted run from its last checkpoint.
 
 Example: openvima train --data demos --preset nano --out run

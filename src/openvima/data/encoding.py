@@ -133,9 +133,8 @@ class ShardInfo:
             fields = json.loads((metadata or {}).get(_METADATA_KEY, b"{}"))
             written_as = fields.pop("schema", None)
             if written_as != SCHEMA_VERSION:
-                raise DatasetError(
-                    f"it has schema version {written_as}; this package reads {SCHEMA_VERSION}."
-                )
+                found = f"schema version {written_as}" if written_as else "no demonstrations"
+                raise DatasetError(f"it holds {found}; this package reads version {SCHEMA_VERSION}.")
             fields.pop("difficulty", None)  # always easy
             info = ShardInfo(**fields)
             for name in ("task", "level", "domain", "assets"):  # of which names of files are made

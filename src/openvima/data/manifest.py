@@ -231,7 +231,7 @@ def explain_missing(folder: Path, name: str = MANIFEST_NAME) -> str:
     if not folder.is_dir():
         return f"there is no folder {folder}; `openvima generate --out {shlex.quote(str(folder))}` makes one."
     inner = sorted(folder.glob(f"*/{MANIFEST_NAME}"))  # as in the folder that `openvima data split` writes
-    hint = f", but {inner[0].parent} does" if inner else ""
+    hint = f", but {inner[0].parent} does" if inner else "; repeat an interrupted `openvima generate`"
     return f"{folder} holds no finished data set ({name} is missing){hint}."
 
 

@@ -101,9 +101,14 @@ def leading_models() -> list[PublishedModel]:
     return list({row.model: row for row in whole}.values())  # sizes ascend
 
 
-def models_by_task() -> list[PublishedModel]:
-    """Models with published rates by task."""
-    return [model for model in published_models() if model.tasks]
+def models_by_task(results: Results) -> list[PublishedModel]:
+    """Models with published rates of tasks that were evaluated."""
+    played = {(row.level, row.task) for row in results.rows}
+    return [
+        model
+        for model in published_models()
+        if any(task in model.tasks.get(level, {}) for level, task in played)
+    ]
 
 
 def beside() -> PublishedModel:
@@ -113,7 +118,7 @@ def beside() -> PublishedModel:
 
 def has_published_tasks(results: Results) -> bool:
     """Whether `BESIDE` was evaluated on one of the tasks of these results."""
-    return any(row.task in beside().tasks.get(row.level, {}) for row in results.rows)
+    return beside() in models_by_task(results)
 
 
 def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | None = None) -> float | None:

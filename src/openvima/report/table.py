@@ -18,6 +18,7 @@ _LATEX_TEXT = {
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
+    "`": r"\textasciigrave{}",
     "−": "$-$",
     "≈": r"$\approx$",
 }

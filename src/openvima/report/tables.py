@@ -165,7 +165,7 @@ def result_table(results: Results, *, published: bool = False) -> Table:
         results: The evaluation.
         published: Whether to add the published rates by task.
     """
-    policies, models = results.policy_names(), models_by_task() if published else []
+    policies, models = results.policy_names(), models_by_task(results) if published else []
     lines: list[Line] = []
     for level in results.levels():
         tasks = results.tasks(level)
@@ -179,7 +179,7 @@ def result_table(results: Results, *, published: bool = False) -> Table:
     control = f", control {results.config['control']}" if "control" in results.config else ""
     about = f". {BY_TASK}" if published else ""
     columns = ("task", "level", *policies, *(f"{each.model} {each.size} (published)" for each in models))
-    return Table("results", f"success rates in % (95 % interval){control}{about}", columns, tuple(lines))
+    return Table("results", f"Success rates (%), with 95 % intervals{control}{about}", columns, tuple(lines))
 
 
 def ablations_by_policy(results: Results) -> dict[str, list[str]]:
