@@ -11,7 +11,7 @@ import openvima
 from openvima.catalog import Pool
 from openvima.evaluation.recording import save_episode_image
 from openvima.evaluation.statistics import wilson_interval
-from openvima.report.published import models_by_task
+from openvima.report.published import published_models
 from openvima.tasks import TaskSpec, list_tasks, task_spec
 from openvima.tasks.registry import oracle_record
 
@@ -150,7 +150,7 @@ def score_table(spec: TaskSpec, scores: Mapping[str, Mapping[tuple[str, str], Sc
     ]
     for policy, rates in scores.items():
         lines.append(f"| {policy} | {' | '.join(rated(rates.get((spec.name, level))) for level in levels)} |")
-    for model in models_by_task():
+    for model in published_models():
         rates = [model.written_task(level, spec.name) for level in levels]
         if any(rate != "–" for rate in rates):
             lines.append(f"| {model.model} {model.size}, published | {' | '.join(rates)} |")
