@@ -34,10 +34,10 @@ def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Let a library write a file under a temporary name, and rename it when the block succeeds.
+    """Let a library write a file or folder under a temporary name, and rename it when the block succeeds.
 
     An exception leaves nothing, a crash a hidden `.tmp` file, which the next writer of that name deletes. The
-    folder must exist.
+    folder that it is in must exist.
 
     Args:
         path: Final name; an existing file is replaced atomically.
@@ -103,24 +103,19 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     path = path.resolve()  # follow links
     restore_folder(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    remove_stale(path.parent, path.name)
-    _remove(temporary)
+    backup = _backup_path(path)
     try:
-        with naming(path, temporary):
+        with atomic_path(path) as temporary:
+            _remove(temporary)
             temporary.mkdir()
             yield temporary
             sync_files(temporary)
-            backup = _backup_path(path)
             if path.exists():
                 shutil.rmtree(backup, ignore_errors=True)
                 os.replace(path, backup)
-            os.replace(temporary, path)
-            sync_file(path.parent)
-            shutil.rmtree(backup, ignore_errors=True)
+        shutil.rmtree(backup, ignore_errors=True)
     finally:
         restore_folder(path)
-        _remove(temporary)
 
 
 def restore_folder(path: Path) -> None:

@@ -15,7 +15,6 @@ from openvima.errors import (
     ConfigError,
     DatasetError,
     InputFileError,
-    OpenVimaError,
     ServerError,
     echo,
 )
@@ -23,10 +22,10 @@ from openvima.evaluation.results import FILE_NAME, Results
 from openvima.evaluation.sources import weights_hash
 from openvima.evaluation.verification import is_marked_verified
 from openvima.hub import HubName, commit, hub_name
-from openvima.input_files import as_path, read_yaml
+from openvima.input_files import as_path
 from openvima.policies.base import require_torch
+from openvima.policies.loading import run_setting
 from openvima.policies.naming import (
-    CHECKPOINTS_FOLDER,
     CONFIG_FILE,
     TOKENIZER_FOLDER,
     WEIGHTS_FILE,
@@ -165,30 +164,17 @@ def _network(folder: Path) -> str:
 
 def _training(folder: Path) -> str:
     """Say what the run recorded about data and settings."""
-    recorded = _recorded(folder)
-    if not recorded:
+    run = folder if run_setting(folder, "training")[1] else folder / _BUNDLED_RUN
+    if not (training := run_setting(run, "training")[1]):
         return "Not recorded: the checkpoint does not lie in its run folder.\n"
-    data = recorded.get("demonstrations") or {}
-    settings = flatten(recorded["training"])
+    settings = flatten(training)
     values = {
-        "demonstrations": data.get("episodes"),
+        "demonstrations": run_setting(run, "demonstrations", "episodes")[1],
         "tasks left out": settings.get("loader.exclude_tasks"),
-        "held-out demonstrations among them": data.get("held_out"),
+        "held-out demonstrations among them": run_setting(run, "demonstrations", "held_out")[1],
         **{name: settings.get(name) for name in _SETTINGS},
     }
     return _facts("What the run folder records.", values)
-
-
-def _recorded(folder: Path) -> Mapping[str, Any]:
-    """Return what the run of a checkpoint recorded; nothing if it is not there."""
-    run = folder.absolute().parent
-    for place in (run.parent if run.name == CHECKPOINTS_FOLDER else folder, folder / _BUNDLED_RUN):
-        try:
-            if "training" in (recorded := read_yaml(place / CONFIG_FILE)):
-                return recorded
-        except (OSError, OpenVimaError):
-            continue
-    return {}
 
 
 def _scores(path: Path | None, folder: Path, name: HubName) -> str:

@@ -153,7 +153,3 @@ def _fail(message: str, status: int) -> int:
     """Print a message in one line; what it quotes of a file may hold anything."""
     print(f"openvima: {echo(message, _MAX_MESSAGE)}", file=sys.stderr)
     return status
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -35,12 +35,7 @@ from openvima.policies.tensor_files import (
 from openvima.policies.tokenizer import Tokenizer, WordTokenizer
 
 _KIND = "network"
-_PRECISIONS = {
-    "float32": torch.float32,
-    "bfloat16": torch.bfloat16,
-    "float16": torch.float16,
-    "float64": torch.float64,
-}
+_PRECISIONS = ("float32", "bfloat16", "float16", "float64")
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,11 +157,11 @@ def read_info(folder: Path) -> CheckpointInfo:
     """
     file, values = folder / CONFIG_FILE, read_description(folder, _KIND)
     precision = values.get("precision", "float32")
-    if not isinstance(precision, str) or precision not in _PRECISIONS:
+    if precision not in _PRECISIONS:
         raise InputFileError(f"{file}: precision is {short(precision)}; allowed: {', '.join(_PRECISIONS)}.")
     try:
         config = config_from_dict(values["config"])
-        return CheckpointInfo(config, _PRECISIONS[precision], str(values.get("digest", "")))
+        return CheckpointInfo(config, getattr(torch, precision), str(values.get("digest", "")))
     except ConfigError as error:
         raise InputFileError(f"{file}: {error}") from error
 

@@ -84,19 +84,9 @@ class _Episodes:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _LastStep:
-    """What `explain` needs to decode the last step once more.
-
-    Args:
-        observations: Those of the episodes that acted.
-        inputs: What was decoded from.
-        decoded: What was decoded.
-    """
-
-    observations: Sequence[Mapping]
-    inputs: StepInputs
-    decoded: Decoded
+# What `explain` needs to decode a step once more: observations of the episodes that acted, what was decoded
+# from, and what was decoded.
+_Step = tuple[Sequence[Mapping], StepInputs, Decoded]
 
 
 class NetworkPolicy(Policy):
@@ -157,7 +147,7 @@ class NetworkPolicy(Policy):
         self._is_bounded = False  # batches of one's own may be as large as the memory allows
         self._prompts: tuple[RenderedPrompt, ...] = ()
         self._episodes: _Episodes | None = None
-        self._last_step: _LastStep | None = None
+        self._last_step: _Step | None = None
 
     @torch.inference_mode()
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
@@ -245,14 +235,15 @@ class NetworkPolicy(Policy):
             )
         from openvima.policies.explaining import explain_row
 
-        trace = self.network.explain_step(last.inputs, last.decoded)
+        seen, inputs, decoded = last
+        trace = self.network.explain_step(inputs, decoded)
         for row, (index, action) in enumerate(zip(episodes.indices, episodes.actions(), strict=True)):
             explanations[index] = explain_row(
                 trace,
                 row,
                 action,
                 self._prompts[index],
-                last.observations[row],
+                seen[row],
                 self.processor,
                 temperature=self._temperature,
                 follow_coreference=getattr(self.network.config, "coreference", False),
@@ -319,7 +310,7 @@ class NetworkPolicy(Policy):
         self,
         episodes: _Episodes,
         observations: Sequence[Mapping],
-    ) -> tuple[_Episodes, _LastStep]:
+    ) -> tuple[_Episodes, _Step]:
         """Decode one action for every episode."""
         batch, stack = self.processor.encode_observations(
             [[each] for each in observations], episodes.num_slots
@@ -352,7 +343,7 @@ class NetworkPolicy(Policy):
             margins_B=torch.stack(margins).amin(0) if margins else None,
             features=features,
         )
-        return after, _LastStep(observations, inputs, decoded)
+        return after, (observations, inputs, decoded)
 
     def _encode(
         self, stack: ImageStack, cached: Mapping[bytes, torch.Tensor]

@@ -4,6 +4,8 @@ import hashlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -53,31 +55,33 @@ def learner_code(folder: str | Path) -> LearnerCode | None:
 
     Nothing is executed.
     """
-    file, preset = _run_setting(folder, "preset")
+    file, preset = run_setting(folder, "training", "preset")
     return LearnerCode(preset, file) if isinstance(preset, str) and is_code(preset) else None
 
 
 def tasks_left_out(folder: str | Path) -> list[str]:
     """Return the tasks that the training of a run folder, or of one of its checkpoints, excluded."""
-    _, loader = _run_setting(folder, "loader")
-    tasks = loader.get("exclude_tasks") if isinstance(loader, dict) else None
+    _, tasks = run_setting(folder, "training", "loader", "exclude_tasks")
     return tasks.split(",") if isinstance(tasks, str) and tasks else []
 
 
 def held_out_data(folder: str | Path) -> list[str]:
     """Return the tasks and levels held out for evaluation on which a run folder was trained all the same."""
-    _, found = _run_setting(folder, "held_out", section="demonstrations")
+    _, found = run_setting(folder, "demonstrations", "held_out")
     return [echo(name) for name in found if isinstance(name, str)] if isinstance(found, list) else []
 
 
-def _run_setting(folder: str | Path, name: str, *, section: str = "training") -> tuple[Path, Any]:
-    """Return a setting of the run that a folder belongs to, None without any, and the file that holds it."""
+def run_setting(folder: str | Path, *names: str) -> tuple[Path, Any]:
+    """Return what the run that a folder belongs to records under names, and before it the file that does.
+
+    The names lead from section to section, as in "training", "loader"; None if nothing is recorded there.
+    """
     path = Path(folder)
     run = path.absolute().parent
     for place in (path, run.parent) if run.name == CHECKPOINTS_FOLDER else (path,):
         file = place / CONFIG_FILE
         try:
-            return file, read_yaml(file)[section][name]
+            return file, reduce(getitem, names, read_yaml(file))
         except (OSError, OpenVimaError, KeyError, TypeError):
             continue
     return path, None

@@ -364,9 +364,7 @@ class _Steps:
 
     def exist(self) -> np.ndarray:
         """Where a padded array holds steps, shape (B, T), bool."""
-        exist = np.zeros(self.shape, np.bool_)
-        exist.reshape(-1)[self.place] = True
-        return exist
+        return self.pad(np.ones(len(self.place), np.bool_))
 
     def pad(self, column: np.ndarray, fill: int = 0) -> np.ndarray:
         """Scatter one row per step into a padded array of shape (B, T, …)."""

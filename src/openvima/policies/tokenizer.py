@@ -233,14 +233,8 @@ def _is_number(piece: str) -> bool:
 
 
 def _is_word(word: str) -> bool:
-    if (
-        len(word) > MAX_WORD_LENGTH
-        or not word.isprintable()
-        or split_words(word) != [word]
-        or word == UNKNOWN
-    ):
-        return False
-    return not _is_number(word)
+    is_short = len(word) <= MAX_WORD_LENGTH and word.isprintable()
+    return is_short and split_words(word) == [word] and word != UNKNOWN and not _is_number(word)
 
 
 def _texts(values: Any) -> tuple[str, ...]:

@@ -234,7 +234,6 @@ class BrowserSession:
         self.next_seed: Callable[[], None] = lambda: None  # set by *Play*
         self._other_policy: RolloutPolicy | None = None
         self._other_table: Table | None = None
-        self._compat = config.env_config.compat
         self.on_change: list[Callable[[], None]] = []
         self.on_drag: list[Callable[[int, viser.SceneNodeDragEvent], None]] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"browser-{client.client_id}")
@@ -318,8 +317,8 @@ class BrowserSession:
 
     def open(self, episode: Episode, policy: RolloutPolicy | None, *, compat: bool | None = None) -> None:
         """Start an episode, sampled or composed, and show it."""
-        self._compat = self.env_config.compat if compat is None else compat
-        opened = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
+        compat = self.env_config.compat if compat is None else compat
+        opened = EpisodeSession(episode, policy, assets=self.assets, compat=compat)
         self.close_episode()
         self.current = opened
         self.compare(self._other_policy)
@@ -334,8 +333,9 @@ class BrowserSession:
             self._other_table.remove()
         self.compared = self._other_table = None
         if policy is not None and self.current is not None:
-            episode, scene = self.current.episode, self.client.scene
-            self.compared = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
+            episode, compat = self.current.episode, self.current.env.compat
+            self.compared = EpisodeSession(episode, policy, assets=self.assets, compat=compat)
+            scene = self.client.scene
             self._other_table = Table(scene, self.assets, root="/second", offset_y_m=SECOND_TABLE_Y_M)
         self.back(0)
 

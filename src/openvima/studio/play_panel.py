@@ -113,8 +113,6 @@ class UserPanel:
     def __init__(self, session: BrowserSession) -> None:
         self.session = session
         self._first: Hit | None = None
-        self._grabbed: Hit | None = None
-        self._own: list[Action] = []  # actions of the user in the current episode
         self._episode: EpisodeSession | None = None
         self._recorded = ""  # what was said of it
         self._nodes: list[viser.SceneNodeHandle] = []
@@ -139,13 +137,8 @@ class UserPanel:
 
     def _dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
         """Act from where an object was grabbed to where it is let go."""
-        if self.session.editing:
-            return
-        if event.phase == "start":
-            self._grabbed = Hit(object_id, event.start_position)
-        elif event.phase == "end" and (first := self._grabbed) is not None:
-            self._grabbed = None
-            self.session.submit(lambda: self._drop(first, event))
+        if event.phase == "end" and not self.session.editing:
+            self.session.submit(lambda: self._drop(Hit(object_id, event.start_position), event))
 
     def _drop(self, first: Hit, event: viser.SceneNodeDragEvent) -> None:
         current = self.session.current
@@ -178,7 +171,6 @@ class UserPanel:
         action = clicked_action(current.scene, first, second, turn_rad=turn_rad)
         self._forget()
         self._turn.value = 0
-        self._own.append(action)
         self.session.step(action)
 
     def _turn_by(self, degrees: int) -> None:
@@ -215,7 +207,7 @@ class UserPanel:
     def _show(self) -> None:
         current = self.session.current
         if current is not self._episode:
-            self._episode, self._own, self._recorded = current, [], ""
+            self._episode, self._recorded = current, ""
         self._forget()
         if current is None:
             return
@@ -234,7 +226,7 @@ class UserPanel:
         solved = current.outcome is not None and current.outcome.success
         if solved and self._recorded:
             return self._recorded
-        if solved and all(action in self._own for action in actions):
+        if solved and all(step.action is not step.proposal.action for step in current.steps):
             count = record_demonstration(folder, current.episode, actions, env_config=config)
             self._recorded = f"**Recorded**: {count} demonstration{'s' * (count > 1)} in `{folder}`."
             return self._recorded

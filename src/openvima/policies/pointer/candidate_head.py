@@ -111,9 +111,8 @@ class CandidatePointerHead(nn.Module):
         right_BTC = right_BTC | ~has_pick[..., None]  # else no logit would be left, and the loss infinite
         right_logits = mask_scores(place_logits, right_BTC)
         place = right_logits.argmax(-1)  # of the right ones that with the highest logit
-        points = at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, pick), candidates.positions_at(place)
-        offset, yaw_logits = self.relate(inputs, candidates, pick, place, points)
-        true_offset = goal - points[-1]
+        offset, yaw_logits = self.relate(inputs, candidates, pick, place)
+        true_offset = goal - at(candidates.positions_BTC2, place)
         yaw = yaw_to_bin(yaw_between(targets.actions_BTC), config.num_yaw_bins)
         place_nll = place_logits.logsumexp(-1) - right_logits.logsumexp(-1)
         pick_appearance = self.pick.appearance_scores(inputs)
@@ -146,13 +145,11 @@ class CandidatePointerHead(nn.Module):
         candidates = self.candidates(inputs)
         pick = strategy(self.pick(inputs))
         place = strategy(self.place(inputs, candidates, pick))
-        grasp, start = at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, pick)
-        goal = candidates.positions_at(place)
-        offset, yaw_logits = self.relate(inputs, candidates, pick, place, (grasp, start, goal))
+        offset, yaw_logits = self.relate(inputs, candidates, pick, place)
         offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         yaw = bin_to_yaw(strategy(yaw_logits), self.config.num_yaw_bins, offset.dtype)
-        goal = goal + offset
-        held = rotate(grasp - start, yaw)
+        goal, grasp = at(candidates.positions_BTC2, place) + offset, at(inputs.grasps_BTN2, pick)
+        held = rotate(grasp - at(inputs.positions_BTN2, pick), yaw)
         return pick_and_place(grasp, torch.where(inputs.has_suction_BT[..., None], goal + held, goal), yaw)
 
     def trace(self, inputs: HeadInputs, decoded: Decoded) -> StepTrace:
@@ -178,13 +175,10 @@ class CandidatePointerHead(nn.Module):
         candidates: PlaceCandidates,
         pick_BT: torch.Tensor,
         place_BT: torch.Tensor,
-        points_BT2: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Offset from the candidate in metres, (B, T, 2), and logits of yaw bins, (B, T, bins).
-
-        The points are grasp and position of the picked object, and the position of the candidate.
-        """
-        grasp, start, goal = points_BT2
+        """Offset from the candidate in metres, (B, T, 2), and logits of yaw bins, (B, T, bins)."""
+        grasp, start = at(inputs.grasps_BTN2, pick_BT), at(inputs.positions_BTN2, pick_BT)
+        goal = at(candidates.positions_BTC2, place_BT)
         metric = torch.cat([grasp - start, start - 0.5, goal - 0.5, goal - start], dim=-1) / OFFSET_UNIT_M
         token_BTD = candidates.tokens_at(place_BT)
         by_kind_BTED = torch.stack([layer(token_BTD) for layer in self.values], dim=2)

@@ -82,10 +82,6 @@ class PlaceCandidates:
         kinds = [kind for kind, count in enumerate(counts) for _ in range(count)]
         self.kinds_C = torch.tensor(kinds, device=masks_BTN.device)
 
-    def positions_at(self, place_BT: torch.Tensor) -> torch.Tensor:
-        """Position of one candidate at every step, (B, T, 2), metres."""
-        return at(self.positions_BTC2, place_BT)
-
     def tokens_at(self, place_BT: torch.Tensor) -> torch.Tensor:
         """Token of one candidate at every step, (B, T, D)."""
         num_in_view = self.inputs.masks_BTN.shape[-1]

@@ -186,7 +186,8 @@ class Correspondence(nn.Module):
         """
         own_VNX = _crops_and_boxes(own)
         other_VMX = own_VNX if other is own else _crops_and_boxes(other)
-        weights_HVNM = _in_both(own, other, weights_HNM)
+        shown_VNM = own.masks_VN[..., :, None] & other.masks_VN[..., None, :]
+        weights_HVNM = weights_HNM.unsqueeze(-3) * shown_VNM.unsqueeze(-4)  # zero in views that lack one
         # Negating the smaller tensor saves a copy of the larger one.
         negative_HVNX = torch.einsum("...hvnm,...vmx->...hvnx", -weights_HVNM, other_VMX)
         found_HVN1 = weights_HVNM.sum(-1, keepdim=True)
@@ -220,12 +221,6 @@ def _crops_and_boxes(objects: ObjectFeatures) -> torch.Tensor:
     """Crop features and boxes, (..., V, N, F + 4)."""
     boxes_VN4 = objects.boxes_VN4.to(objects.features_VNF.dtype) / _BOX_UNIT_PX
     return torch.cat([objects.features_VNF, boxes_VN4], dim=-1)
-
-
-def _in_both(own: ObjectFeatures, other: ObjectFeatures, weights_HNM: torch.Tensor) -> torch.Tensor:
-    """Attention weights, zero in views that do not show both, (..., H, V, N, M)."""
-    shown_VNM = own.masks_VN[..., :, None] & other.masks_VN[..., None, :]
-    return weights_HNM.unsqueeze(-3) * shown_VNM.unsqueeze(-4)
 
 
 def in_earlier_image(objects: ObjectFeatures, other: ObjectFeatures) -> torch.Tensor:

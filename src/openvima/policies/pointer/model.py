@@ -13,12 +13,11 @@ from torch.nn import functional as F
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_head import (
-    ObservationTokens,
     action_segment,
     shift_actions,
 )
 from openvima.policies.nn.actions import ActionEncoder, ActionTargets, DecodingStrategy, greedy, to_unit_range
-from openvima.policies.nn.decoder import KVCache, build_decoder
+from openvima.policies.nn.decoder import KVCache, TokenSegment, build_decoder
 from openvima.policies.nn.layers import TensorRecord, map_tensors, valid_first
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import (
@@ -212,10 +211,10 @@ class Pointer(PolicyNetwork):
             attributes_BTNX = self.attributes.embed(objects, selected_BP)
             compared = self.attributes.hide_others(objects, selected_BP, attributes_BTNX)
         changes_BTND, rotations_BTNR = self._changes_in_view(compared, prompt)
-        tokens = self._observation_tokens(history, compared, changes_BTND)
+        observed = self._observation_segment(history, compared, changes_BTND)
         actions_BTC = to_unit_range(step.previous_BTC.to(torch.float64)).to(features_KF.dtype)
         previous = action_segment(self.actions(actions_BTC)[:, :, None], step.has_previous_BT)
-        (_, outputs_BTQD), cache = self.decoder.decode_segments(state.cache, [previous, tokens.segment()])
+        (_, outputs_BTQD), cache = self.decoder.decode_segments(state.cache, [previous, observed])
         objects_BTND = outputs_BTQD[:, :, :-1]  # the last token of a step is its query
         num_steps, first_step = history.steps_BT.shape[1], state.first_step
         if first_step is None:
@@ -223,9 +222,9 @@ class Pointer(PolicyNetwork):
             first_step = ObjectSet.of(objects_BTND[:, 0], now, now.appearance_NA[..., :0])
         steps_BT = state.num_steps + torch.arange(num_steps, device=prompt.mask_BL.device)[None]
         inputs = HeadInputs(
-            query_BTD=tokens.query(outputs_BTQD),
+            query_BTD=outputs_BTQD[:, :, -1].contiguous(),  # as linear layers take it fastest
             objects_BTND=objects_BTND,
-            masks_BTN=history.masks_BTVN.any(dim=2),
+            masks_BTN=objects.exists_N,
             appearance_BTNA=appearance_BTNA,
             positions_BTN2=objects.positions_N2,
             grasps_BTN2=history.grasps_BTN2.to(objects.positions_N2.dtype),
@@ -248,17 +247,15 @@ class Pointer(PolicyNetwork):
             return appearance_NA
         return self.attributes.with_appearance(appearance_NA, features_VNF, boxes_VN4, masks_VN)
 
-    def _observation_tokens(
+    def _observation_segment(
         self, history: HistoryBatch, objects: ObjectFeatures, changes_BTND: torch.Tensor
-    ) -> ObservationTokens:
+    ) -> TokenSegment:
+        """Return the tokens of the objects in view, and a learned query behind them."""
         tokens_BTNE = self.images(objects.features_VNF, objects.boxes_VN4, objects.masks_VN) + changes_BTND
         tokens_BTND = self.add_end_effector(tokens_BTNE, history.end_effector_BT)
         query_BT1D = self.query.expand(*tokens_BTND.shape[:2], 1, -1)
-        mask_BTQ = torch.cat([history.masks_BTVN.any(dim=2), history.steps_BT[..., None]], dim=2)
-        query_BT = torch.full_like(history.num_slots_BT, tokens_BTND.shape[2])
-        return ObservationTokens(
-            torch.cat([tokens_BTND, query_BT1D], dim=2), mask_BTQ, query_BT, history.steps_BT
-        )
+        mask_BTQ = torch.cat([objects.exists_N, history.steps_BT[..., None]], dim=2)
+        return TokenSegment(torch.cat([tokens_BTND, query_BT1D], dim=2), mask_BTQ, mask_BTQ)
 
     def _encode(
         self,

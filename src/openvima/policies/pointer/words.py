@@ -208,8 +208,6 @@ class TextGrounding(nn.Module):
 
     def forward(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
         """Return the mean appearance of the attended words at each step, (B, T, A)."""
-        if prompt.describes_BL is None:
-            return context_BTD.new_zeros(*context_BTD.shape[:2], prompt.text_appearance_BLA.shape[-1])
         return self.attention(prompt, context_BTD) @ prompt.text_appearance_BLA
 
     def attention(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
