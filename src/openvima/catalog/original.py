@@ -19,7 +19,7 @@ from openvima.catalog.mesh_files import ObjMesh, parse_obj
 from openvima.catalog.meshes import scale_geometry
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.catalog.procedural import CataloguePack
-from openvima.catalog.textures import TextureSpec, texture_spec
+from openvima.catalog.textures import texture_spec
 from openvima.errors import AssetError
 from openvima.input_files import cache_dir, read_json
 
@@ -136,24 +136,6 @@ _FIXED_MESHES: dict[str, tuple[str, Vector3, float]] = {
     "disk": ("hanoi/disk0.obj", (0.0015, 0.0015, 0.003), 0.015),
 }
 _BOWL_PARTS = ("bowl/cup.obj", (2.2, 2.2, 0.4))  # 14 convex parts, a fifth flatter than what is drawn
-_SPECIAL_IMAGES = {
-    "brick": "brick.jpg",
-    "tiles": "tiles.jpg",
-    "wooden": "wood_light.png",
-    "granite": "granite.png",
-    "plastic": "plastic.jpg",
-    "polka dot": "polka_dot.jpg",
-    "checkerboard": "checkerboard.png",
-    "tiger": "tiger.jpg",
-    "magma": "magma.jpg",
-    "rainbow": "rainbow.jpg",
-}
-_PATTERN_FOLDERS = {
-    "stripe": ("stripes", "stripe"),
-    "polka_dot_2": ("polka_dots", "polka_dot"),
-    "swirl": ("swirls", "swirl"),
-    "paisley": ("paisleys", "paisley"),
-}
 
 
 class OriginalAssets(CataloguePack):
@@ -207,8 +189,10 @@ class OriginalAssets(CataloguePack):
         """
         from PIL import Image
 
+        file = texture_spec(texture_name).original_file
+        assert file is not None, texture_name  # only plain colours have none
         try:
-            content = read_original(self.folder, image_file(texture_spec(texture_name)))
+            content = read_original(self.folder, file)
         except AssetError as error:
             raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
         with Image.open(io.BytesIO(content)) as image:
@@ -245,13 +229,3 @@ def _hull(vertices: np.ndarray) -> CollisionHull:
 def _mesh(pack: Path, relative_path: str) -> ObjMesh:
     content = read_original(pack, relative_path)
     return parse_obj(content.decode("utf-8", errors="replace"), relative_path)
-
-
-def image_file(texture: TextureSpec) -> str:
-    """Return where the pack keeps the image of a texture that is no plain colour, relative to the pack."""
-    light = texture.light_variant
-    if light in _SPECIAL_IMAGES:
-        return f"textures/{_SPECIAL_IMAGES[light]}"
-    subfolder, suffix = _PATTERN_FOLDERS[texture.category]
-    stem = "_".join([*(["dark"] if texture.is_dark else []), *texture.base_colours, suffix])
-    return f"textures/{subfolder}/{stem}.jpg"

@@ -105,12 +105,7 @@ def known_object(handle: object, handles: Handles, label: str) -> Placement:
         return list(handles.values())[handle]
     if isinstance(handle, str) and handle in handles:
         return handles[handle]
-    raise SceneError(f"{label}: {unknown_name('object', handle, handles, handles_hint(handles))}")
-
-
-def handles_hint(handles: Handles) -> str:
-    """Return a sentence with all handles."""
-    return f"The scene has {echo(', '.join(handles))}."
+    raise SceneError(f"{label}: {unknown_name('object', handle, handles)}")
 
 
 SCALES = (0.5, 2.0)
@@ -377,6 +372,8 @@ def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, a
     moved = bound.arguments["a"]
     if moved.fixed:
         raise SceneError(f"{label} ({name}): the {moved.texture} {moved.object} is fixed to the table.")
+    if moved is bound.arguments.get("b"):
+        raise SceneError(f"{label} ({name}): {moved.texture} {moved.object} cannot be in itself.")
     try:
         return make(*bound.args, **bound.kwargs)
     except SceneError as error:
@@ -393,7 +390,6 @@ def _usage(name: str) -> str:
 
 def _in(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     """The position of a is within 0.1 m of that of b, as in the tasks; so a is in b or on it."""
-    _check_two_objects(a, b)
     return AtPose.into(a, b, TOLERANCE)
 
 
@@ -423,18 +419,12 @@ def _swept_into(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     """The small block a is inside the outline of b."""
     if a.object != "small block":
         raise SceneError(f"only a small block can be swept, not a {a.object}.")
-    _check_two_objects(a, b)
     if abs(math.remainder(b.pose.yaw_rad, math.pi / 2)) > 1e-6:
         yaw_deg = math.degrees(b.pose.yaw_rad)
         raise SceneError(f"the {b.object} has a yaw of {yaw_deg:.1f} degrees; it must be a multiple of 90.")
     low, high = _extent(b, assets)
     (x, y), (size_x, size_y) = ((low + high) / 2).tolist(), np.subtract(high, low).tolist()
     return InZone(a.id, Zone(x, y, size_x, size_y), relative_to=b.id)
-
-
-def _check_two_objects(a: Placement, b: Placement) -> None:
-    if a.id == b.id:
-        raise SceneError(f"{a.texture} {a.object} cannot be in itself; name two objects.")
 
 
 _GOALS: dict[str, Callable[..., Goal]] = {
@@ -528,7 +518,7 @@ def _prompt(
     for slot in slots:
         if slot not in given and slot not in handles:
             what = "image or object for placeholder"
-            raise SceneError(unknown_name(what, slot, handles, handles_hint(handles)))
+            raise SceneError(unknown_name(what, slot, handles))
     return Prompt(text, tuple((slot, fill(slot, given.get(slot, slot))) for slot in slots))
 
 

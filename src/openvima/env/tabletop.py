@@ -284,7 +284,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             EpisodeError, ActionError: As for `step`.
         """
         run = self._going_on()
-        run.step(run.checked(action), realtime=self.realtime)
+        run.step(run.checked(action))
         return self._after_step(run)
 
     def perform(self, action: Action) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -300,7 +300,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             EpisodeError: No episode is running.
         """
         run = self._going_on()
-        run.perform(action, realtime=self.realtime)
+        run.perform(action)
         return self.observe(), *self._after_step(run)
 
     def commands(self, action: Action) -> Iterator[ToolCommand]:
@@ -316,6 +316,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         run = self._running()
         if run.outcome.is_over or run.is_out_of_steps:
             raise EpisodeError(f"the episode ended at step {run.num_steps}; reset() starts the next one.")
+        run.realtime = self.realtime
         return run
 
     def _after_step(self, run: PrimitiveRun) -> tuple[float, bool, bool, dict[str, Any]]:

@@ -465,25 +465,18 @@ def _check_actions(actions: Any, num_envs: int, control: str) -> None:
     Raises:
         ActionError: It has another form, or an action is invalid; the first one is named.
     """
+    check: Callable[[Any], object] = Action.from_arrays
+    wanted: Any = {key: (num_envs, length) for key, length in ACTION_SHAPES.items()}
     if control == END_EFFECTOR:
-        shape, check = (num_envs, len(COMMAND_NAMES)), ToolCommand.from_array
-        if not isinstance(actions, np.ndarray) or actions.shape != shape:
-            given = f"of shape {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
-            raise ActionError(f"actions are an array of shape {shape}, not {given}. Nothing was moved.")
-    else:
-        check = Action.from_arrays
-        if not isinstance(actions, Mapping) or actions.keys() != ACTION_SHAPES.keys():
-            given = f"keys {', '.join(actions)}" if isinstance(actions, Mapping) else type(actions).__name__
-            raise ActionError(
-                f"actions are one mapping with keys {', '.join(ACTION_SHAPES)} and a row for each "
-                f"sub-environment, not {given}. `stack_actions` makes it from a list. Nothing was moved."
-            )
-        for key, value in actions.items():
-            if np.shape(value)[:1] != (num_envs,):
-                raise ActionError(
-                    f"{key} has shape {np.shape(value)}; it must have one row for each of the {num_envs} "
-                    f"sub-environments, shape ({num_envs}, {ACTION_SHAPES[key]}). Nothing was moved."
-                )
+        check, wanted = ToolCommand.from_array, (num_envs, len(COMMAND_NAMES))
+    given = getattr(actions, "shape", type(actions).__name__)
+    if isinstance(actions, Mapping):
+        given = {key: np.shape(value) for key, value in actions.items()}
+    if given != wanted:
+        raise ActionError(
+            f"actions have the form {given}; give arrays of shapes {wanted}, a row for each sub-environment. "
+            "`stack_actions` makes those of primitives from a list. Nothing was moved."
+        )
     for index in range(num_envs):
         try:
             check(_rows(actions, index))

@@ -249,17 +249,17 @@ class TableSampler:
         Returns:
             The pose at height 0, or None without a free position.
         """
-        from openvima.tasks.kernels import mark_free_centres, nth_centre
+        from openvima.tasks.kernels import list_free_centres
 
         side = round(float(np.hypot(size[0], size[1])) / CELL_M)
-        centres = np.empty(self._labels.shape, np.uint8)
-        counts, run = np.empty(len(centres), np.int32), np.empty(len(centres.T), np.int32)
-        num_free = mark_free_centres(self._labels, side, run, centres, counts)
+        num_columns = self._labels.shape[1]
+        run, centres = np.empty(num_columns, np.int32), np.empty(self._labels.size, np.int32)
+        num_free = list_free_centres(self._labels, side, run, centres)
         if num_free == 0:
             return None
         is_larger = not self.compat and _reach_m(self.assets, object_name, size) > (side / 2 + 1) * CELL_M
         for _ in range(_FOOTPRINT_TRIES if is_larger else 1):
-            row, column = nth_centre(centres, counts, int(self.rng.integers(num_free)))
+            row, column = divmod(int(centres[self.rng.integers(num_free)]), num_columns)
             pose = Pose.planar(
                 WORKSPACE_LOW[0] + column * CELL_M,
                 WORKSPACE_LOW[1] + row * CELL_M,
