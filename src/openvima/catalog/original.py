@@ -127,13 +127,13 @@ def _check_files(pack: Path, copy_to: Path | None = None) -> list[str]:
     return problems
 
 
-# Scales of meshes of fixed size, metres per mesh unit, and the height at which their origin rests.
-_FIXED_MESHES: dict[str, tuple[str, Vector3, float]] = {
-    "bowl": ("bowl/textured-0008192.obj", (2.2, 2.2, 0.5), 0.0),
-    "pallet": ("pallet/pallet.obj", (0.175, 0.175, 0.175), 0.0131),
-    "frame": ("zone/zone.obj", (0.009, 0.009, 0.000075), 0.0),
-    "pan": ("google/meshes_fixed/frypan.obj", (0.825, 0.825, 0.825 / 1.1), 0.0137),
-    "disk": ("hanoi/disk0.obj", (0.0015, 0.0015, 0.003), 0.015),
+# Of meshes that are not of the kit: metres per mesh unit, and the height at which their origin rests.
+_SCALES: dict[str, tuple[Vector3, float]] = {
+    "bowl": ((2.2, 2.2, 0.5), 0.0),
+    "pallet": ((0.175, 0.175, 0.175), 0.0131),
+    "frame": ((0.009, 0.009, 0.000075), 0.0),
+    "pan": ((0.825, 0.825, 0.825 / 1.1), 0.0137),
+    "disk": ((0.0015, 0.0015, 0.003), 0.015),
 }
 _BOWL_PARTS = ("bowl/cup.obj", (2.2, 2.2, 0.4))  # 14 convex parts, a fifth flatter than what is drawn
 
@@ -177,7 +177,7 @@ class OriginalAssets(CataloguePack):
         if object_name == "stand":  # which has no mesh file
             return scale_geometry(fixed_geometry("stand with long rods"), scale)
         try:
-            return self._kit(spec, scale) if spec.kind == "kit" else self._fixed_mesh(object_name, scale)
+            return self._from_file(spec, scale)
         except AssetError as error:
             raise AssetError(f"object {object_name!r} cannot be used: {error}") from error
 
@@ -189,27 +189,19 @@ class OriginalAssets(CataloguePack):
         """
         from PIL import Image
 
-        file = texture_spec(texture_name).original_file
-        assert file is not None, texture_name  # only plain colours have none
         try:
-            content = read_original(self.folder, file)
+            content = read_original(self.folder, texture_spec(texture_name).original_file)
         except AssetError as error:
             raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
         with Image.open(io.BytesIO(content)) as image:
             return np.array(image.convert("RGB"))
 
-    def _kit(self, spec: ObjectSpec, scale: Vector3) -> Geometry:
-        kit_scale = spec.kit_scale or 1.0
-        metres = product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
-        name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
-        visual = _scale(_mesh(self.folder, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
-        return Geometry(visual, (_hull(visual.vertices),))
-
-    def _fixed_mesh(self, object_name: str, scale: Vector3) -> Geometry:
-        file, metres, rest_z_m = _FIXED_MESHES[object_name]
-        visual = _scale(_mesh(self.folder, file), product(metres, scale))
+    def _from_file(self, spec: ObjectSpec, scale: Vector3) -> Geometry:
+        kit = spec.kit_scale or 1.0
+        metres, rest_z_m = _SCALES.get(spec.name, ((0.003 * kit, 0.003 * kit, 0.001 * kit / 1.1), 0.0))
+        visual = _scale(_mesh(self.folder, spec.original_file), product(metres, scale))
         collision = (_hull(visual.vertices),)
-        if object_name == "bowl":
+        if spec.name == "bowl":
             parts_file, parts_metres = _BOWL_PARTS
             factors = product(parts_metres, scale)
             collision = tuple(_hull(part * factors) for part in _mesh(self.folder, parts_file).pieces())

@@ -7,7 +7,7 @@ import math
 import re
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any  # of whatever type a user gives; checked here
@@ -195,7 +195,7 @@ def scene_object(given: object, label: str, default_name: object) -> SceneObject
         UnknownNameError: The catalogue has no such object or texture.
     """
     if isinstance(given, SceneObject):
-        values: dict[str, Any] = {name: getattr(given, name) for name in FIELDS}
+        values: dict[str, Any] = asdict(given)
     elif isinstance(given, Mapping):
         values = dict(given)
         if unknown := [key for key in values if key not in FIELDS]:

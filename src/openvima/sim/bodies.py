@@ -16,6 +16,7 @@ from openvima.scene.scene import Quaternion, normalised
 from openvima.sim.model import PARKED_M, PROBE_HALF_LENGTH_M, TICK_S, body_shape, build_model
 
 _FASTEST = np.array([1.0, 1.0, 1.0, 1 / 0.015, 1 / 0.015, 1 / 0.015])  # rad/s per m/s: half a small block
+MAX_SPEED = 0.5  # m/s, of bodies squeezed out between the spatula and a fixed body
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that later ticks depend on
 _SLOWEST = -_FASTEST - np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0])  # falling is free
 
@@ -31,6 +32,7 @@ class Bodies:
 
     Attributes:
         geoms: MuJoCo ids of the convex parts of each body.
+        sleeping: Indices of free bodies at rest that nothing can touch for now; physics leaves them out.
     """
 
     def __init__(self, scene: Scene, assets: Assets) -> None:
@@ -49,6 +51,7 @@ class Bodies:
         self.geoms = tuple(
             range(int(first[i + 1]), int(first[i + 1] + count[i + 1])) for i in range(len(self.shapes))
         )
+        self.sleeping: set[int] = set()
         self._has_walls = any(self.geoms[index] for index in fixed)
         self._probe_mocap = len(fixed)
         self.probe_geom = int(first[len(self.shapes) + 1])
@@ -120,14 +123,9 @@ class Bodies:
         """Update the geometry to the poses that were set."""
         mujoco.mj_kinematics(self.model, self.data)
 
-    def tick(self, num_ticks: int = 1, *, sleeping: Iterable[int] = ()) -> None:
-        """Advance the physics.
-
-        Args:
-            num_ticks: Number of ticks.
-            sleeping: Indices of free bodies at rest that nothing can touch meanwhile. They are left out.
-        """
-        rows = [self._joint[index] for index in sleeping]
+    def tick(self, num_ticks: int) -> None:
+        """Advance the physics by some ticks."""
+        rows = [self._joint[index] for index in self.sleeping]
         if not rows:
             mujoco.mj_step(self.model, self.data, num_ticks)
             return
@@ -137,32 +135,25 @@ class Bodies:
         self._positions[rows], self._velocities[rows] = before, 0.0
 
     def tick_with_spatula(
-        self,
-        pose: Pose,
-        velocity: Vector3,
-        *,
-        num_ticks: int,
-        max_speed: float,
-        sleeping: Iterable[int],
-        turning: float = 0.0,
+        self, pose: Pose, velocity: Vector3, num_ticks: int, *, turning: float = 0.0
     ) -> None:
         """Advance the physics while the spatula moves at constant velocity, unaffected by contacts.
+
+        Speeds are limited at the end. With fixed bodies, after every tick: a body squeezed between one and
+        the spatula accelerates too fast for a later limit.
 
         Args:
             pose: The spatula's centre at the start.
             velocity: Velocity of the spatula, m/s.
             num_ticks: Number of ticks.
-            max_speed: See `limit_speed`; applied at the end. With fixed bodies, after every tick: a body
-                squeezed between one and the spatula accelerates too fast for a later limit.
-            sleeping: See `tick`.
             turning: Angular velocity of the upright spatula, rad/s; its heading follows after the last tick.
         """
         place, speed = np.array(_numbers(pose)), np.array((*velocity, 0.0, 0.0, turning))
         stride = 1 if self._has_walls else num_ticks
         for _ in range(0, num_ticks, stride):
             self._positions[-1], self._velocities[-1] = place, speed
-            self.tick(stride, sleeping=sleeping)
-            self.limit_speed(max_speed)
+            self.tick(stride)
+            self.limit_speed(MAX_SPEED)
             place[:3] += speed[:3] * (stride * TICK_S)
 
     def stop(self) -> None:
@@ -189,21 +180,17 @@ class Bodies:
         """Current positions and quaternions of the free bodies, shape (N, 7), a copy."""
         return self._positions[: len(self.rigid)].copy()
 
-    def mean_speeds(
-        self, since: np.ndarray, duration_s: float, *, apart_from: int | None = None
-    ) -> tuple[float, float]:
-        """Largest component of the mean linear (m/s) and angular (rad/s) velocity.
+    def mean_speeds(self, since: np.ndarray, duration_s: float) -> tuple[float, float]:
+        """Largest component of mean linear (m/s) and angular (rad/s) velocity, of bodies not parked.
 
         A body that jitters in place has a velocity, but no mean velocity.
 
         Args:
             since: Earlier `coordinates`.
             duration_s: Time since then.
-            apart_from: Index of a body to ignore, such as a parked one.
         """
-        change = np.abs(self._positions[: len(self.rigid)] - since) / duration_s
-        if apart_from is not None:
-            change[self._joint[apart_from]] = 0.0
+        in_play = since[:, 2] < PARKED_M / 2
+        change = np.abs(self._positions[: len(self.rigid)] - since)[in_play] / duration_s
         return float(change[:, :3].max(initial=0.0)), 2 * float(change[:, 3:].max(initial=0.0))
 
     def shift(self, indices: Iterable[int], offset: Vector3) -> None:
@@ -226,13 +213,8 @@ class Bodies:
 
 
 def _heights(points: np.ndarray, quaternion: Quaternion) -> np.ndarray:
-    """Heights above its link frame, shape (N,), of points of a body with that orientation.
-
-    Written out: the last bits of a matrix product depend on the CPU.
-    """
-    x, y, z, w = quaternion
-    up = (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))  # in the body's frame
-    return points[:, 0] * up[0] + points[:, 1] * up[1] + points[:, 2] * up[2]
+    """Heights above its link frame, shape (N,), of points of a body with that orientation."""
+    return Pose((0.0, 0.0, 0.0), quaternion).transform(points[:, :3])[:, 2]
 
 
 def _numbers(pose: Pose) -> tuple[float, ...]:

@@ -1,7 +1,7 @@
 """State of one primitive: bodies, monitor, settling, and the path of the arm with frames for a video."""
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,16 +25,12 @@ class Settling:
 
     Args:
         bodies: The bodies.
-        apart_from: Index of a body to ignore, such as a parked one.
         max_speed: Bound of the horizontal speed in m/s, for bodies that overlap at the start.
-        sleeping: See `Bodies.tick`.
         num_ticks: Ticks so far.
     """
 
     bodies: Bodies
-    apart_from: int | None = None
     max_speed: float | None = None
-    sleeping: Collection[int] = ()
     num_ticks: int = 0
     _quiet: int = 0  # strides in a row in which all bodies were slow
 
@@ -46,11 +42,11 @@ class Settling:
     def run(self, num_ticks: int = STRIDE_TICKS) -> None:
         """Run one stride; where it is the last one, stop all bodies."""
         before = self.bodies.coordinates()
-        self.bodies.tick(num_ticks, sleeping=self.sleeping)
+        self.bodies.tick(num_ticks)
         if self.max_speed is not None:
             self.bodies.limit_speed(self.max_speed)
         self.num_ticks += num_ticks
-        speed, turning = self.bodies.mean_speeds(before, num_ticks * TICK_S, apart_from=self.apart_from)
+        speed, turning = self.bodies.mean_speeds(before, num_ticks * TICK_S)
         is_slow = speed < SETTLED_SPEED and turning < SETTLED_TURNING
         self._quiet = self._quiet + 1 if is_slow else 0
         if self.is_over:
@@ -198,16 +194,9 @@ class PrimitiveState:
             self._unmonitored_ticks = 0
             self.monitor(self.scene())
 
-    def settle(
-        self,
-        held: tuple[int, Pose] | None = None,
-        *,
-        max_speed: float | None = None,
-        sleeping: Collection[int] = (),
-    ) -> None:
+    def settle(self, held: tuple[int, Pose] | None = None, *, max_speed: float | None = None) -> None:
         """Run physics until everything is at rest; the arm's next move happens meanwhile."""
-        apart_from = held[0] if held else None
-        settling = Settling(self.bodies, apart_from=apart_from, max_speed=max_speed, sleeping=sleeping)
+        settling = Settling(self.bodies, max_speed)
         while not settling.is_over:
             settling.run()
             self.count_ticks(STRIDE_TICKS, held)

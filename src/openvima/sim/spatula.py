@@ -12,7 +12,7 @@ from openvima.catalog.geometry import Vector3
 from openvima.scene import Pose
 from openvima.scene.scene import rotate
 from openvima.sim import ur5
-from openvima.sim.bodies import distance_to_contact
+from openvima.sim.bodies import MAX_SPEED, distance_to_contact
 from openvima.sim.model import TICK_S
 from openvima.sim.primitive_state import (
     MONITOR_TICKS,
@@ -27,7 +27,6 @@ from openvima.sim.primitive_state import (
 )
 
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
-MAX_SPEED = 0.5  # m/s, of bodies squeezed out between the spatula and a fixed body
 # Pushed bodies jitter, but hardly shift against the spatula. Carrying them without physics saves three of
 # four ticks and changes final positions as much as a 0.1 % faster spatula (1.5 mm in the median, at most 12).
 CARRIED_SHIFT_M = 6e-4  # bodies that shift against the spatula by less than this, and rotate by less …
@@ -62,7 +61,7 @@ class Spatula:
         self._in_joint_space = in_joint_space
         self._tip: Vector3 = (0.0, 0.0, ur5.SWEEP_HOVER_TIP_Z_M)
         self._recent: list[tuple[np.ndarray, Vector3]] = []  # coordinates and tip before the last strides
-        self._sleeping = set(() if awake else state.bodies.rigid)  # at rest, and far from all that moves
+        self._bodies.sleeping = set(() if awake else state.bodies.rigid)
         self._pushed = tuple(geom for index in state.bodies.rigid for geom in state.bodies.geoms[index])
 
     def lower(self, x: float, y: float) -> None:
@@ -72,11 +71,7 @@ class Spatula:
         down = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
         path.move(hover, scene=lambda _: scene)
         path.move(down, scene=lambda _: scene)
-        way = (
-            [point for point in _joint_space_path(hover, down) if point[2] < _LOW_TIP_Z_M]
-            if self._in_joint_space
-            else []
-        )
+        way = [point for point in self._bent_path(hover, down) if point[2] < _LOW_TIP_Z_M]
         self._tip, *rest = [*way, (x, y, ur5.SWEEP_TIP_Z_M)]
         in_the_way = [index for index in self._bodies.rigid if self._displace(index)]
         if in_the_way:
@@ -87,9 +82,8 @@ class Spatula:
     def push(self, x: float, y: float) -> None:
         """Move the lowered spatula to a point."""
         target = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
-        for point in _joint_space_path(self._joints(), target) if self._in_joint_space else []:
+        for point in (*self._bent_path(self._joints(), target), (x, y, ur5.SWEEP_TIP_Z_M)):
             self._push_to(point)
-        self._push_to((x, y, ur5.SWEEP_TIP_Z_M))
         self._state.path.waypoints.append(target)
 
     def engage(self, x: float, y: float) -> None:
@@ -114,20 +108,20 @@ class Spatula:
         """Take the spatula off the table; return the settling of the bodies that it moved."""
         self._bodies.park_spatula()
         self._wake(_SLIDE_M)
-        return Settling(self._bodies, max_speed=MAX_SPEED, sleeping=self._sleeping)
+        return Settling(self._bodies, MAX_SPEED)
 
     def lift(self) -> None:
         """Lift the spatula and let everything settle."""
         state = self._state
         hover = self._joints_at(self._tip[0], self._tip[1], ur5.SWEEP_HOVER_TIP_Z_M)
-        for point in _joint_space_path(self._joints(), hover) if self._in_joint_space else []:
+        for point in self._bent_path(self._joints(), hover):
             if point[2] > _LOW_TIP_Z_M:
                 break
             self._push_to(point)
         self._bodies.park_spatula()
         if state.num_ticks:
             self._wake(_SLIDE_M)
-            state.settle(max_speed=MAX_SPEED, sleeping=self._sleeping)
+            state.settle(max_speed=MAX_SPEED)
         after = state.scene() if state.path.record else state.start
         state.path.move(hover, scene=lambda _: after)
 
@@ -254,34 +248,27 @@ class Spatula:
 
     def _run(self, num_ticks: int, velocity: Vector3, turning: float = 0.0) -> None:
         self._wake(_STRIDE_M)
-        self._bodies.tick_with_spatula(
-            self._pose(),
-            velocity,
-            turning=turning,
-            num_ticks=num_ticks,
-            max_speed=MAX_SPEED,
-            sleeping=self._sleeping,
-        )
+        self._bodies.tick_with_spatula(self._pose(), velocity, num_ticks, turning=turning)
         self._state.count_ticks(num_ticks)
         self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)
 
     def _wake(self, near_m: float) -> None:
         """Wake the sleeping bodies near the spatula, those near a woken body, and so on."""
-        if not self._sleeping:
-            return
         bodies = self._bodies
+        if not bodies.sleeping:
+            return
         circles = {
             index: (x, y, bodies.shapes[index].radius_m)
             for index, (x, y) in zip(bodies.rigid, bodies.coordinates()[:, :2].tolist(), strict=True)
         }
-        awake = [circles[index] for index in bodies.rigid if index not in self._sleeping]
+        awake = [circles[index] for index in bodies.rigid if index not in bodies.sleeping]
         awake.append((*self._tip[:2], ur5.SPATULA_HALF_SIZE_M[1]))
         while awake:
             x, y, reach = awake.pop()
-            for index in tuple(self._sleeping):
+            for index in tuple(bodies.sleeping):
                 other_x, other_y, radius = circles[index]
                 if math.hypot(other_x - x, other_y - y) < reach + radius + near_m:
-                    self._sleeping.remove(index)
+                    bodies.sleeping.remove(index)
                     awake.append(circles[index])
 
     def _record_frames(self, direction: Vector3, length: float) -> None:
@@ -298,6 +285,25 @@ class Spatula:
         speed, turning = self._bodies.speeds()
         return speed < SETTLED_SPEED and turning < SETTLED_TURNING
 
+    def _bent_path(self, start: np.ndarray, end: np.ndarray) -> list[Vector3]:
+        """Points, some millimetres apart, of a path that is straight in joint space; none without such paths.
+
+        Args:
+            start: Joint angles, shape (6,), radians.
+            end: Joint angles at the last point.
+        """
+        if not self._in_joint_space:
+            return []
+        points = [
+            ur5.forward(start + (end - start) * (k / _NUM_PATH_POINTS)).position
+            for k in range(_NUM_PATH_POINTS + 1)
+        ]
+        way = [points[0]]
+        for point in points:
+            if math.dist(point, way[-1]) >= _PATH_STEP_M:
+                way.append(point)
+        return [*way[1:], points[-1]]
+
     def _joints(self) -> np.ndarray:
         return self._joints_at(*self._tip)
 
@@ -312,21 +318,3 @@ class Spatula:
 def _move(point: Vector3, direction: Vector3, length: float) -> Vector3:
     x, y, z = (start + part * length for start, part in zip(point, direction, strict=True))
     return (x, y, z)
-
-
-def _joint_space_path(start: np.ndarray, end: np.ndarray) -> list[Vector3]:
-    """Points, some millimetres apart, of the tip on a straight path in joint space.
-
-    Args:
-        start: Joint angles, shape (6,), radians.
-        end: Joint angles at the last point.
-    """
-    points = [
-        ur5.forward(start + (end - start) * (k / _NUM_PATH_POINTS)).position
-        for k in range(_NUM_PATH_POINTS + 1)
-    ]
-    way = [points[0]]
-    for point in points:
-        if math.dist(point, way[-1]) >= _PATH_STEP_M:
-            way.append(point)
-    return [*way[1:], points[-1]]

@@ -161,7 +161,7 @@ class ToolWorld:
         self._held = HeldBody(caught, self._bodies.pose(caught), pose)
         self._stands_alone, carries_others = take_out(self._bodies, self._held)
         if carries_others or self._settling is not None:
-            self._settling = Settling(self._bodies, apart_from=caught)
+            self._settling = Settling(self._bodies)
 
     def _let_go(self) -> None:
         """Release the body, or take the spatula off the table."""

@@ -17,6 +17,8 @@ _NUM_STEPS = 1000  # the error falls as one over this number
 
 
 T = TypeVar("T")
+Appearance = tuple[str, str]  # names of object and texture
+Draw = Callable[[], Appearance]
 Reject = Callable[[Placement], bool]
 
 CELL_M = 0.003125  # side of a raster cell; the benchmark's resolution for placing and picking
@@ -59,9 +61,9 @@ class TableSampler:
         self.placements: list[Placement] = []
         self.assets = assets
         self._end_effector: EndEffector = end_effector
-        self._labels, self._heights = self._stamp_all(())
+        self._labels, self._heights = self._stamped(())
 
-    def appearances(self) -> list[tuple[str, str]]:
+    def appearances(self) -> list[Appearance]:
         """All shapes and textures of dragged objects of the pool."""
         return list(itertools.product(self.pool.dragged_objects, self.pool.dragged_textures))
 
@@ -77,7 +79,7 @@ class TableSampler:
         """Draw so many different options."""
         return [options[index] for index in self.rng.choice(len(options), count, replace=False).tolist()]
 
-    def drawing(self, objects: Sequence[str], textures: Sequence[str]) -> Callable[[], tuple[str, str]]:
+    def drawing(self, objects: Sequence[str], textures: Sequence[str]) -> Draw:
         """Return a function that draws an object and its texture, for `place`."""
         return lambda: (self.choose(objects), self.choose(textures))
 
@@ -94,7 +96,7 @@ class TableSampler:
     def place(
         self,
         what: str,
-        draw: Callable[[], tuple[str, str]],
+        draw: Draw,
         *,
         count: int = 1,
         tries: int = 10,
@@ -137,7 +139,7 @@ class TableSampler:
             raise SamplingError(f"only {len(placed)} of {count} × {what} found a place in {tries} tries.")
         return placed
 
-    def place_one(self, what: str, draw: Callable[[], tuple[str, str]], **settings: Any) -> Placement:
+    def place_one(self, what: str, draw: Draw, **settings: Any) -> Placement:
         """Place one object, with the settings of `place`."""
         return self.place(what, draw, **settings)[0]
 
@@ -175,7 +177,7 @@ class TableSampler:
     def move(self, placement: Placement, place: Placement) -> Placement:
         """Move an object to a pose from `find_place`; return it there."""
         self.placements[self.placements.index(placement)] = place
-        self._labels, self._heights = self._stamp_all(self.placements)
+        self._labels, self._heights = self._stamped(self.placements)
         return place
 
     def add(
@@ -274,7 +276,7 @@ class TableSampler:
         geometry = self.assets.geometry(placement.object, placement.size, placement.scale)
         pose = placement.pose
         raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
-        return self._stamp_all([replace(placement, id=1, pose=raised)])[0] > 0
+        return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
 
     def scene(self) -> Scene:
         """Return the scene placed so far."""
@@ -302,22 +304,19 @@ class TableSampler:
         )
 
     def _put(self, placement: Placement) -> Placement:
-        self._stamp(self._labels, self._heights, placement)
+        self._stamped([placement], onto=(self._labels, self._heights))
         self.placements.append(placement)
         return placement
 
-    def _stamp(self, labels: np.ndarray, heights: np.ndarray, placement: Placement) -> None:
-        from openvima.render.labels import stamp  # imports Numba, which a list of tasks does not need
+    def _stamped(
+        self, placements: Sequence[Placement], *, onto: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Labels and heights of these objects, on an empty table or on what is given, which changes."""
+        from openvima.render.labels import empty_labels, stamp  # Numba, which a list of tasks does not need
 
-        stamp(labels, heights, placement, self.assets)
-
-    def _stamp_all(self, placements: Sequence[Placement]) -> tuple[np.ndarray, np.ndarray]:
-        """Labels and heights of these objects."""
-        from openvima.render.labels import empty_labels
-
-        labels, heights = empty_labels()
+        labels, heights = onto or empty_labels()
         for placement in placements:
-            self._stamp(labels, heights, placement)
+            stamp(labels, heights, placement, self.assets)
         return labels, heights
 
     def _footprint_is_free(self, object_name: str, size: Vector3, pose: Pose) -> bool:
