@@ -1,6 +1,5 @@
 """Composed episodes: scenes, prompts, photos and goals of users, checked and placed at rest."""
 
-import functools
 import inspect
 import itertools
 import math
@@ -282,8 +281,8 @@ def check_inside(placement: Placement, assets: Assets, label: str) -> None:
 
 def _extent(placement: Placement, assets: Assets) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest x and y of an object's mesh, metres."""
-    geometry = assets.geometry(placement.object, placement.size, placement.scale)
-    corners = placement.pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
+    vertices = placement.geometry(assets).visual.vertices
+    corners = placement.pose.transform(vertices.reshape(-1, 3))[:, :2]
     return corners.min(axis=0), corners.max(axis=0)
 
 
@@ -493,14 +492,11 @@ def _object_image(placement: Placement) -> ObjectImage:
     return ObjectImage(placement, MAGNIFICATION if placement.object == "small block" else 1.0)
 
 
-def _prompt(
-    text: object, images: object, handles: Handles, fill: Callable[[str, object], PromptFill]
-) -> Prompt:
-    """Make a prompt of its text and the images that a user gives.
+def _prompt_parts(text: object, images: object, handles: Handles) -> tuple[str, dict[str, Any]]:
+    """Return the text of a prompt, and what a user gives for the image of each placeholder.
 
     Raises:
-        SceneError: The text or an image is malformed, or a placeholder has no image.
-        UnknownNameError, InputFileError: As for `compose`.
+        SceneError: The text is malformed, or a placeholder has no image.
     """
     if isinstance(text, str) and len(text) <= 2 * MAX_PROMPT_CHARS and not text.isprintable():
         text = " ".join(text.split())  # other blanks than the space, such as ends of lines, become one
@@ -519,7 +515,7 @@ def _prompt(
         if slot not in given and slot not in handles:
             what = "image or object for placeholder"
             raise SceneError(unknown_name(what, slot, handles))
-    return Prompt(text, tuple((slot, fill(slot, given.get(slot, slot))) for slot in slots))
+    return text, {slot: given.get(slot, slot) for slot in slots}
 
 
 COMPOSE_KEYS = ("objects", "prompt", "images", "goals", "max_steps", "end_effector")
@@ -604,10 +600,12 @@ def composed(values: Mapping[str, Any], *, assets: Assets, photo: Callable[[str]
     for given in scene_objects(values.get("objects")):
         handles[given.name] = add_object(table, given, handles)
     listed = () if values.get("goals") is None else entries(values["goals"], "goals")
-    fill = functools.partial(_fill, handles=handles, table=table, photo=photo)
+    text, images = _prompt_parts(values.get("prompt"), values.get("images"), handles)
     problem = Problem(
         table.scene(),
-        _prompt(values.get("prompt"), values.get("images"), handles, fill),
+        Prompt(
+            text, tuple((slot, _fill(slot, image, handles, table, photo)) for slot, image in images.items())
+        ),
         tuple(_goal(each, f"goal {n}", handles, end_effector, assets) for n, each in enumerate(listed)),
     )
     return Episode(COMPOSED, "train", "user", 0, problem, oracle_max_steps=max_steps, max_steps=max_steps)

@@ -46,6 +46,7 @@ from openvima.scene.action import (
     check_control,
     steps_per_primitive,
 )
+from openvima.sim.arm_view import arm_drawables
 from openvima.sim.ur5 import JOINT_LIMITS
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
@@ -486,11 +487,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
     def _images(self, *, depth: bool = False) -> dict[View, Image]:
         world = self._running().world
         scene = world.scene
-        if self.hide_arm:
-            return self._rasteriser.scene(scene, depth=depth)
-        from openvima.sim.arm_view import arm_drawables
-
-        arm = arm_drawables(world.joints, scene.end_effector)
+        arm = () if self.hide_arm else arm_drawables(world.joints, scene.end_effector)
         return self._rasteriser.scene(scene, extra=arm, depth=depth)
 
     def _info(self) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from openvima.tasks.sampling import checked_seed
 RESET_MASK = "reset_mask"  # Gymnasium's option: which sub-environments to reset, shape (N,), bool
 
 Info = Mapping[str, Any]
+EnvFns = Sequence[Callable[[], gymnasium.Env]]
 
 
 def make_vec(
@@ -123,7 +124,7 @@ class TabletopVectorEnv(VectorEnv):
 
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gymnasium.Env]],
+        env_fns: EnvFns,
         seeds: Sequence[Sequence[int]],
         autoreset_mode: AutoresetMode,
         num_workers: int,
@@ -390,7 +391,7 @@ class _Part:
 
 def _work(
     pipe: Connection,
-    env_fns: Sequence[Callable[[], gymnasium.Env]],
+    env_fns: EnvFns,
     seeds: Sequence[Sequence[int]],
     autoreset_mode: AutoresetMode,
     part: slice,
@@ -418,7 +419,7 @@ def _work(
                 pipe.send(WorkerError(f"an answer of a worker cannot be pickled: {answer!r}"))
 
 
-def _build(env_fns: Sequence[Callable[[], gymnasium.Env]]) -> list[gymnasium.Env]:
+def _build(env_fns: EnvFns) -> list[gymnasium.Env]:
     """Build sub-environments and check that their spaces are equal."""
     envs: list[gymnasium.Env] = []
     for index, env_fn in enumerate(env_fns):

@@ -147,7 +147,7 @@ class Rasteriser:
         return PromptImage(name, kind, rgb, segm, records)
 
     def _drawable(self, placement: Placement, magnification: float = 1.0) -> Drawable:
-        mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
+        mesh = placement.geometry(self.assets).visual
         return Drawable(
             mesh if magnification == 1 else magnify(mesh, magnification),
             placement.pose,

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from openvima.catalog.geometry import Vector3
+from openvima.catalog.geometry import Assets, Geometry, Vector3
 from openvima.errors import SceneError, brief_repr
 
 Quaternion = tuple[float, float, float, float]
@@ -199,6 +199,10 @@ class Placement:
     def at(self, pose: Pose) -> "Placement":
         """Return the same object at another pose."""
         return replace(self, pose=pose)
+
+    def geometry(self, assets: Assets) -> Geometry:
+        """Return its shape in an asset pack, in the link frame."""
+        return assets.geometry(self.object, self.size, self.scale)
 
 
 @dataclass(frozen=True, slots=True)

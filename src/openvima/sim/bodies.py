@@ -3,6 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's names come from a compiled module without type stubs.)
 
+import itertools
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -36,10 +37,7 @@ class Bodies:
     """
 
     def __init__(self, scene: Scene, assets: Assets) -> None:
-        self.shapes = tuple(
-            body_shape(p.object, assets.geometry(p.object, p.size, p.scale), p.fixed)
-            for p in scene.placements
-        )
+        self.shapes = tuple(body_shape(p.object, p.geometry(assets), p.fixed) for p in scene.placements)
         with_spatula = scene.end_effector == "spatula"
         self._load_model(with_spatula)
         rigid = [index for index, shape in enumerate(self.shapes) if not shape.fixed]
@@ -238,13 +236,13 @@ def body_gap(bodies: Bodies, index1: int, index2: int) -> float:
     reach = bodies.shapes[index1].radius_m + bodies.shapes[index2].radius_m
     if bodies.pose(index1).planar_distance(bodies.pose(index2)) > reach + 0.01:
         return np.inf
-    pairs = [(g1, g2) for g1 in bodies.geoms[index1] for g2 in bodies.geoms[index2]]
-    return min((gap(bodies, g1, g2) for g1, g2 in pairs), default=np.inf)
+    pairs = itertools.product(bodies.geoms[index1], bodies.geoms[index2])
+    return min((gap(bodies, *pair) for pair in pairs), default=np.inf)
 
 
 def distance_to_contact(
     bodies: Bodies, moving: Iterable[int], others: Iterable[int], *, direction: Vector3, length_m: float
-) -> float | None:
+) -> float:
     """How far some parts can move before one of them touches one of the others; nothing is moved.
 
     Args:
@@ -255,21 +253,17 @@ def distance_to_contact(
         length_m: Largest distance.
 
     Returns:
-        Metres, 0 if they touch already; None without contact.
+        Metres, 0 if they touch already; infinite without contact.
     """
-    ways = [
-        way
-        for geom in moving
-        for other in others
-        if (way := _pair_distance_to_contact(bodies, geom, other, np.array(direction), length_m)) is not None
-    ]
-    return min(ways, default=None)
+    pairs = itertools.product(moving, others)
+    along = np.array(direction)
+    return min((_pair_distance_to_contact(bodies, *pair, along, length_m) for pair in pairs), default=np.inf)
 
 
 def _pair_distance_to_contact(
     bodies: Bodies, geom: int, other: int, direction: np.ndarray, length_m: float
-) -> float | None:
-    """How far one part can move before it touches another; None without contact.
+) -> float:
+    """How far one part can move before it touches another; infinite without contact.
 
     The distance of two convex shapes is a convex function of the translation of one of them. Newton's method,
     started without contact, therefore never overshoots, and converges in a few evaluations. The slope is that
@@ -281,10 +275,10 @@ def _pair_distance_to_contact(
     offset = positions[other] - start
     sideways = offset - direction * _dot(offset, direction)
     if _dot(sideways, sideways) > float(model.geom_rbound[geom] + model.geom_rbound[other] + margin) ** 2:
-        return None
+        return np.inf
     segment = np.zeros(6)
     way = 0.0
-    found = None
+    found = np.inf
     for _ in range(_MOST_STEPS):
         positions[geom] = start + way * direction
         distance = mujoco.mj_geomDistance(model, bodies.data, geom, other, _FARTHEST_M, segment) - margin

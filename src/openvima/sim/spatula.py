@@ -66,11 +66,10 @@ class Spatula:
 
     def lower(self, x: float, y: float) -> None:
         """Lower the spatula at a point and displace bodies there."""
-        path, scene = self._state.path, self._state.start
         hover = self._joints_at(x, y, ur5.SWEEP_HOVER_TIP_Z_M)
         down = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
-        path.move(hover, scene=lambda _: scene)
-        path.move(down, scene=lambda _: scene)
+        self._state.move(hover)
+        self._state.move(down)
         way = [point for point in self._bent_path(hover, down) if point[2] < _LOW_TIP_Z_M]
         self._tip, *rest = [*way, (x, y, ur5.SWEEP_TIP_Z_M)]
         in_the_way = [index for index in self._bodies.rigid if self._displace(index)]
@@ -84,7 +83,7 @@ class Spatula:
         target = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
         for point in (*self._bent_path(self._joints(), target), (x, y, ur5.SWEEP_TIP_Z_M)):
             self._push_to(point)
-        self._state.path.waypoints.append(target)
+        self._state.waypoints.append(target)
 
     def engage(self, x: float, y: float) -> None:
         """Press the spatula to the table where it is, displacing bodies there."""
@@ -122,8 +121,7 @@ class Spatula:
         if state.num_ticks:
             self._wake(_SLIDE_M)
             state.settle(max_speed=MAX_SPEED)
-        after = state.scene() if state.path.record else state.start
-        state.path.move(hover, scene=lambda _: after)
+        state.move(hover, scene=lambda _: state.scene())
 
     def _displace(self, index: int) -> bool:
         """Shift a body under the spatula to the nearest side; return whether there was one.
@@ -181,7 +179,7 @@ class Spatula:
         free = distance_to_contact(
             self._bodies, (self._bodies.spatula_geom,), self._pushed, direction=direction, length_m=length
         )
-        way = length if free is None else free
+        way = min(free, length)
         self._record_frames(direction, way)
         self._tip = _move(self._tip, direction, way)
         return length - way
@@ -221,7 +219,7 @@ class Spatula:
             left -= piece
             self._state.notify()
             num_ticks = max(1, round(piece / (SWEEP_M_S * TICK_S)))
-            self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)
+            self._state.stay(num_ticks, self._joints)
         return way
 
     def _distance_to_next(self, carried: tuple[int, ...], direction: Vector3, length: float) -> float:
@@ -237,7 +235,7 @@ class Spatula:
             distance_to_contact(bodies, (bodies.spatula_geom,), free, direction=direction, length_m=length),
             distance_to_contact(bodies, carried_geoms, [*free, *fixed], direction=direction, length_m=length),
         )
-        return min((way for way in ways if way is not None), default=length)
+        return min(*ways, length)
 
     def _push_with_physics(self, direction: Vector3, length: float, num_ticks: int) -> None:
         """Move by a length with physics, at constant speed."""
@@ -250,7 +248,7 @@ class Spatula:
         self._wake(_STRIDE_M)
         self._bodies.tick_with_spatula(self._pose(), velocity, num_ticks, turning=turning)
         self._state.count_ticks(num_ticks)
-        self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)
+        self._state.stay(num_ticks, self._joints)
 
     def _wake(self, near_m: float) -> None:
         """Wake the sleeping bodies near the spatula, those near a woken body, and so on."""
@@ -274,12 +272,11 @@ class Spatula:
     def _record_frames(self, direction: Vector3, length: float) -> None:
         """Record the frames of a motion without contact."""
         state = self._state
-        if state.path.record is None or length <= 0:
+        if state.record is None or length <= 0:
             return
-        scene = state.scene()
         joints = self._joints_at(*_move(self._tip, direction, length))
-        state.path.move(joints, scene=lambda _: scene, speed=SWEEP_SPEED)
-        state.path.waypoints.pop()
+        state.move(joints, scene=lambda _: state.scene(), speed=SWEEP_SPEED)
+        state.waypoints.pop()
 
     def _is_calm(self) -> bool:
         speed, turning = self._bodies.speeds()

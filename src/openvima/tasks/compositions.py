@@ -243,12 +243,12 @@ def compose_problem(table: TableSampler, kinds: tuple[str, ...], num_distractors
     first = len(stages[0][1])
     restored = {goals.index(group[0]) for kind, group in stages if kind == "restore"}
     later = tuple(index for index in range(first, len(goals)) if index not in restored)
-    others = tuple(p.id for p in table.placements if p not in meant)
+    others = [p for p in table.placements if p not in meant]
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(template(kinds), **made.fills),
         goals=goals,
-        constraints=(InOrder(later), DistractorsApart(others)),
+        constraints=(InOrder(later), DistractorsApart.of(others)),
         stages=tuple(len(group) for _, group in stages),
         oracle_max_steps=len(goals) + _SPARE_STEPS,
     )

@@ -44,17 +44,13 @@ def list_free_centres(
 
 @njit
 def squared_depths(
-    labels: np.ndarray,  # (R, C) int16
-    object_id: int,
-    top: int,
-    left: int,
+    mask: np.ndarray,  # (H, W) bool, where the object is in a window that holds all of it
     vertical: np.ndarray,  # (H, W) int32, scratch
-    depths: np.ndarray,  # (H, W) int32, gets the result for the cells from (top, left) on
+    depths: np.ndarray,  # (H, W) int32, gets the result
 ) -> None:
     """Squared distance, in cells, of each cell of one object to the nearest cell that is not of it.
 
-    The window must hold the whole object; cells outside of it count as not of the object, and cells of others
-    get 0.
+    Cells outside of the window count as not of the object, and cells of others get 0.
 
     Source: exact distance transform in two passes, columns then rows (Felzenszwalb and Huttenlocher, 2012);
     the second is a plain search, which is fast enough at this size.
@@ -64,11 +60,11 @@ def squared_depths(
     for column in range(num_columns):
         distance = 0
         for row in range(num_rows):
-            distance = distance + 1 if labels[top + row, left + column] == object_id else 0
+            distance = distance + 1 if mask[row, column] else 0
             vertical[row, column] = distance
         distance = 0
         for row in range(num_rows - 1, -1, -1):
-            distance = distance + 1 if labels[top + row, left + column] == object_id else 0
+            distance = distance + 1 if mask[row, column] else 0
             vertical[row, column] = min(vertical[row, column], distance)
     for row in range(num_rows):
         for column in range(num_columns):

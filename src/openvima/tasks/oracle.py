@@ -117,11 +117,10 @@ def visible_point(
     if rng is not None:
         x, y = (points[rng.integers(len(points))] - CELL_M / 2).tolist()
         return x, y
-    top, left = int(rows.min()), int(columns.min())
-    window = np.empty((int(rows.max()) - top + 1, int(columns.max()) - left + 1), np.int32)
-    squared_depths(labels, object_id, top, left, np.empty_like(window), window)
-    depths = window[rows - top, columns - left]
-    deepest = points[depths == depths.max()]
+    mask = labels[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] == object_id
+    depths = np.empty(mask.shape, np.int32)
+    squared_depths(mask, np.empty_like(depths), depths)
+    deepest = points[depths[mask] == depths.max()]
     pose = scene[object_id].pose
     offsets = deepest - (pose.x, pose.y)
     x, y = deepest[np.argmin((offsets * offsets).sum(axis=1))].tolist()

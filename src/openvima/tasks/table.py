@@ -273,7 +273,7 @@ class TableSampler:
 
     def covered(self, placement: Placement) -> np.ndarray:
         """Return the cells that an object covers from above, whatever its height; shape (320, 160), bool."""
-        geometry = self.assets.geometry(placement.object, placement.size, placement.scale)
+        geometry = placement.geometry(self.assets)
         pose = placement.pose
         raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
         return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
@@ -384,13 +384,11 @@ def is_wedged(placement: Placement, base: Placement, assets: Assets) -> bool:
     A top view does not show it: the hull of a pan fills the corners beside its handle, and what lies there
     would be pressed into the table.
     """
-    geometry = assets.geometry(placement.object, placement.size, placement.scale)
+    geometry = placement.geometry(assets)
     if placement.pose.z > geometry.rest_z_m + _ON_TABLE_M:
         return False
     shadows = [_shadow(part, placement.pose) for part in geometry.collision]
-    others = [
-        _shadow(part, base.pose) for part in assets.geometry(base.object, base.size, base.scale).collision
-    ]
+    others = [_shadow(part, base.pose) for part in base.geometry(assets).collision]
     return any(
         not ((low > other_high) | (other_low > high)).any()
         for low, high in shadows
