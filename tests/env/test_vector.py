@@ -97,10 +97,10 @@ def with_row(key: str, value: object) -> dict[str, np.ndarray]:
     ("actions", "message"),
     [
         (with_row("pose0_position", np.nan), r"sub-environment 1: pose0_position is \(nan, nan\)"),
-        (IDLE | {"gripper": 1}, r"'gripper': \(\)}; give .* 'pose0_position': \(2, 2\)"),
+        (IDLE | {"gripper": 1}, r"'gripper': \(\)}; give .*'pose0_position': \(2, 2\)"),
         (
             {key: rows[:1] for key, rows in IDLE.items()},
-            r"'pose0_position': \(1, 2\).* 'pose0_position': \(2, 2\).* a row for each sub-environment",
+            r"'pose0_position': \(1, 2\).*'pose0_position': \(2, 2\).* a row for each sub-environment",
         ),
         (IDLE | {"pose0_rotation": 1.0}, r"'pose0_rotation': \(\)"),
         (IDLE | {"pose0_rotation": np.eye(2)}, r"'pose0_rotation': \(2, 2\).* 'pose0_rotation': \(2, 4\)"),

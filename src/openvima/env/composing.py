@@ -34,6 +34,7 @@ from openvima.scene import (
     ObjectImage,
     PhotoImage,
     Placement,
+    Point,
     Pose,
     Problem,
     Prompt,
@@ -80,7 +81,7 @@ def number(value: Any, label: str, low: float, high: float) -> float:
     return float(value)
 
 
-def pair(value: Any, label: str) -> tuple[float, float]:
+def pair(value: Any, label: str) -> Point:
     """Return x and y in metres.
 
     Raises:
@@ -135,7 +136,7 @@ class SceneObject:
 
     object: str
     texture: str
-    position: tuple[float, float]
+    position: Point
     yaw_deg: float = 0.0
     name: str = ""
     scale: float = 1.0

@@ -309,7 +309,8 @@ class Spatula:
 
     def _pose(self) -> Pose:
         x, y, tip_z = self._tip
-        return Pose.planar(x, y, self._yaw_rad, z=ur5.spatula_centre_z(tip_z))
+        centre_z = tip_z - ur5.SPATULA_BELOW_TIP_M + ur5.SPATULA_HALF_SIZE_M[2]
+        return Pose.planar(x, y, self._yaw_rad, z=centre_z)
 
 
 def _move(point: Vector3, direction: Vector3, length: float) -> Vector3:

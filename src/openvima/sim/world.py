@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.scene import Action, Pose, Scene
+from openvima.scene import Action, Point, Pose, Scene
 from openvima.scene.action import ToolPose
 from openvima.sim import ur5
 from openvima.sim.bodies import Bodies, body_gap, distance_to_contact, gap
@@ -228,8 +228,8 @@ class SweepPlan:
     """
 
     yaw_rad: float
-    start: tuple[float, float]
-    legs: tuple[tuple[float, float], ...]
+    start: Point
+    legs: tuple[Point, ...]
 
 
 def sweep_plan(action: Action, *, compat: bool = False) -> SweepPlan | None:
@@ -253,7 +253,7 @@ def sweep_plan(action: Action, *, compat: bool = False) -> SweepPlan | None:
     return SweepPlan(math.atan2(vy, vx), start, (*overshoot, end))
 
 
-def _within_reach(x: float, y: float) -> tuple[float, float]:
+def _within_reach(x: float, y: float) -> Point:
     """Move a point towards the base until the lowered tool reaches it."""
     farthest = ur5.farthest_tip_distance(ur5.SWEEP_TIP_Z_M) - 1e-6
     shrink = min(1.0, farthest / math.hypot(x, y))

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
-from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, object_spec
+from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Vector3, object_spec
 from openvima.errors import SamplingError
 from openvima.scene import AtPose, DistractorsApart, InZone, Placement, Problem, ZoneKeptClear
 from openvima.scene.goal import object_of
@@ -84,7 +84,7 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
 
     blocks = _blocks_for(task, problem, moved)
 
-    def put(*, tries: int, scale: tuple[float, float, float], reject: Reject) -> None:
+    def put(*, tries: int, scale: Vector3, reject: Reject) -> None:
         with contextlib.suppress(SamplingError):
             new = table.place_one("clutter", draw, tries=tries, scale=scale, reject=reject)
             forbidden.add((new.object, new.texture))

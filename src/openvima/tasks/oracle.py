@@ -7,7 +7,7 @@ import numpy as np
 
 from openvima.catalog import Assets
 from openvima.errors import OracleError, echo
-from openvima.scene import Action, AtPose, InZone, Pose, Problem, Scene
+from openvima.scene import Action, AtPose, InZone, Point, Pose, Problem, Scene
 from openvima.scene.goal import object_of, oracle_move
 from openvima.tasks.goals import Progress
 from openvima.tasks.sweeping import plan_sweep
@@ -90,7 +90,7 @@ def oracle_action(
 
 def visible_point(
     scene: Scene, object_id: int, *, assets: Assets, rng: np.random.Generator | None = None
-) -> tuple[float, float]:
+) -> Point:
     """Return a point where an object is visible from straight above.
 
     Args:
@@ -127,7 +127,7 @@ def visible_point(
     return x, y
 
 
-def _pick_and_place(goal: AtPose, pose: Pose, point: tuple[float, float], *, compat: bool) -> Action:
+def _pick_and_place(goal: AtPose, pose: Pose, point: Point, *, compat: bool) -> Action:
     """Action that moves the object's origin to the target's, with the smallest rotation that it needs."""
     in_base = goal.relative_to is not None and goal.relative_to != goal.object_id
     if in_base and goal.tolerance.yaw_rad is None and not compat:

@@ -12,10 +12,9 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from openvima.scene import WORKSPACE_HIGH, InZone, NeverTouches, Problem, Scene, Zone
+from openvima.scene import WORKSPACE_HIGH, InZone, NeverTouches, Point, Problem, Scene, Zone
 from openvima.tasks.pushes import (
     BLOCK_REACH_M,
-    Point,
     Push,
     Rectangle,
     Sweep,

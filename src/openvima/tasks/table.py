@@ -11,7 +11,16 @@ import numpy as np
 from openvima.catalog import Assets, Pool, Vector3, object_spec
 from openvima.catalog.geometry import CollisionShape
 from openvima.errors import SamplingError
-from openvima.scene import FIRST_OBJECT_ID, WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Placement, Pose, Scene
+from openvima.scene import (
+    FIRST_OBJECT_ID,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    EndEffector,
+    Placement,
+    Point,
+    Pose,
+    Scene,
+)
 
 _NUM_STEPS = 1000  # the error falls as one over this number
 
@@ -410,7 +419,7 @@ def _reach_m(assets: Assets, object_name: str, size: Vector3) -> float:
 
 
 @functools.lru_cache(maxsize=256)
-def _circle_centre_m(assets: Assets, object_name: str, size: Vector3) -> tuple[float, float]:
+def _circle_centre_m(assets: Assets, object_name: str, size: Vector3) -> Point:
     """Centre of the smallest circle around an object's mesh, in its link frame, in metres.
 
     It is accurate to about a thousandth of the radius.
