@@ -57,7 +57,7 @@ def value_noise(cells: tuple[int, int], seed: int) -> np.ndarray:
     rows, columns = (np.arange(_SIDE_PX) * count / _SIDE_PX for count in cells)
     top, left = rows.astype(np.int64), columns.astype(np.int64)
     down, right = _smooth(rows - top)[:, None], _smooth(columns - left)[None, :]
-    lattice = hash_numbers(*np.ogrid[: cells[0], : cells[1]], seed)
+    lattice = hash_numbers(*np.ogrid[: cells[0], : cells[1]], seed=seed)
 
     def across(row: np.ndarray) -> np.ndarray:
         return lattice[row][:, left] * (1 - right) + lattice[row][:, (left + 1) % cells[1]] * right
