@@ -10,7 +10,7 @@ import pytest
 from openvima.catalog import OBJECTS, TEXTURES, CollisionBox, CollisionHull
 from openvima.catalog.bodies import block, container, line, square, three_sided_rectangle
 from openvima.catalog.mesh_files import parse_obj
-from openvima.catalog.original import _FIXED_MESHES, OriginalAssets, image_file
+from openvima.catalog.original import _SCALES, OriginalAssets
 from openvima.catalog.textures import texture_spec
 from openvima.errors import AssetError
 
@@ -48,7 +48,7 @@ def test_golden_meshes_have_the_catalogued_bounds(pack, catalogue) -> None:
 def test_golden_file_names_are_those_of_the_catalogue(catalogue) -> None:
     for record in catalogue["textures"]:
         if "file" in record:
-            assert image_file(texture_spec(record["name"])) == record["file"]
+            assert texture_spec(record["name"]).original_file == record["file"]
 
 
 @needs_pack
@@ -189,6 +189,6 @@ def test_golden_body_descriptions_name_the_meshes_and_scales_of_the_code() -> No
     for name, file in described.items():
         text = (ASSETS_FOLDER / f"{file}.urdf").read_text()
         mesh, scale = re.findall(r'mesh filename="([^"]+)" scale="([^"]+)"', text)[0]
-        path, metres, _ = _FIXED_MESHES[name]
-        assert path == f"{Path(file).parent}/{mesh}"
+        metres, _ = _SCALES[name]
+        assert OBJECTS[name].original_file == f"{Path(file).parent}/{mesh}"
         assert metres == tuple(float(number) for number in scale.split())

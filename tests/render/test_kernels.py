@@ -48,12 +48,12 @@ def draw(bodies: list[Body], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
             mesh.uvs,
             mesh.is_flat,
             matrix_3x4(pose),
-            camera.matrix(),
             texture,
             object_id,
-            depth,
+            camera.matrix(),
             rgb,
             segm,
+            depth,
         )
     return rgb, segm
 

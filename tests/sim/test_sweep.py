@@ -170,7 +170,7 @@ def test_a_row_of_blocks_ends_where_it_does_with_no_block_asleep(monkeypatch) ->
     action = Action.planar((0.7, 0.0), (0.45, 0.0))
     sleeping, awake = World(scene, ASSETS), World(scene, ASSETS)
     sleeping.execute(action)
-    monkeypatch.setattr(Spatula, "_wake", lambda spatula, _: spatula._sleeping.clear())
+    monkeypatch.setattr(Spatula, "_wake", lambda spatula, _: spatula._bodies.sleeping.clear())
     awake.execute(action)
     assert sleeping.scene[8] == scene[8]
     for ours, theirs in zip(sleeping.scene.placements, awake.scene.placements, strict=True):

@@ -9,7 +9,7 @@ from openvima.env.config import EnvConfig
 from openvima.errors import ConfigError, UnknownTaskError
 from openvima.scene import DistractorsApart, ZoneKeptClear
 from openvima.tasks import sample_episode, task_spec
-from openvima.tasks.options import MAX_DISTRACTORS, TaskOptions
+from openvima.tasks.options import MAX_DISTRACTORS, options_of, options_text, parse_options
 from openvima.tasks.sampling import check_task_options
 
 WITH_DISTRACTORS = [task for task in PUBLISHED_TASKS if "num_distractors" in task_spec(task).options]
@@ -17,12 +17,11 @@ UNCHECKED = ("follow_motion", "follow_order")  # their distractors may be anywhe
 
 
 def test_a_specific_option_overrides_a_general_one() -> None:
-    options = TaskOptions.parse(" rotate.num_distractors=2,num_distractors=6 ")
-    assert str(options) == "num_distractors=6,rotate.num_distractors=2"
-    assert options.of(task_spec("rotate")) == {"num_distractors": 2}
-    assert options.of(task_spec("novel_noun")) == {"num_distractors": 6}
-    assert options.of(task_spec("pick_in_order_then_restore")) == {}
-    assert TaskOptions.parse(str(options)) == options
+    options = " rotate.num_distractors=2,num_distractors=6 "
+    assert options_text(parse_options(options)) == "num_distractors=6,rotate.num_distractors=2"
+    assert options_of(task_spec("rotate"), options) == {"num_distractors": 2}
+    assert options_of(task_spec("novel_noun"), options) == {"num_distractors": 6}
+    assert options_of(task_spec("pick_in_order_then_restore"), options) == {}
 
 
 def test_settings_keep_options_in_one_spelling_and_record_them_only_if_there_are_any() -> None:
@@ -44,7 +43,7 @@ def test_settings_keep_options_in_one_spelling_and_record_them_only_if_there_are
     ],
 )
 def test_values_have_the_type_of_the_option(entry: str, value: object) -> None:
-    (found,) = TaskOptions.parse(entry).of(task_spec(entry.partition(".")[0])).values()
+    (found,) = options_of(task_spec(entry.partition(".")[0]), entry).values()
     assert found == value
     assert type(found) is type(value)
 

@@ -72,9 +72,13 @@ def parse_obj(text: str, name: str) -> ObjMesh:
     if not faces:
         raise AssetError(f"{name} holds no faces; restore the file.")
     try:
-        return _assemble(numbers, np.array(faces), np.array(parts, dtype=np.int32))
+        v, vt, vn = np.moveaxis(np.array(faces), -1, 0)
+        vertices = np.array(numbers["v"], dtype=np.float64)[v]
+        normals = _look_up(numbers["vn"], vn, otherwise=face_normals(vertices))
+        uvs = _look_up(numbers["vt"], vt, otherwise=np.zeros((*vt.shape, 2)))
     except (IndexError, ValueError) as error:
         raise AssetError(f"{name} is damaged: {error}; restore the file.") from error
+    return ObjMesh(vertices, normals, uvs, np.array(parts, dtype=np.int32))
 
 
 def _corner(word: str, counts: tuple[int, int, int]) -> tuple[int, int, int]:
@@ -86,13 +90,6 @@ def _corner(word: str, counts: tuple[int, int, int]) -> tuple[int, int, int]:
     if v < 0:
         raise ValueError(f"no vertex {indices[0]}")
     return v, vt, vn
-
-
-def _assemble(numbers: dict[str, list[list[float]]], faces: np.ndarray, parts: np.ndarray) -> ObjMesh:
-    v, vt, vn = np.moveaxis(faces, -1, 0)
-    vertices = np.array(numbers["v"], dtype=np.float64)[v]
-    normals = _look_up(numbers["vn"], vn, otherwise=face_normals(vertices))
-    return ObjMesh(vertices, normals, _look_up(numbers["vt"], vt, otherwise=np.zeros((*vt.shape, 2))), parts)
 
 
 def _look_up(numbers: list[list[float]], indices: np.ndarray, *, otherwise: np.ndarray) -> np.ndarray:

@@ -42,6 +42,7 @@ class ObjectSpec:
             the benchmark reads back their poses.
         kit_scale: Scale s of a kit object: a nominal width of 0.08 s and a height of 0.02 s; None otherwise.
         aliases: Other names for paraphrased instructions; not valid names.
+        original_file: Where the original pack keeps the mesh; empty for boxes.
     """
 
     name: str
@@ -55,6 +56,7 @@ class ObjectSpec:
     com_offset: Vector3 = (0.0, 0.0, 0.0)
     kit_scale: float | None = None
     aliases: tuple[str, ...] = ()
+    original_file: str = ""
 
 
 OBJECTS: dict[str, ObjectSpec] = {

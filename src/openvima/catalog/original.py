@@ -19,7 +19,7 @@ from openvima.catalog.mesh_files import ObjMesh, parse_obj
 from openvima.catalog.meshes import scale_geometry
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.catalog.procedural import CataloguePack
-from openvima.catalog.textures import TextureSpec, texture_spec
+from openvima.catalog.textures import texture_spec
 from openvima.errors import AssetError
 from openvima.input_files import cache_dir, read_json
 
@@ -127,33 +127,15 @@ def _check_files(pack: Path, copy_to: Path | None = None) -> list[str]:
     return problems
 
 
-# Scales of meshes of fixed size, metres per mesh unit, and the height at which their origin rests.
-_FIXED_MESHES: dict[str, tuple[str, Vector3, float]] = {
-    "bowl": ("bowl/textured-0008192.obj", (2.2, 2.2, 0.5), 0.0),
-    "pallet": ("pallet/pallet.obj", (0.175, 0.175, 0.175), 0.0131),
-    "frame": ("zone/zone.obj", (0.009, 0.009, 0.000075), 0.0),
-    "pan": ("google/meshes_fixed/frypan.obj", (0.825, 0.825, 0.825 / 1.1), 0.0137),
-    "disk": ("hanoi/disk0.obj", (0.0015, 0.0015, 0.003), 0.015),
+# Of meshes that are not of the kit: metres per mesh unit, and the height at which their origin rests.
+_SCALES: dict[str, tuple[Vector3, float]] = {
+    "bowl": ((2.2, 2.2, 0.5), 0.0),
+    "pallet": ((0.175, 0.175, 0.175), 0.0131),
+    "frame": ((0.009, 0.009, 0.000075), 0.0),
+    "pan": ((0.825, 0.825, 0.825 / 1.1), 0.0137),
+    "disk": ((0.0015, 0.0015, 0.003), 0.015),
 }
 _BOWL_PARTS = ("bowl/cup.obj", (2.2, 2.2, 0.4))  # 14 convex parts, a fifth flatter than what is drawn
-_SPECIAL_IMAGES = {
-    "brick": "brick.jpg",
-    "tiles": "tiles.jpg",
-    "wooden": "wood_light.png",
-    "granite": "granite.png",
-    "plastic": "plastic.jpg",
-    "polka dot": "polka_dot.jpg",
-    "checkerboard": "checkerboard.png",
-    "tiger": "tiger.jpg",
-    "magma": "magma.jpg",
-    "rainbow": "rainbow.jpg",
-}
-_PATTERN_FOLDERS = {
-    "stripe": ("stripes", "stripe"),
-    "polka_dot_2": ("polka_dots", "polka_dot"),
-    "swirl": ("swirls", "swirl"),
-    "paisley": ("paisleys", "paisley"),
-}
 
 
 class OriginalAssets(CataloguePack):
@@ -195,7 +177,7 @@ class OriginalAssets(CataloguePack):
         if object_name == "stand":  # which has no mesh file
             return scale_geometry(fixed_geometry("stand with long rods"), scale)
         try:
-            return self._kit(spec, scale) if spec.kind == "kit" else self._fixed_mesh(object_name, scale)
+            return self._from_file(spec, scale)
         except AssetError as error:
             raise AssetError(f"object {object_name!r} cannot be used: {error}") from error
 
@@ -208,24 +190,18 @@ class OriginalAssets(CataloguePack):
         from PIL import Image
 
         try:
-            content = read_original(self.folder, image_file(texture_spec(texture_name)))
+            content = read_original(self.folder, texture_spec(texture_name).original_file)
         except AssetError as error:
             raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
         with Image.open(io.BytesIO(content)) as image:
             return np.array(image.convert("RGB"))
 
-    def _kit(self, spec: ObjectSpec, scale: Vector3) -> Geometry:
-        kit_scale = spec.kit_scale or 1.0
-        metres = product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
-        name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
-        visual = _scale(_mesh(self.folder, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
-        return Geometry(visual, (_hull(visual.vertices),))
-
-    def _fixed_mesh(self, object_name: str, scale: Vector3) -> Geometry:
-        file, metres, rest_z_m = _FIXED_MESHES[object_name]
-        visual = _scale(_mesh(self.folder, file), product(metres, scale))
+    def _from_file(self, spec: ObjectSpec, scale: Vector3) -> Geometry:
+        kit = spec.kit_scale or 1.0
+        metres, rest_z_m = _SCALES.get(spec.name, ((0.003 * kit, 0.003 * kit, 0.001 * kit / 1.1), 0.0))
+        visual = _scale(_mesh(self.folder, spec.original_file), product(metres, scale))
         collision = (_hull(visual.vertices),)
-        if object_name == "bowl":
+        if spec.name == "bowl":
             parts_file, parts_metres = _BOWL_PARTS
             factors = product(parts_metres, scale)
             collision = tuple(_hull(part * factors) for part in _mesh(self.folder, parts_file).pieces())
@@ -245,13 +221,3 @@ def _hull(vertices: np.ndarray) -> CollisionHull:
 def _mesh(pack: Path, relative_path: str) -> ObjMesh:
     content = read_original(pack, relative_path)
     return parse_obj(content.decode("utf-8", errors="replace"), relative_path)
-
-
-def image_file(texture: TextureSpec) -> str:
-    """Return where the pack keeps the image of a texture that is no plain colour, relative to the pack."""
-    light = texture.light_variant
-    if light in _SPECIAL_IMAGES:
-        return f"textures/{_SPECIAL_IMAGES[light]}"
-    subfolder, suffix = _PATTERN_FOLDERS[texture.category]
-    stem = "_".join([*(["dark"] if texture.is_dark else []), *texture.base_colours, suffix])
-    return f"textures/{subfolder}/{stem}.jpg"

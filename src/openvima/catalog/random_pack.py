@@ -20,11 +20,12 @@ _SIDE_PX = 128
 _PLACES = (np.arange(_SIDE_PX) + 0.5) / _SIDE_PX - 0.5  # of pixels about the middle of the image
 
 
-def hash_numbers(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
-    """Return a number in [0, 1) for each combination of whole numbers.
+def hash_numbers(rows: np.ndarray, columns: np.ndarray, seed: int) -> np.ndarray:
+    """Return a number in [0, 1) for each pair of whole numbers.
 
     Args:
-        *coordinates: Arrays of non-negative integers, broadcast against each other.
+        rows: Non-negative integers.
+        columns: The same, broadcast against them.
         seed: Seed of the hash.
 
     Returns:
@@ -34,8 +35,8 @@ def hash_numbers(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
     """
     state = np.asarray(seed, dtype=np.uint64)
     with np.errstate(over="ignore"):  # overflow is intended
-        for coordinate in coordinates:
-            state = _mix_bits(state * np.uint64(31) + np.asarray(coordinate).astype(np.uint64) + np.uint64(1))
+        for coordinate in (rows, columns):
+            state = _mix_bits(state * np.uint64(31) + coordinate.astype(np.uint64) + np.uint64(1))
     return (state >> np.uint64(32)).astype(np.float64) / 2.0**32
 
 

@@ -15,6 +15,8 @@ _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # of a rectangle, cou
 _LEAST_DIFFERENCE = 0.15  # fraction of the area; 0.18 for the heart, 0.05 for the star
 
 Cell = tuple[int, int]
+Loops = tuple[np.ndarray, ...]
+"""An outline: a loop counter-clockwise, then holes clockwise, each of shape (N, 2), float64, metres."""
 
 
 def random_shape(rng: np.random.Generator) -> Geometry:
@@ -97,15 +99,8 @@ def random_round_container(rng: np.random.Generator) -> Geometry:
     return _bowl(rng, sides=26)
 
 
-def random_outline(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw an outline: a star, a polygon, a blob, a ring, or strokes like those of a letter.
-
-    Args:
-        rng: Generator of all draws.
-
-    Returns:
-        Loops of shape (N, 2), float64, metres: the outer one counter-clockwise, then holes clockwise.
-    """
+def random_outline(rng: np.random.Generator) -> Loops:
+    """Draw an outline: a star, a polygon, a blob, a ring, or strokes like those of a letter."""
     loops = _OUTLINES[int(rng.integers(len(_OUTLINES)))](rng)
     low, high = loops[0].min(axis=0), loops[0].max(axis=0)
     stretch = np.array([rng.uniform(0.75, 1.0), 1.0])
@@ -117,12 +112,8 @@ def random_outline(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     )
 
 
-def has_heading(loops: tuple[np.ndarray, ...]) -> bool:
-    """Whether an outline differs clearly from its rotations, so that its yaw is visible.
-
-    Args:
-        loops: As `random_outline` returns them.
-    """
+def has_heading(loops: Loops) -> bool:
+    """Whether an outline differs clearly from its rotations, so that its yaw is visible."""
     middle = _centroid(loops)
     reach = float(np.linalg.norm(loops[0] - middle, axis=1).max())
     radii = reach * (np.arange(_NUM_RADII) + 0.5) / _NUM_RADII
@@ -137,14 +128,14 @@ def has_heading(loops: tuple[np.ndarray, ...]) -> bool:
     return bool(min(differences) >= _LEAST_DIFFERENCE)
 
 
-def _centroid(loops: tuple[np.ndarray, ...]) -> np.ndarray:
+def _centroid(loops: Loops) -> np.ndarray:
     """Centroid of the area inside an outline, shape (2,)."""
     start, end = _sides(loops)
     parts = start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]  # of triangles with the origin, holes negative
     return ((start + end) * parts[:, None]).sum(axis=0) / (3 * parts.sum())
 
 
-def _inside(points: np.ndarray, loops: tuple[np.ndarray, ...]) -> np.ndarray:
+def _inside(points: np.ndarray, loops: Loops) -> np.ndarray:
     """Whether points are inside an outline and in none of its holes, shape (N,), bool; by crossings."""
     start, end = _sides(loops)
     x, y = points[:, :1], points[:, 1:]
@@ -154,7 +145,7 @@ def _inside(points: np.ndarray, loops: tuple[np.ndarray, ...]) -> np.ndarray:
     return (spans & (x < crossing)).sum(axis=1) % 2 == 1
 
 
-def _sides(loops: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _sides(loops: Loops) -> tuple[np.ndarray, np.ndarray]:
     """First and second end of each side of an outline, both of shape (N, 2)."""
     return np.concatenate(loops), np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
 

@@ -28,6 +28,7 @@ class TextureSpec:
         base_colours: Names of the colours of a pattern: first and second stripe, dots and ground, or the one
             colour beside white. Empty for plain and special textures.
         dark_variant: Name of the dark variant, if there is one.
+        original_file: Where the original pack keeps the image; empty for plain colours.
     """
 
     name: str
@@ -36,6 +37,7 @@ class TextureSpec:
     colour: Rgb | None = None
     base_colours: tuple[str, ...] = ()
     dark_variant: str | None = None
+    original_file: str = ""
 
     @property
     def light_variant(self) -> str:

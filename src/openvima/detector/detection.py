@@ -295,9 +295,7 @@ class DetectedObjects:
             if mask is None or not mask.any():
                 objects.grasps[v, k], colours[k] = objects.boxes[v, k, :2], _histogram(inside.reshape(3, -1))
                 continue
-            extent = np.array([0, right - left, 0, lower - upper])
-            objects.grasps[v, k] = interior_pixel(np.ascontiguousarray(mask).view(np.uint8), extent, value=1)
-            objects.grasps[v, k] += left, upper
+            objects.grasps[v, k] = np.add(interior_pixel(mask), (left, upper))
             colours[k] = _histogram(inside[:, mask])
         return _Seen(objects, unproject(found.boxes[:, [[0, 3], [2, 3]]], CAMERAS[view]), colours)
 

@@ -1,13 +1,12 @@
 """Composed episodes: scenes, prompts, photos and goals of users, checked and placed at rest."""
 
-import functools
 import inspect
 import itertools
 import math
 import re
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any  # of whatever type a user gives; checked here
@@ -35,6 +34,7 @@ from openvima.scene import (
     ObjectImage,
     PhotoImage,
     Placement,
+    Point,
     Pose,
     Problem,
     Prompt,
@@ -81,7 +81,7 @@ def number(value: Any, label: str, low: float, high: float) -> float:
     return float(value)
 
 
-def pair(value: Any, label: str) -> tuple[float, float]:
+def pair(value: Any, label: str) -> Point:
     """Return x and y in metres.
 
     Raises:
@@ -105,12 +105,7 @@ def known_object(handle: object, handles: Handles, label: str) -> Placement:
         return list(handles.values())[handle]
     if isinstance(handle, str) and handle in handles:
         return handles[handle]
-    raise SceneError(f"{label}: {unknown_name('object', handle, handles, handles_hint(handles))}")
-
-
-def handles_hint(handles: Handles) -> str:
-    """Return a sentence with all handles."""
-    return f"The scene has {echo(', '.join(handles))}."
+    raise SceneError(f"{label}: {unknown_name('object', handle, handles)}")
 
 
 SCALES = (0.5, 2.0)
@@ -141,7 +136,7 @@ class SceneObject:
 
     object: str
     texture: str
-    position: tuple[float, float]
+    position: Point
     yaw_deg: float = 0.0
     name: str = ""
     scale: float = 1.0
@@ -200,7 +195,7 @@ def scene_object(given: object, label: str, default_name: object) -> SceneObject
         UnknownNameError: The catalogue has no such object or texture.
     """
     if isinstance(given, SceneObject):
-        values: dict[str, Any] = {name: getattr(given, name) for name in FIELDS}
+        values: dict[str, Any] = asdict(given)
     elif isinstance(given, Mapping):
         values = dict(given)
         if unknown := [key for key in values if key not in FIELDS]:
@@ -287,8 +282,8 @@ def check_inside(placement: Placement, assets: Assets, label: str) -> None:
 
 def _extent(placement: Placement, assets: Assets) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest x and y of an object's mesh, metres."""
-    geometry = assets.geometry(placement.object, placement.size, placement.scale)
-    corners = placement.pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
+    vertices = placement.geometry(assets).visual.vertices
+    corners = placement.pose.transform(vertices.reshape(-1, 3))[:, :2]
     return corners.min(axis=0), corners.max(axis=0)
 
 
@@ -377,6 +372,8 @@ def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, a
     moved = bound.arguments["a"]
     if moved.fixed:
         raise SceneError(f"{label} ({name}): the {moved.texture} {moved.object} is fixed to the table.")
+    if moved is bound.arguments.get("b"):
+        raise SceneError(f"{label} ({name}): {moved.texture} {moved.object} cannot be in itself.")
     try:
         return make(*bound.args, **bound.kwargs)
     except SceneError as error:
@@ -393,7 +390,6 @@ def _usage(name: str) -> str:
 
 def _in(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     """The position of a is within 0.1 m of that of b, as in the tasks; so a is in b or on it."""
-    _check_two_objects(a, b)
     return AtPose.into(a, b, TOLERANCE)
 
 
@@ -423,18 +419,12 @@ def _swept_into(a: Placement, b: Placement, *, assets: Assets) -> Goal:
     """The small block a is inside the outline of b."""
     if a.object != "small block":
         raise SceneError(f"only a small block can be swept, not a {a.object}.")
-    _check_two_objects(a, b)
     if abs(math.remainder(b.pose.yaw_rad, math.pi / 2)) > 1e-6:
         yaw_deg = math.degrees(b.pose.yaw_rad)
         raise SceneError(f"the {b.object} has a yaw of {yaw_deg:.1f} degrees; it must be a multiple of 90.")
     low, high = _extent(b, assets)
     (x, y), (size_x, size_y) = ((low + high) / 2).tolist(), np.subtract(high, low).tolist()
     return InZone(a.id, Zone(x, y, size_x, size_y), relative_to=b.id)
-
-
-def _check_two_objects(a: Placement, b: Placement) -> None:
-    if a.id == b.id:
-        raise SceneError(f"{a.texture} {a.object} cannot be in itself; name two objects.")
 
 
 _GOALS: dict[str, Callable[..., Goal]] = {
@@ -503,14 +493,11 @@ def _object_image(placement: Placement) -> ObjectImage:
     return ObjectImage(placement, MAGNIFICATION if placement.object == "small block" else 1.0)
 
 
-def _prompt(
-    text: object, images: object, handles: Handles, fill: Callable[[str, object], PromptFill]
-) -> Prompt:
-    """Make a prompt of its text and the images that a user gives.
+def _prompt_parts(text: object, images: object, handles: Handles) -> tuple[str, dict[str, Any]]:
+    """Return the text of a prompt, and what a user gives for the image of each placeholder.
 
     Raises:
-        SceneError: The text or an image is malformed, or a placeholder has no image.
-        UnknownNameError, InputFileError: As for `compose`.
+        SceneError: The text is malformed, or a placeholder has no image.
     """
     if isinstance(text, str) and len(text) <= 2 * MAX_PROMPT_CHARS and not text.isprintable():
         text = " ".join(text.split())  # other blanks than the space, such as ends of lines, become one
@@ -528,8 +515,8 @@ def _prompt(
     for slot in slots:
         if slot not in given and slot not in handles:
             what = "image or object for placeholder"
-            raise SceneError(unknown_name(what, slot, handles, handles_hint(handles)))
-    return Prompt(text, tuple((slot, fill(slot, given.get(slot, slot))) for slot in slots))
+            raise SceneError(unknown_name(what, slot, handles))
+    return text, {slot: given.get(slot, slot) for slot in slots}
 
 
 COMPOSE_KEYS = ("objects", "prompt", "images", "goals", "max_steps", "end_effector")
@@ -614,10 +601,12 @@ def composed(values: Mapping[str, Any], *, assets: Assets, photo: Callable[[str]
     for given in scene_objects(values.get("objects")):
         handles[given.name] = add_object(table, given, handles)
     listed = () if values.get("goals") is None else entries(values["goals"], "goals")
-    fill = functools.partial(_fill, handles=handles, table=table, photo=photo)
+    text, images = _prompt_parts(values.get("prompt"), values.get("images"), handles)
     problem = Problem(
         table.scene(),
-        _prompt(values.get("prompt"), values.get("images"), handles, fill),
+        Prompt(
+            text, tuple((slot, _fill(slot, image, handles, table, photo)) for slot, image in images.items())
+        ),
         tuple(_goal(each, f"goal {n}", handles, end_effector, assets) for n, each in enumerate(listed)),
     )
     return Episode(COMPOSED, "train", "user", 0, problem, oracle_max_steps=max_steps, max_steps=max_steps)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any  # options are of whatever type a task dec
 
 from openvima.scene.action import PRIMITIVES, check_control
 from openvima.tasks import sample_episode, task_spec
-from openvima.tasks.options import TaskOptions
+from openvima.tasks.options import options_of, options_text, parse_options
 from openvima.tasks.prompts import MULTIMODAL, check_prompts
 from openvima.user_code import is_code, without_folder
 
@@ -41,7 +41,7 @@ class EnvConfig:
     def __post_init__(self) -> None:
         check_prompts(self.prompts)
         check_control(self.control)
-        object.__setattr__(self, "task_options", str(TaskOptions.parse(self.task_options)))
+        object.__setattr__(self, "task_options", options_text(parse_options(self.task_options)))
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> "EnvConfig":
@@ -90,7 +90,7 @@ class EnvConfig:
             UnknownTaskError: There is no such task.
             ConfigError: The task does not have one of its options, or a value is not of its type.
         """
-        return TaskOptions.parse(self.task_options).of(task_spec(task))
+        return options_of(task_spec(task), self.task_options)
 
     def record(self) -> dict[str, str | bool]:
         """Return the settings for a record, without paths, and those from `prompts` on unless published."""

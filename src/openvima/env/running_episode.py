@@ -52,6 +52,7 @@ class PrimitiveRun:
         episode: The episode.
         assets: Asset pack.
         compat: Reproduce VIMA-Bench's quirks.
+        realtime: Keep video frames from now on.
     """
 
     control: ClassVar[str] = PRIMITIVES
@@ -59,6 +60,7 @@ class PrimitiveRun:
     episode: Episode
     assets: Assets
     compat: bool
+    realtime: bool = False
     world: World | ToolWorld = field(init=False)
     progress: Progress = field(init=False)
     oracle_rng: np.random.Generator = field(init=False)
@@ -100,20 +102,20 @@ class PrimitiveRun:
         arrays: Any = _arrays(action) if isinstance(action, Action) else action
         return Action.from_arrays(arrays)
 
-    def step(self, action: Any, *, realtime: bool) -> None:
+    def step(self, action: Any) -> None:
         """Execute a checked action, and evaluate the goals."""
         self.frames = []
         assert isinstance(self.world, World)
-        execution = self.world.execute(action, **self.watchers(realtime=realtime))
+        execution = self.world.execute(action, **self.watchers())
         self.grasped, self.joint_path = execution.grasped, execution.joint_path
         self.num_steps += 1
         self.judge()
 
-    def perform(self, action: Action, *, realtime: bool) -> None:
+    def perform(self, action: Action) -> None:
         """Execute a primitive."""
-        self.step(action, realtime=realtime)
+        self.step(action)
 
-    def watchers(self, *, realtime: bool) -> dict[str, Any]:
+    def watchers(self) -> dict[str, Any]:
         """Return what is called during motion: to test constraints, and to keep video frames."""
 
         def monitor(scene: Scene) -> None:
@@ -123,7 +125,7 @@ class PrimitiveRun:
             self.frames.append(VideoFrame(scene, np.array(joints)))
 
         is_monitored = goals.needs_monitoring(self.episode.problem)
-        return {"monitor": monitor if is_monitored else None, "record": record if realtime else None}
+        return {"monitor": monitor if is_monitored else None, "record": record if self.realtime else None}
 
     def judge(self) -> None:
         """Evaluate goals and constraints; everything is at rest."""
@@ -169,14 +171,14 @@ class ToolRun(PrimitiveRun):
         """
         return ToolCommand.from_array(_arrays(action) if isinstance(action, ToolCommand) else action)
 
-    def step(self, action: ToolCommand, *, realtime: bool) -> None:
+    def step(self, action: ToolCommand) -> None:
         """Follow a checked command; evaluate the goals where a manipulation has ended."""
         world, before = self.tool_world, self.world.joints
         self.frames = []
         if action != self.advice:
             self.follower = None
         self.advice = None
-        has_ended = world.command(action, **self.watchers(realtime=realtime))
+        has_ended = world.command(action, **self.watchers())
         self.grasped = world.grasped
         self.joint_path = np.array([before, world.joints], np.float32)
         self.num_steps += 1
@@ -193,11 +195,11 @@ class ToolRun(PrimitiveRun):
                 return
             yield self.checked(command)
 
-    def perform(self, action: Action, *, realtime: bool) -> None:
+    def perform(self, action: Action) -> None:
         """Execute a primitive as a sequence of commands."""
         path, frames = [self.world.joints], []
         for command in self.commands(action):
-            self.step(command, realtime=realtime)
+            self.step(command)
             path.append(self.world.joints)
             frames += self.frames
         self.joint_path, self.frames = np.array(path, np.float32), frames

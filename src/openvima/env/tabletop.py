@@ -46,6 +46,7 @@ from openvima.scene.action import (
     check_control,
     steps_per_primitive,
 )
+from openvima.sim.arm_view import arm_drawables
 from openvima.sim.ur5 import JOINT_LIMITS
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
@@ -284,7 +285,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             EpisodeError, ActionError: As for `step`.
         """
         run = self._going_on()
-        run.step(run.checked(action), realtime=self.realtime)
+        run.step(run.checked(action))
         return self._after_step(run)
 
     def perform(self, action: Action) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -300,7 +301,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             EpisodeError: No episode is running.
         """
         run = self._going_on()
-        run.perform(action, realtime=self.realtime)
+        run.perform(action)
         return self.observe(), *self._after_step(run)
 
     def commands(self, action: Action) -> Iterator[ToolCommand]:
@@ -316,6 +317,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         run = self._running()
         if run.outcome.is_over or run.is_out_of_steps:
             raise EpisodeError(f"the episode ended at step {run.num_steps}; reset() starts the next one.")
+        run.realtime = self.realtime
         return run
 
     def _after_step(self, run: PrimitiveRun) -> tuple[float, bool, bool, dict[str, Any]]:
@@ -485,11 +487,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
     def _images(self, *, depth: bool = False) -> dict[View, Image]:
         world = self._running().world
         scene = world.scene
-        if self.hide_arm:
-            return self._rasteriser.scene(scene, depth=depth)
-        from openvima.sim.arm_view import arm_drawables
-
-        arm = arm_drawables(world.joints, scene.end_effector)
+        arm = () if self.hide_arm else arm_drawables(world.joints, scene.end_effector)
         return self._rasteriser.scene(scene, extra=arm, depth=depth)
 
     def _info(self) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from openvima.tasks.sampling import checked_seed
 RESET_MASK = "reset_mask"  # Gymnasium's option: which sub-environments to reset, shape (N,), bool
 
 Info = Mapping[str, Any]
+EnvFns = Sequence[Callable[[], gymnasium.Env]]
 
 
 def make_vec(
@@ -123,7 +124,7 @@ class TabletopVectorEnv(VectorEnv):
 
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gymnasium.Env]],
+        env_fns: EnvFns,
         seeds: Sequence[Sequence[int]],
         autoreset_mode: AutoresetMode,
         num_workers: int,
@@ -390,7 +391,7 @@ class _Part:
 
 def _work(
     pipe: Connection,
-    env_fns: Sequence[Callable[[], gymnasium.Env]],
+    env_fns: EnvFns,
     seeds: Sequence[Sequence[int]],
     autoreset_mode: AutoresetMode,
     part: slice,
@@ -418,7 +419,7 @@ def _work(
                 pipe.send(WorkerError(f"an answer of a worker cannot be pickled: {answer!r}"))
 
 
-def _build(env_fns: Sequence[Callable[[], gymnasium.Env]]) -> list[gymnasium.Env]:
+def _build(env_fns: EnvFns) -> list[gymnasium.Env]:
     """Build sub-environments and check that their spaces are equal."""
     envs: list[gymnasium.Env] = []
     for index, env_fn in enumerate(env_fns):
@@ -465,25 +466,18 @@ def _check_actions(actions: Any, num_envs: int, control: str) -> None:
     Raises:
         ActionError: It has another form, or an action is invalid; the first one is named.
     """
+    check: Callable[[Any], object] = Action.from_arrays
+    wanted: Any = {key: (num_envs, length) for key, length in ACTION_SHAPES.items()}
     if control == END_EFFECTOR:
-        shape, check = (num_envs, len(COMMAND_NAMES)), ToolCommand.from_array
-        if not isinstance(actions, np.ndarray) or actions.shape != shape:
-            given = f"of shape {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
-            raise ActionError(f"actions are an array of shape {shape}, not {given}. Nothing was moved.")
-    else:
-        check = Action.from_arrays
-        if not isinstance(actions, Mapping) or actions.keys() != ACTION_SHAPES.keys():
-            given = f"keys {', '.join(actions)}" if isinstance(actions, Mapping) else type(actions).__name__
-            raise ActionError(
-                f"actions are one mapping with keys {', '.join(ACTION_SHAPES)} and a row for each "
-                f"sub-environment, not {given}. `stack_actions` makes it from a list. Nothing was moved."
-            )
-        for key, value in actions.items():
-            if np.shape(value)[:1] != (num_envs,):
-                raise ActionError(
-                    f"{key} has shape {np.shape(value)}; it must have one row for each of the {num_envs} "
-                    f"sub-environments, shape ({num_envs}, {ACTION_SHAPES[key]}). Nothing was moved."
-                )
+        check, wanted = ToolCommand.from_array, (num_envs, len(COMMAND_NAMES))
+    given = getattr(actions, "shape", type(actions).__name__)
+    if isinstance(actions, Mapping):
+        given = {key: np.shape(value) for key, value in actions.items()}
+    if given != wanted:
+        raise ActionError(
+            f"actions have the form {given}; give arrays of shapes {wanted}, a row for each sub-environment. "
+            "`stack_actions` makes those of primitives from a list. Nothing was moved."
+        )
     for index in range(num_envs):
         try:
             check(_rows(actions, index))

@@ -39,7 +39,7 @@ from openvima.evaluation.prompt_ablations import (
 from openvima.evaluation.sources import ORACLE, RANDOM
 from openvima.perception.boxes import BoxJitter
 from openvima.scene import PromptImage, RenderedPrompt
-from openvima.tasks.options import MAX_DISTRACTORS, TaskOptions
+from openvima.tasks.options import MAX_DISTRACTORS, options_text, parse_options
 from openvima.tasks.sampling import check_task_options, make_rng, takes_prompts
 
 
@@ -91,19 +91,17 @@ def has_form(task: str, env_config: EnvConfig) -> bool:
 
 def with_num_distractors(env_config: EnvConfig, count: float) -> EnvConfig:
     """Put so many distractors on the table, in place of the number that the settings name."""
-    others = [
-        entry for entry in TaskOptions.parse(env_config.task_options).entries if entry[1] != _NUM_DISTRACTORS
-    ]
-    options = TaskOptions((*others, ("", _NUM_DISTRACTORS, str(int(count)))))
-    return replace(env_config, task_options=str(options))
+    options = parse_options(env_config.task_options)
+    others = {key: value for key, value in options.items() if key[1] != _NUM_DISTRACTORS}
+    options = {**others, ("", _NUM_DISTRACTORS): str(int(count))}
+    return replace(env_config, task_options=options_text(options))
 
 
 def allows_num_distractors(task: str, env_config: EnvConfig) -> bool:
     """Whether a task has the option and takes as many."""
-    entries = TaskOptions.parse(env_config.task_options).entries
-    (own,) = (entry for entry in entries if entry[1] == _NUM_DISTRACTORS)
+    count = parse_options(env_config.task_options)["", _NUM_DISTRACTORS]
     try:
-        check_task_options((task,), str(TaskOptions((own,))))
+        check_task_options((task,), f"{_NUM_DISTRACTORS}={count}")
     except ConfigError:
         return False
     return True

@@ -121,21 +121,20 @@ def _enlarge(square, size, crop):
 
 
 @njit
-def most_interior_pixel(segm, object_id, extents, distance, pixel):
-    """Write column and row of the object's pixel that is farthest from its outline into `pixel` (2,).
+def most_interior_pixel(mask, distance):
+    """Return column and row of the pixel of an object that is farthest from its outline.
 
     Distances are those of the 3-4 chamfer metric; among equals the one nearest the centroid wins, then the
-    first in reading order. `distance` is int32 of shape (H + 2, W + 2) at least; its border means "outside".
+    first in reading order. `mask` is bool, (H, W), and `distance` scratch, (H + 2, W + 2) int32, whose border
+    means "outside".
     """
-    xmin, xmax, ymin, ymax = extents[0], extents[1], extents[2], extents[3]
-    width = xmax - xmin + 1
-    height = ymax - ymin + 1
+    height, width = mask.shape
     count = 0
     sum_x = 0
     sum_y = 0
     for i in range(height + 2):
         for j in range(width + 2):
-            inside = 1 <= i <= height and 1 <= j <= width and segm[ymin + i - 1, xmin + j - 1] == object_id
+            inside = 1 <= i <= height and 1 <= j <= width and mask[i - 1, j - 1]
             distance[i, j] = _FAR if inside else 0
             if inside:
                 count += 1
@@ -147,6 +146,8 @@ def most_interior_pixel(segm, object_id, extents, distance, pixel):
             distance[i, j] = min(d, distance[i - 1, j - 1] + 4, distance[i - 1, j + 1] + 4)
     best = -1
     best_off = 0
+    column = 0
+    row = 0
     for i in range(height, 0, -1):
         for j in range(width, 0, -1):
             d = min(distance[i, j], distance[i, j + 1] + 3, distance[i + 1, j] + 3)
@@ -155,5 +156,5 @@ def most_interior_pixel(segm, object_id, extents, distance, pixel):
             if distance[i, j] > best or (distance[i, j] == best and off <= best_off):
                 best = distance[i, j]
                 best_off = off
-                pixel[0] = xmin + j - 1
-                pixel[1] = ymin + i - 1
+                column, row = j - 1, i - 1
+    return column, row

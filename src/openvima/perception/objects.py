@@ -341,25 +341,22 @@ def _cut_out(views: Sequence[_Measured], ids: np.ndarray) -> ObjectViews:
     for v, view in enumerate(views):
         objects.masks[v] = view.num_pixels[ids] >= MIN_PIXELS
         for slot in np.flatnonzero(objects.masks[v]):
-            object_id = ids[slot]
-            extent = view.extents[object_id]
-            objects.crops[v, slot], objects.boxes[v, slot] = crop_box(view.rgb, extent.tolist())
-            objects.grasps[v, slot] = interior_pixel(view.segm, extent, value=object_id)
+            left, right, upper, lower = extent = view.extents[ids[slot]].tolist()
+            objects.crops[v, slot], objects.boxes[v, slot] = crop_box(view.rgb, extent)
+            mask = view.segm[upper : lower + 1, left : right + 1] == ids[slot]
+            objects.grasps[v, slot] = np.add(interior_pixel(mask), (left, upper))
     return objects
 
 
-def interior_pixel(segm: np.ndarray, extent: np.ndarray, *, value: int) -> np.ndarray:
+def interior_pixel(mask: np.ndarray) -> np.ndarray:
     """Find the pixel of an object that is farthest from its outline.
 
     Args:
-        segm: Which object each pixel shows, shape (H, W), uint8.
-        extent: First and last column, first and last row in which to look, inclusive, shape (4,), int64.
-        value: The object; at least one pixel of it lies there.
+        mask: Where the object is in a window, shape (H, W), bool; somewhere it is.
 
     Returns:
-        Column and row, shape (2,), int64.
+        Column and row in the window, shape (2,), int64.
     """
-    distance = np.empty((extent[3] - extent[2] + 3, extent[1] - extent[0] + 3), np.int32)
-    pixel = np.empty(2, np.int64)
-    most_interior_pixel(segm, value, extent, distance, pixel)
-    return pixel
+    height, width = mask.shape
+    distance = np.empty((height + 2, width + 2), np.int32)
+    return np.array(most_interior_pixel(np.ascontiguousarray(mask), distance))

@@ -18,7 +18,7 @@ from openvima.perception.objects import (
     whole_frames,
 )
 from openvima.scene import PromptImage, RenderedPrompt
-from openvima.scene.prompt import PLACEHOLDER
+from openvima.scene.prompt import PLACEHOLDER, split_text
 
 
 class ImageStack:
@@ -251,10 +251,7 @@ def split_prompt(text: str) -> tuple[str | int, ...]:
     Returns:
         Texts, and for each placeholder the number of its image in the order of `image_names`.
     """
-    numbers = {name: number for number, name in enumerate(image_names(text))}
-    parts = PLACEHOLDER.split(text)  # texts at even indices, names at odd ones
-    pieces = [numbers[part] if k % 2 else part.strip() for k, part in enumerate(parts)]
-    return tuple(piece for piece in pieces if piece != "")
+    return tuple(split_text(text, image_names(text).index))
 
 
 def _extract_prompt_image(

@@ -47,6 +47,45 @@ def _row_times(matrix: np.ndarray, row: int, x: float, y: float, z: float) -> fl
 
 
 @njit
+def _transform(matrix: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """First three rows of a matrix, shape (·, 4), times a point."""
+    return (
+        _row_times(matrix, 0, x, y, z) + matrix[0, 3],
+        _row_times(matrix, 1, x, y, z) + matrix[1, 3],
+        _row_times(matrix, 2, x, y, z) + matrix[2, 3],
+    )
+
+
+@njit
+def _doubled_area(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> float:
+    """Doubled area of a triangle, positive for a left turn."""
+    return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+
+
+@njit
+def _interpolate(a: float, b: float, c: float, values: np.ndarray, triangle: int, part: int) -> float:
+    """Weigh one of the numbers that the corners of a triangle have, (F, 3, ·)."""
+    return a * values[triangle, 0, part] + b * values[triangle, 1, part] + c * values[triangle, 2, part]
+
+
+@njit
+def _corner_points(points: np.ndarray, corners: np.ndarray, triangle: int) -> tuple[float, ...]:
+    """Return x, y, z of the corners of a triangle, one after the other."""
+    a, b, c = corners[triangle, 0], corners[triangle, 1], corners[triangle, 2]
+    return (
+        points[a, 0],
+        points[a, 1],
+        points[a, 2],
+        points[b, 0],
+        points[b, 1],
+        points[b, 2],
+        points[c, 0],
+        points[c, 1],
+        points[c, 2],
+    )
+
+
+@njit
 def project_vertices(
     vertices: np.ndarray,  # (V, 3) float64, body frame
     pose: np.ndarray,  # (3, 4) float64, world from body
@@ -56,14 +95,9 @@ def project_vertices(
     screen = np.empty(vertices.shape)
     focal, half_width, half_height = camera[3, 0], camera[3, 1], camera[3, 2]
     for i in range(vertices.shape[0]):
-        vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        x = _row_times(pose, 0, vx, vy, vz) + pose[0, 3]
-        y = _row_times(pose, 1, vx, vy, vz) + pose[1, 3]
-        z = _row_times(pose, 2, vx, vy, vz) + pose[2, 3]
-        right = _row_times(camera, 0, x, y, z) + camera[0, 3]
-        up = _row_times(camera, 1, x, y, z) + camera[1, 3]
+        x, y, z = _transform(pose, vertices[i, 0], vertices[i, 1], vertices[i, 2])
+        right, up, distance = _transform(camera, x, y, z)
         away = _row_times(camera, 2, x, y, z)
-        distance = away + camera[2, 3]
         inverse = 1.0 / distance if distance > 0.0 else math.nan  # NaN fails every comparison: not drawn
         screen[i, 0] = half_width + focal * right * inverse
         screen[i, 1] = half_height + focal * up * inverse
@@ -76,7 +110,7 @@ def project_vertices(
 @njit
 def select_triangles(
     corners: np.ndarray,  # (F, 3) int32, indices into points
-    points: np.ndarray,  # (V, ≥ 2) float64: across and upwards; the front of triangles turns left
+    points: np.ndarray,  # (V, 3) float64: across and upwards; the front of triangles turns left
     min_area: float,  # smaller doubled areas are left out
 ) -> np.ndarray:
     """Return the indices of triangles that show their front and may cover a whole-numbered point, in order.
@@ -86,15 +120,15 @@ def select_triangles(
     """
     count, selected = 0, np.empty(corners.shape[0] + 1, np.int32)
     for f in range(corners.shape[0]):
-        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
-        ax, ay = points[a, 0], points[a, 1]
-        bx, by = points[b, 0], points[b, 1]
-        cx, cy = points[c, 0], points[c, 1]
-        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        ax, ay, _, bx, by, _, cx, cy, _ = _corner_points(points, corners, f)
         low_x, high_x = _range_of(ax, bx, cx)
         low_y, high_y = _range_of(ay, by, cy)
         selected[count] = f
-        count += (area > min_area) & (np.ceil(low_x) <= high_x) & (np.ceil(low_y) <= high_y)
+        count += (
+            (_doubled_area(ax, ay, bx, by, cx, cy) > min_area)
+            & (np.ceil(low_x) <= high_x)
+            & (np.ceil(low_y) <= high_y)
+        )
     return selected[:count]
 
 
@@ -121,12 +155,12 @@ def draw_triangles(
     uvs: np.ndarray,  # (F, 3, 2) float64
     is_flat: np.ndarray,  # (F,) bool: the corners' normals are equal
     pose: np.ndarray,  # (3, 4) float64, world from body
-    camera: np.ndarray,  # (4, 4) float64, see Camera.matrix
     texture: np.ndarray,  # (h, w, 3) uint8
     object_id: int,
-    depth: np.ndarray,  # (H, W) float64, micrometres, smaller is nearer
+    camera: np.ndarray,  # (4, 4) float64, see Camera.matrix
     rgb: np.ndarray,  # (3, H, W) uint8
     segm: np.ndarray,  # (H, W) uint8
+    depth: np.ndarray,  # (H, W) float64, micrometres, smaller is nearer
 ) -> None:
     """Draw one body into one image, over what is there already.
 
@@ -140,47 +174,30 @@ def draw_triangles(
     texture_height, texture_width = texture.shape[0], texture.shape[1]
     screen = project_vertices(vertices, pose, camera)
     for f in select_triangles(corners, screen, camera[3, 3]):
-        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
-        ax, ay = screen[a, 0], screen[a, 1]
-        bx, by = screen[b, 0], screen[b, 1]
-        cx, cy = screen[c, 0], screen[c, 1]
-        inverse_area = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+        ax, ay, az, bx, by, bz, cx, cy, cz = _corner_points(screen, corners, f)
+        inverse_area = 1.0 / _doubled_area(ax, ay, bx, by, cx, cy)
         low_x, high_x = _whole_numbers_between(ax, bx, cx, image_width - 1)
         low_y, high_y = _whole_numbers_between(ay, by, cy, image_height - 1)
         intensity = -1.0
         for j in range(low_y, high_y + 1):
             row = image_height - 1 - j
             for column in range(low_x, high_x + 1):
-                weight_a = (bx - column) * (cy - j) - (cx - column) * (by - j)
-                weight_b = (cx - column) * (ay - j) - (ax - column) * (cy - j)
-                weight_c = (ax - column) * (by - j) - (bx - column) * (ay - j)
+                weight_a = _doubled_area(column, j, bx, by, cx, cy)
+                weight_b = _doubled_area(column, j, cx, cy, ax, ay)
+                weight_c = _doubled_area(column, j, ax, ay, bx, by)
                 if (weight_a < 0.0) | (weight_b < 0.0) | (weight_c < 0.0):
                     continue
                 weight_a *= inverse_area
                 weight_b *= inverse_area
                 weight_c *= inverse_area
                 # Rounded to whole micrometres: surfaces at one height tie whatever triangles they consist of.
-                pixel_depth = np.rint(
-                    weight_a * screen[a, 2] + weight_b * screen[b, 2] + weight_c * screen[c, 2]
-                )
+                pixel_depth = np.rint(weight_a * az + weight_b * bz + weight_c * cz)
                 if pixel_depth > depth[row, column]:
                     continue
                 if intensity < 0.0 or not is_flat[f]:
-                    nx = (
-                        weight_a * normals[f, 0, 0]
-                        + weight_b * normals[f, 1, 0]
-                        + weight_c * normals[f, 2, 0]
-                    )
-                    ny = (
-                        weight_a * normals[f, 0, 1]
-                        + weight_b * normals[f, 1, 1]
-                        + weight_c * normals[f, 2, 1]
-                    )
-                    nz = (
-                        weight_a * normals[f, 0, 2]
-                        + weight_b * normals[f, 1, 2]
-                        + weight_c * normals[f, 2, 2]
-                    )
+                    nx = _interpolate(weight_a, weight_b, weight_c, normals, f, 0)
+                    ny = _interpolate(weight_a, weight_b, weight_c, normals, f, 1)
+                    nz = _interpolate(weight_a, weight_b, weight_c, normals, f, 2)
                     length = math.sqrt(nx * nx + ny * ny + nz * nz)
                     if length > 0.0:
                         nx, ny, nz = nx / length, ny / length, nz / length
@@ -189,8 +206,8 @@ def draw_triangles(
                         _row_times(pose, 1, nx, ny, nz),
                         _row_times(pose, 2, nx, ny, nz),
                     )
-                u = weight_a * uvs[f, 0, 0] + weight_b * uvs[f, 1, 0] + weight_c * uvs[f, 2, 0]
-                v = weight_a * uvs[f, 0, 1] + weight_b * uvs[f, 1, 1] + weight_c * uvs[f, 2, 1]
+                u = _interpolate(weight_a, weight_b, weight_c, uvs, f, 0)
+                v = _interpolate(weight_a, weight_b, weight_c, uvs, f, 1)
                 texel_row, texel_column = texel_index(u, v, texture_height, texture_width)
                 for channel in range(3):
                     lit = intensity * texture[texel_row, texel_column, channel]
@@ -219,29 +236,22 @@ def stamp_triangles(
     num_rows, num_columns = labels.shape
     points = np.empty(vertices.shape)  # column, row, height
     for i in range(vertices.shape[0]):
-        vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        points[i, 0] = (_row_times(pose, 0, vx, vy, vz) + pose[0, 3] - origin_x) / cell
-        points[i, 1] = (_row_times(pose, 1, vx, vy, vz) + pose[1, 3] - origin_y) / cell
-        points[i, 2] = _row_times(pose, 2, vx, vy, vz) + pose[2, 3]
+        x, y, z = _transform(pose, vertices[i, 0], vertices[i, 1], vertices[i, 2])
+        points[i, 0], points[i, 1], points[i, 2] = (x - origin_x) / cell, (y - origin_y) / cell, z
 
     for f in select_triangles(corners, points, 0.0):
-        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
-        ax, ay = points[a, 0], points[a, 1]
-        bx, by = points[b, 0], points[b, 1]
-        cx, cy = points[c, 0], points[c, 1]
-        inverse_area = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+        ax, ay, az, bx, by, bz, cx, cy, cz = _corner_points(points, corners, f)
+        inverse_area = 1.0 / _doubled_area(ax, ay, bx, by, cx, cy)
         low_x, high_x = _whole_numbers_between(ax, bx, cx, num_columns - 1)
         low_y, high_y = _whole_numbers_between(ay, by, cy, num_rows - 1)
         for row in range(low_y, high_y + 1):
             for column in range(low_x, high_x + 1):
-                weight_a = (bx - column) * (cy - row) - (cx - column) * (by - row)
-                weight_b = (cx - column) * (ay - row) - (ax - column) * (cy - row)
-                weight_c = (ax - column) * (by - row) - (bx - column) * (ay - row)
+                weight_a = _doubled_area(column, row, bx, by, cx, cy)
+                weight_b = _doubled_area(column, row, cx, cy, ax, ay)
+                weight_c = _doubled_area(column, row, ax, ay, bx, by)
                 if (weight_a < 0.0) | (weight_b < 0.0) | (weight_c < 0.0):
                     continue
-                z = (
-                    weight_a * points[a, 2] + weight_b * points[b, 2] + weight_c * points[c, 2]
-                ) * inverse_area
+                z = (weight_a * az + weight_b * bz + weight_c * cz) * inverse_area
                 height = np.float32(z)
                 if z < ceiling and height >= heights[row, column]:
                     heights[row, column] = height

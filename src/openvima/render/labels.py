@@ -37,7 +37,7 @@ def stamp(raster: np.ndarray, heights: np.ndarray, placement: Placement, assets:
         placement: The object.
         assets: Asset pack.
     """
-    mesh = index_mesh(assets.geometry(placement.object, placement.size, placement.scale).visual)
+    mesh = index_mesh(placement.geometry(assets).visual)
     x, y, _, _ = placement.pose.quaternion
     is_level = x == 0 and y == 0
     stamp_triangles(

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from openvima.errors import ShapeError
 from openvima.render.camera import CAMERAS, VIEWS, Camera, View, channels_first, channels_last
 from openvima.render.kernels import (
     MICROMETRES,
-    IndexedMesh,
     draw_triangles,
     index_mesh,
     magnify,
@@ -148,7 +147,7 @@ class Rasteriser:
         return PromptImage(name, kind, rgb, segm, records)
 
     def _drawable(self, placement: Placement, magnification: float = 1.0) -> Drawable:
-        mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
+        mesh = placement.geometry(self.assets).visual
         return Drawable(
             mesh if magnification == 1 else magnify(mesh, magnification),
             placement.pose,
@@ -171,7 +170,7 @@ class Rasteriser:
             empty = _empty_canvas(CAMERAS[view].enlarged(enlarge), table)
             canvas = _Canvas(empty.camera, empty.rgb.copy(), empty.segm.copy(), empty.depth.copy())
             for body in prepared:
-                _draw_body(body, canvas)
+                draw_triangles(*body, *canvas)
             distances = _distances(canvas.depth, CAMERAS[view]) if depth else None
             images[view] = Image(canvas.rgb, canvas.segm, distances)
         return images
@@ -184,9 +183,6 @@ class _Canvas(NamedTuple):
     rgb: np.ndarray
     segm: np.ndarray
     depth: np.ndarray
-
-
-_Prepared = tuple[IndexedMesh, np.ndarray, np.ndarray, int]  # mesh, pose, texture, id
 
 
 def _photo_image(name: str, fill: PhotoImage) -> PromptImage:
@@ -205,28 +201,13 @@ def _photo_image(name: str, fill: PhotoImage) -> PromptImage:
     return PromptImage(name, "object", rgb, segm, (ObjectRecord(0, PHOTO_OBJECT, PHOTO_TEXTURE),))
 
 
-def _prepare(body: Drawable) -> _Prepared:
+def _prepare(body: Drawable) -> tuple[Any, ...]:
+    """Return what `draw_triangles` takes of a body."""
     if not 0 <= body.id <= LARGEST_ID:
         raise ShapeError(f"object id {body.id} does not fit a segmentation image; use 0 to {LARGEST_ID}.")
-    return index_mesh(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), body.id
-
-
-def _draw_body(body: _Prepared, canvas: _Canvas) -> None:
-    mesh, pose, texture, object_id = body
-    draw_triangles(
-        mesh.vertices,
-        mesh.corners,
-        mesh.normals,
-        mesh.uvs,
-        mesh.is_flat,
-        pose,
-        canvas.camera,
-        texture,
-        object_id,
-        canvas.depth,
-        canvas.rgb,
-        canvas.segm,
-    )
+    mesh = index_mesh(body.mesh)
+    arrays = (mesh.vertices, mesh.corners, mesh.normals, mesh.uvs, mesh.is_flat)
+    return *arrays, matrix_3x4(body.pose), _texture_array(body.texture), body.id
 
 
 @lru_cache(maxsize=16)
@@ -242,7 +223,7 @@ def _empty_canvas(camera: Camera, table: bool) -> _Canvas:
         floor = Drawable(_rectangle(200.0, 200.0), Pose((0.0, 0.0, FLOOR_Z)), FLOOR_ID, FLOOR_RGB)
         sheet = Drawable(_rectangle(*SHEET_SIZE), Pose((0.5, 0.0, 0.0)), SHEET_ID, SHEET_RGB)
         for body in (floor, sheet):
-            _draw_body(_prepare(body), canvas)
+            draw_triangles(*_prepare(body), *canvas)
     return canvas
 
 

@@ -48,7 +48,7 @@ def first_hit(
     if nearest < 0:
         nearest = np.inf
     for placement in placements:
-        visual = assets.geometry(placement.object, placement.size, placement.scale).visual
+        visual = placement.geometry(assets).visual
         corners = placement.pose.transform(visual.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
         distance = _nearest(corners, start, ray)
         if distance < nearest:

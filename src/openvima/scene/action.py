@@ -12,6 +12,7 @@ from openvima.scene.scene import (
     IDENTITY,
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
+    Point,
     Pose,
     Quaternion,
     normalised,
@@ -42,13 +43,13 @@ class Action:
         pose1_rotation: Quaternion xyzw; only its yaw matters. The spatula ignores both rotations.
     """
 
-    pose0_position: tuple[float, float]
-    pose1_position: tuple[float, float]
+    pose0_position: Point
+    pose1_position: Point
     pose0_rotation: Quaternion = IDENTITY
     pose1_rotation: Quaternion = IDENTITY
 
     @staticmethod
-    def planar(pick: tuple[float, float], place: tuple[float, float], yaw_rad: float = 0.0) -> "Action":
+    def planar(pick: Point, place: Point, yaw_rad: float = 0.0) -> "Action":
         """Build an action from two points and a relative rotation, counter-clockwise from above.
 
         Positions are clipped to the workspace and rounded to float32.

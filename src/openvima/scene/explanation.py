@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from openvima.scene.action import WORKSPACE_HIGH, WORKSPACE_LOW
+from openvima.scene.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Point
 
 SAME_PLACE_M = 0.02  # place candidates this near to each other count as one
 PLACE_KINDS = ("in view", "first step", "prompt", "grid")  # where place candidates come from
@@ -26,7 +26,7 @@ class ObjectProbability:
 
     object_id: int
     boxes: Mapping[str, tuple[int, ...]]
-    grasp: tuple[float, float]
+    grasp: Point
     probability: float
 
 
@@ -43,7 +43,7 @@ class PlaceProbability:
     """
 
     kind: str
-    position: tuple[float, float]
+    position: Point
     probability: float
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, TypeAlias, TypeGuard
 
+from openvima.catalog.geometry import Vector3
 from openvima.errors import brief_repr
 from openvima.scene.scene import Placement, Pose, Scene, angle_difference, rotate
 
@@ -73,12 +74,12 @@ class Zone:
     size_x: float
     size_y: float
 
-    def contains(self, point: tuple[float, float, float]) -> bool:
+    def contains(self, point: Vector3) -> bool:
         """Whether a point is strictly inside the rectangle and less than 0.3 m above the table."""
         px, py, pz = point
         return abs(px - self.x) < self.size_x / 2 and abs(py - self.y) < self.size_y / 2 and pz < 0.3
 
-    def distance(self, point: tuple[float, float, float]) -> float:
+    def distance(self, point: Vector3) -> float:
         """Planar distance of a point from the rectangle in metres; 0 inside."""
         beside_x = max(abs(point[0] - self.x) - self.size_x / 2, 0.0)
         beside_y = max(abs(point[1] - self.y) - self.size_y / 2, 0.0)
@@ -97,7 +98,7 @@ _BLOCK_REACH_M = 0.026  # of the farthest point from the block's centre
 BLOCK_POINTS = tuple((x, y, z) for x in _BLOCK_GRID for y in _BLOCK_GRID for z in _BLOCK_GRID)
 
 
-def block_points(pose: Pose) -> list[tuple[float, float, float]]:
+def block_points(pose: Pose) -> list[Vector3]:
     """The eight points that stand for a small block at `pose`, in the world, metres."""
     points = []
     for local in BLOCK_POINTS:

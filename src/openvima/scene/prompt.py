@@ -1,9 +1,9 @@
 """Multimodal prompts: text interleaved with images of objects and scenes."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,23 @@ from openvima.scene.scene import Placement, Scene
 FIRST_IMAGE_ID = 2  # after floor and sheet; prompt images show no arm
 PHOTO_SIDE = 48  # pixels; rendered prompt objects have 22 to 60
 PLACEHOLDER = re.compile(r"\{(\w+)\}")  # of an image, with its name
+
+T = TypeVar("T")
+
+
+def split_text(text: str, image_of: Callable[[str], T]) -> list[str | T]:
+    """Split the text of a prompt at its placeholders.
+
+    Args:
+        text: The text.
+        image_of: Returns what stands for the image of a name.
+
+    Returns:
+        Stripped text pieces, but for empty ones, and what stands for the images, in reading order.
+    """
+    pieces = enumerate(PLACEHOLDER.split(text))  # texts at even places, names at odd ones
+    parts = (image_of(piece) if place % 2 else piece.strip() for place, piece in pieces)
+    return [part for part in parts if part != ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +131,7 @@ class Prompt:
     def described_parts(self) -> list[str | tuple[str, str]]:
         """Return text pieces, and for each image its name and what it will show, in reading order."""
         shown = {name: str(fill) for name, fill in self.images}
-        return [
-            (piece, shown.get(piece, piece)) if place % 2 else piece.strip()
-            for place, piece in enumerate(PLACEHOLDER.split(self.text))
-            if piece.strip()
-        ]
+        return split_text(self.text, lambda name: (name, shown.get(name, name)))
 
     @staticmethod
     def parse(template: str, **fills: PromptFill | str | int) -> "Prompt":
@@ -212,6 +225,4 @@ class RenderedPrompt:
                 f"prompt {echo(repr(self.text), 100)} names images {echo(str(sorted(set(names))), 100)}, "
                 f"but got {echo(str(sorted(self.images)), 100)}."
             )
-        pieces = PLACEHOLDER.split(self.text)  # text at even places, names at odd ones
-        parts = [self.images[piece] if i % 2 else piece.strip() for i, piece in enumerate(pieces)]
-        return [part for part in parts if not isinstance(part, str) or part]
+        return split_text(self.text, self.images.__getitem__)

@@ -7,9 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from openvima.catalog.geometry import Vector3
+from openvima.catalog.geometry import Assets, Geometry, Vector3
 from openvima.errors import SceneError, brief_repr
 
+Point = tuple[float, float]  # x and y on the table, metres
 Quaternion = tuple[float, float, float, float]
 
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -51,8 +52,12 @@ class Pose:
 
     @property
     def yaw_rad(self) -> float:
-        """Heading: the angle about z of the z-x-y static Euler decomposition, in (−π, π]."""
-        return quaternion_yaw(self.quaternion)
+        """Heading in (−π, π].
+
+        Source: angle about z of the z-x-y static Euler angles, R = Ry Rx Rz; the usual yaw for flat bodies.
+        """
+        x, y, z, w = self.quaternion
+        return math.atan2(2 * (x * y + w * z), 1 - 2 * (x * x + z * z))
 
     def rotated(self, yaw_rad: float) -> "Pose":
         """Return this pose rotated in place by `yaw_rad` about the world's z axis."""
@@ -101,15 +106,6 @@ class Pose:
 def yaw_quaternion(yaw_rad: float) -> Quaternion:
     """Quaternion xyzw of a rotation by `yaw_rad` about z."""
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
-
-
-def quaternion_yaw(quaternion: Quaternion) -> float:
-    """Heading of a quaternion xyzw in (−π, π].
-
-    Source: angle about z of the z-x-y static Euler angles, R = Ry Rx Rz; the usual yaw for flat bodies.
-    """
-    x, y, z, w = quaternion
-    return math.atan2(2 * (x * y + w * z), 1 - 2 * (x * x + z * z))
 
 
 def normalised(quaternion: Quaternion) -> Quaternion:
@@ -199,6 +195,10 @@ class Placement:
     def at(self, pose: Pose) -> "Placement":
         """Return the same object at another pose."""
         return replace(self, pose=pose)
+
+    def geometry(self, assets: Assets) -> Geometry:
+        """Return its shape in an asset pack, in the link frame."""
+        return assets.geometry(self.object, self.size, self.scale)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's names come from a compiled module without type stubs.)
 
+import itertools
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -16,6 +17,7 @@ from openvima.scene.scene import Quaternion, normalised
 from openvima.sim.model import PARKED_M, PROBE_HALF_LENGTH_M, TICK_S, body_shape, build_model
 
 _FASTEST = np.array([1.0, 1.0, 1.0, 1 / 0.015, 1 / 0.015, 1 / 0.015])  # rad/s per m/s: half a small block
+MAX_SPEED = 0.5  # m/s, of bodies squeezed out between the spatula and a fixed body
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that later ticks depend on
 _SLOWEST = -_FASTEST - np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0])  # falling is free
 
@@ -31,13 +33,11 @@ class Bodies:
 
     Attributes:
         geoms: MuJoCo ids of the convex parts of each body.
+        sleeping: Indices of free bodies at rest that nothing can touch for now; physics leaves them out.
     """
 
     def __init__(self, scene: Scene, assets: Assets) -> None:
-        self.shapes = tuple(
-            body_shape(p.object, assets.geometry(p.object, p.size, p.scale), p.fixed)
-            for p in scene.placements
-        )
+        self.shapes = tuple(body_shape(p.object, p.geometry(assets), p.fixed) for p in scene.placements)
         with_spatula = scene.end_effector == "spatula"
         self._load_model(with_spatula)
         rigid = [index for index, shape in enumerate(self.shapes) if not shape.fixed]
@@ -49,6 +49,7 @@ class Bodies:
         self.geoms = tuple(
             range(int(first[i + 1]), int(first[i + 1] + count[i + 1])) for i in range(len(self.shapes))
         )
+        self.sleeping: set[int] = set()
         self._has_walls = any(self.geoms[index] for index in fixed)
         self._probe_mocap = len(fixed)
         self.probe_geom = int(first[len(self.shapes) + 1])
@@ -120,14 +121,9 @@ class Bodies:
         """Update the geometry to the poses that were set."""
         mujoco.mj_kinematics(self.model, self.data)
 
-    def tick(self, num_ticks: int = 1, *, sleeping: Iterable[int] = ()) -> None:
-        """Advance the physics.
-
-        Args:
-            num_ticks: Number of ticks.
-            sleeping: Indices of free bodies at rest that nothing can touch meanwhile. They are left out.
-        """
-        rows = [self._joint[index] for index in sleeping]
+    def tick(self, num_ticks: int) -> None:
+        """Advance the physics by some ticks."""
+        rows = [self._joint[index] for index in self.sleeping]
         if not rows:
             mujoco.mj_step(self.model, self.data, num_ticks)
             return
@@ -137,32 +133,25 @@ class Bodies:
         self._positions[rows], self._velocities[rows] = before, 0.0
 
     def tick_with_spatula(
-        self,
-        pose: Pose,
-        velocity: Vector3,
-        *,
-        num_ticks: int,
-        max_speed: float,
-        sleeping: Iterable[int],
-        turning: float = 0.0,
+        self, pose: Pose, velocity: Vector3, num_ticks: int, *, turning: float = 0.0
     ) -> None:
         """Advance the physics while the spatula moves at constant velocity, unaffected by contacts.
+
+        Speeds are limited at the end. With fixed bodies, after every tick: a body squeezed between one and
+        the spatula accelerates too fast for a later limit.
 
         Args:
             pose: The spatula's centre at the start.
             velocity: Velocity of the spatula, m/s.
             num_ticks: Number of ticks.
-            max_speed: See `limit_speed`; applied at the end. With fixed bodies, after every tick: a body
-                squeezed between one and the spatula accelerates too fast for a later limit.
-            sleeping: See `tick`.
             turning: Angular velocity of the upright spatula, rad/s; its heading follows after the last tick.
         """
         place, speed = np.array(_numbers(pose)), np.array((*velocity, 0.0, 0.0, turning))
         stride = 1 if self._has_walls else num_ticks
         for _ in range(0, num_ticks, stride):
             self._positions[-1], self._velocities[-1] = place, speed
-            self.tick(stride, sleeping=sleeping)
-            self.limit_speed(max_speed)
+            self.tick(stride)
+            self.limit_speed(MAX_SPEED)
             place[:3] += speed[:3] * (stride * TICK_S)
 
     def stop(self) -> None:
@@ -189,21 +178,17 @@ class Bodies:
         """Current positions and quaternions of the free bodies, shape (N, 7), a copy."""
         return self._positions[: len(self.rigid)].copy()
 
-    def mean_speeds(
-        self, since: np.ndarray, duration_s: float, *, apart_from: int | None = None
-    ) -> tuple[float, float]:
-        """Largest component of the mean linear (m/s) and angular (rad/s) velocity.
+    def mean_speeds(self, since: np.ndarray, duration_s: float) -> tuple[float, float]:
+        """Largest component of mean linear (m/s) and angular (rad/s) velocity, of bodies not parked.
 
         A body that jitters in place has a velocity, but no mean velocity.
 
         Args:
             since: Earlier `coordinates`.
             duration_s: Time since then.
-            apart_from: Index of a body to ignore, such as a parked one.
         """
-        change = np.abs(self._positions[: len(self.rigid)] - since) / duration_s
-        if apart_from is not None:
-            change[self._joint[apart_from]] = 0.0
+        in_play = since[:, 2] < PARKED_M / 2
+        change = np.abs(self._positions[: len(self.rigid)] - since)[in_play] / duration_s
         return float(change[:, :3].max(initial=0.0)), 2 * float(change[:, 3:].max(initial=0.0))
 
     def shift(self, indices: Iterable[int], offset: Vector3) -> None:
@@ -226,13 +211,8 @@ class Bodies:
 
 
 def _heights(points: np.ndarray, quaternion: Quaternion) -> np.ndarray:
-    """Heights above its link frame, shape (N,), of points of a body with that orientation.
-
-    Written out: the last bits of a matrix product depend on the CPU.
-    """
-    x, y, z, w = quaternion
-    up = (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))  # in the body's frame
-    return points[:, 0] * up[0] + points[:, 1] * up[1] + points[:, 2] * up[2]
+    """Heights above its link frame, shape (N,), of points of a body with that orientation."""
+    return Pose((0.0, 0.0, 0.0), quaternion).transform(points[:, :3])[:, 2]
 
 
 def _numbers(pose: Pose) -> tuple[float, ...]:
@@ -256,13 +236,13 @@ def body_gap(bodies: Bodies, index1: int, index2: int) -> float:
     reach = bodies.shapes[index1].radius_m + bodies.shapes[index2].radius_m
     if bodies.pose(index1).planar_distance(bodies.pose(index2)) > reach + 0.01:
         return np.inf
-    pairs = [(g1, g2) for g1 in bodies.geoms[index1] for g2 in bodies.geoms[index2]]
-    return min((gap(bodies, g1, g2) for g1, g2 in pairs), default=np.inf)
+    pairs = itertools.product(bodies.geoms[index1], bodies.geoms[index2])
+    return min((gap(bodies, *pair) for pair in pairs), default=np.inf)
 
 
 def distance_to_contact(
     bodies: Bodies, moving: Iterable[int], others: Iterable[int], *, direction: Vector3, length_m: float
-) -> float | None:
+) -> float:
     """How far some parts can move before one of them touches one of the others; nothing is moved.
 
     Args:
@@ -273,21 +253,17 @@ def distance_to_contact(
         length_m: Largest distance.
 
     Returns:
-        Metres, 0 if they touch already; None without contact.
+        Metres, 0 if they touch already; infinite without contact.
     """
-    ways = [
-        way
-        for geom in moving
-        for other in others
-        if (way := _pair_distance_to_contact(bodies, geom, other, np.array(direction), length_m)) is not None
-    ]
-    return min(ways, default=None)
+    pairs = itertools.product(moving, others)
+    along = np.array(direction)
+    return min((_pair_distance_to_contact(bodies, *pair, along, length_m) for pair in pairs), default=np.inf)
 
 
 def _pair_distance_to_contact(
     bodies: Bodies, geom: int, other: int, direction: np.ndarray, length_m: float
-) -> float | None:
-    """How far one part can move before it touches another; None without contact.
+) -> float:
+    """How far one part can move before it touches another; infinite without contact.
 
     The distance of two convex shapes is a convex function of the translation of one of them. Newton's method,
     started without contact, therefore never overshoots, and converges in a few evaluations. The slope is that
@@ -299,10 +275,10 @@ def _pair_distance_to_contact(
     offset = positions[other] - start
     sideways = offset - direction * _dot(offset, direction)
     if _dot(sideways, sideways) > float(model.geom_rbound[geom] + model.geom_rbound[other] + margin) ** 2:
-        return None
+        return np.inf
     segment = np.zeros(6)
     way = 0.0
-    found = None
+    found = np.inf
     for _ in range(_MOST_STEPS):
         positions[geom] = start + way * direction
         distance = mujoco.mj_geomDistance(model, bodies.data, geom, other, _FARTHEST_M, segment) - margin

@@ -1,7 +1,7 @@
-"""State of one primitive: bodies, monitor, settling, and the path of the arm with frames for a video."""
+"""State of one primitive: bodies, settling, and the path of the arm with frames for a video."""
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,16 +25,12 @@ class Settling:
 
     Args:
         bodies: The bodies.
-        apart_from: Index of a body to ignore, such as a parked one.
         max_speed: Bound of the horizontal speed in m/s, for bodies that overlap at the start.
-        sleeping: See `Bodies.tick`.
         num_ticks: Ticks so far.
     """
 
     bodies: Bodies
-    apart_from: int | None = None
     max_speed: float | None = None
-    sleeping: Collection[int] = ()
     num_ticks: int = 0
     _quiet: int = 0  # strides in a row in which all bodies were slow
 
@@ -46,11 +42,11 @@ class Settling:
     def run(self, num_ticks: int = STRIDE_TICKS) -> None:
         """Run one stride; where it is the last one, stop all bodies."""
         before = self.bodies.coordinates()
-        self.bodies.tick(num_ticks, sleeping=self.sleeping)
+        self.bodies.tick(num_ticks)
         if self.max_speed is not None:
             self.bodies.limit_speed(self.max_speed)
         self.num_ticks += num_ticks
-        speed, turning = self.bodies.mean_speeds(before, num_ticks * TICK_S, apart_from=self.apart_from)
+        speed, turning = self.bodies.mean_speeds(before, num_ticks * TICK_S)
         is_slow = speed < SETTLED_SPEED and turning < SETTLED_TURNING
         self._quiet = self._quiet + 1 if is_slow else 0
         if self.is_over:
@@ -63,6 +59,7 @@ FRAME_S = 1 / FRAMES_PER_SECOND
 FREE_SPEED = 2.4  # rad/s, Euclidean norm over the joints, as in VIMA-Bench
 SWEEP_SPEED = 0.48
 
+Monitor = Callable[[Scene], None]
 RecordFrame = Callable[[Scene, np.ndarray], None]
 
 
@@ -77,76 +74,6 @@ def reachable_joints(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray
     return inverse(x, y, min(z, highest_tip_z(x, y) - REACH_RESERVE_M), yaw_rad)
 
 
-@dataclass(slots=True, eq=False)
-class ArmPath:
-    """The path of the arm during one primitive.
-
-    Frames are computed only with a recorder.
-
-    Args:
-        waypoints: Joint angles so far, shape (6,), float64, radians.
-        record: Called with scene and joints for every video frame, or None.
-    """
-
-    waypoints: list[np.ndarray]
-    record: RecordFrame | None
-    _since_frame_s: float = 0.0
-    _stored: list[Scene] = field(default_factory=list)
-
-    @property
-    def joints(self) -> np.ndarray:
-        """Current joint angles, shape (6,), radians."""
-        return self.waypoints[-1]
-
-    def move(
-        self, joints: np.ndarray, *, scene: Callable[[np.ndarray], Scene], speed: float = FREE_SPEED
-    ) -> None:
-        """Move in a straight line in joint space.
-
-        Args:
-            joints: Target joint angles, shape (6,), radians.
-            scene: Returns the scene for the joints of a frame; stored scenes come first.
-            speed: In rad/s, Euclidean norm over the joints.
-        """
-        start = self.joints
-        self.waypoints.append(joints)
-        if self.record is None:
-            return
-        duration_s = max(math.dist(joints, start) / speed, 1e-9)
-        stored, self._stored = self._stored, []
-        now = start
-        for time_s in self._frame_times(duration_s):
-            now = start + (joints - start) * (time_s / duration_s)
-            self.record(stored.pop(0) if stored else scene(now), now)
-        for late in stored:
-            self.record(late, joints)
-
-    def stay(self, num_ticks: int, *, scene: Callable[[], Scene], joints: Callable[[], np.ndarray]) -> None:
-        """Record the frames of some physics ticks, with the arm at `joints()`."""
-        for _ in self._frame_times(num_ticks * TICK_S):
-            if self.record is not None:
-                self.record(scene(), joints())
-
-    def store(self, num_ticks: int, *, scene: Callable[[], Scene]) -> None:
-        """Store the frames of some physics ticks for the arm's next move, which happens meanwhile."""
-        for _ in self._frame_times(num_ticks * TICK_S):
-            self._stored.append(scene())
-
-    def array(self) -> np.ndarray:
-        """Waypoints, shape (W, 6), float32, radians."""
-        return np.array(self.waypoints, dtype=np.float32)
-
-    def _frame_times(self, duration_s: float) -> Iterator[float]:
-        """Times within the coming `duration_s` seconds at which a frame is due."""
-        if self.record is None:
-            return
-        due_s = FRAME_S - self._since_frame_s
-        count = max(0, math.floor((duration_s - due_s) / FRAME_S + 1e-9) + 1)
-        self._since_frame_s += duration_s - count * FRAME_S
-        for index in range(count):
-            yield due_s + index * FRAME_S
-
-
 RESTING_GAP_M = 5e-4  # bodies nearer than this may support each other
 LEVEL_RAD = 0.03  # the pan rests tilted by 0.01
 STILL_M = 5e-5  # a body that moved by less than this, and rotated by less than …
@@ -155,22 +82,28 @@ STILL_RAD = 5e-4  # … this, keeps its pose, so that nothing creeps over many s
 
 @dataclass(slots=True, eq=False)
 class PrimitiveState:
-    """Bodies, arm and monitor during one primitive.
+    """Bodies and arm during one primitive, and who is told of their motion.
+
+    Frames are computed only with a recorder.
 
     Args:
         start: The scene at the start.
         bodies: Its bodies.
-        path: Path of the arm.
+        waypoints: Joint angles of the arm so far, shape (6,), float64, radians.
         monitor: Called with the scene at least every 25 ticks of physics, or None.
+        record: Called with scene and joints for every video frame, or None.
         num_ticks: Ticks of physics so far.
     """
 
     start: Scene
     bodies: Bodies
-    path: ArmPath
-    monitor: Callable[[Scene], None] | None
+    waypoints: list[np.ndarray]
+    monitor: Monitor | None
+    record: RecordFrame | None = None
     num_ticks: int = 0
     _unmonitored_ticks: int = 0
+    _since_frame_s: float = 0.0
+    _stored: list[Scene] = field(default_factory=list)
 
     def placement(self, index: int) -> Placement:
         """A placement at the start."""
@@ -198,20 +131,57 @@ class PrimitiveState:
             self._unmonitored_ticks = 0
             self.monitor(self.scene())
 
-    def settle(
-        self,
-        held: tuple[int, Pose] | None = None,
-        *,
-        max_speed: float | None = None,
-        sleeping: Collection[int] = (),
-    ) -> None:
+    def settle(self, held: tuple[int, Pose] | None = None, *, max_speed: float | None = None) -> None:
         """Run physics until everything is at rest; the arm's next move happens meanwhile."""
-        apart_from = held[0] if held else None
-        settling = Settling(self.bodies, apart_from=apart_from, max_speed=max_speed, sleeping=sleeping)
+        settling = Settling(self.bodies, max_speed)
         while not settling.is_over:
             settling.run()
             self.count_ticks(STRIDE_TICKS, held)
-            self.path.store(STRIDE_TICKS, scene=lambda: self.scene(held))
+            self._stored += [self.scene(held) for _ in self._frame_times(STRIDE_TICKS * TICK_S)]
+
+    def move(
+        self,
+        joints: np.ndarray,
+        *,
+        scene: Callable[[np.ndarray], Scene] | None = None,
+        speed: float = FREE_SPEED,
+    ) -> None:
+        """Move the arm in a straight line in joint space.
+
+        Args:
+            joints: Target joint angles, shape (6,), radians.
+            scene: Returns the scene for the joints of a frame; stored scenes come first. None: that at the
+                start.
+            speed: In rad/s, Euclidean norm over the joints.
+        """
+        start = self.waypoints[-1]
+        self.waypoints.append(joints)
+        if self.record is None:
+            return
+        duration_s = max(math.dist(joints, start) / speed, 1e-9)
+        stored, self._stored = self._stored, []
+        now = start
+        for time_s in self._frame_times(duration_s):
+            now = start + (joints - start) * (time_s / duration_s)
+            self.record(stored.pop(0) if stored else scene(now) if scene else self.start, now)
+        for late in stored:
+            self.record(late, joints)
+
+    def stay(self, num_ticks: int, joints: Callable[[], np.ndarray]) -> None:
+        """Record the frames of some physics ticks, with the arm at `joints()`."""
+        for _ in self._frame_times(num_ticks * TICK_S):
+            if self.record is not None:
+                self.record(self.scene(), joints())
+
+    def _frame_times(self, duration_s: float) -> Iterator[float]:
+        """Times within the coming `duration_s` seconds at which a frame is due."""
+        if self.record is None:
+            return
+        due_s = FRAME_S - self._since_frame_s
+        count = max(0, math.floor((duration_s - due_s) / FRAME_S + 1e-9) + 1)
+        self._since_frame_s += duration_s - count * FRAME_S
+        for index in range(count):
+            yield due_s + index * FRAME_S
 
     def finish(self) -> Scene:
         """Reset bodies that hardly moved; monitor and return the final scene."""

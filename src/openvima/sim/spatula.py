@@ -12,7 +12,7 @@ from openvima.catalog.geometry import Vector3
 from openvima.scene import Pose
 from openvima.scene.scene import rotate
 from openvima.sim import ur5
-from openvima.sim.bodies import distance_to_contact
+from openvima.sim.bodies import MAX_SPEED, distance_to_contact
 from openvima.sim.model import TICK_S
 from openvima.sim.primitive_state import (
     MONITOR_TICKS,
@@ -27,7 +27,6 @@ from openvima.sim.primitive_state import (
 )
 
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
-MAX_SPEED = 0.5  # m/s, of bodies squeezed out between the spatula and a fixed body
 # Pushed bodies jitter, but hardly shift against the spatula. Carrying them without physics saves three of
 # four ticks and changes final positions as much as a 0.1 % faster spatula (1.5 mm in the median, at most 12).
 CARRIED_SHIFT_M = 6e-4  # bodies that shift against the spatula by less than this, and rotate by less …
@@ -62,21 +61,16 @@ class Spatula:
         self._in_joint_space = in_joint_space
         self._tip: Vector3 = (0.0, 0.0, ur5.SWEEP_HOVER_TIP_Z_M)
         self._recent: list[tuple[np.ndarray, Vector3]] = []  # coordinates and tip before the last strides
-        self._sleeping = set(() if awake else state.bodies.rigid)  # at rest, and far from all that moves
+        self._bodies.sleeping = set(() if awake else state.bodies.rigid)
         self._pushed = tuple(geom for index in state.bodies.rigid for geom in state.bodies.geoms[index])
 
     def lower(self, x: float, y: float) -> None:
         """Lower the spatula at a point and displace bodies there."""
-        path, scene = self._state.path, self._state.start
         hover = self._joints_at(x, y, ur5.SWEEP_HOVER_TIP_Z_M)
         down = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
-        path.move(hover, scene=lambda _: scene)
-        path.move(down, scene=lambda _: scene)
-        way = (
-            [point for point in _joint_space_path(hover, down) if point[2] < _LOW_TIP_Z_M]
-            if self._in_joint_space
-            else []
-        )
+        self._state.move(hover)
+        self._state.move(down)
+        way = [point for point in self._bent_path(hover, down) if point[2] < _LOW_TIP_Z_M]
         self._tip, *rest = [*way, (x, y, ur5.SWEEP_TIP_Z_M)]
         in_the_way = [index for index in self._bodies.rigid if self._displace(index)]
         if in_the_way:
@@ -87,10 +81,9 @@ class Spatula:
     def push(self, x: float, y: float) -> None:
         """Move the lowered spatula to a point."""
         target = self._joints_at(x, y, ur5.SWEEP_TIP_Z_M)
-        for point in _joint_space_path(self._joints(), target) if self._in_joint_space else []:
+        for point in (*self._bent_path(self._joints(), target), (x, y, ur5.SWEEP_TIP_Z_M)):
             self._push_to(point)
-        self._push_to((x, y, ur5.SWEEP_TIP_Z_M))
-        self._state.path.waypoints.append(target)
+        self._state.waypoints.append(target)
 
     def engage(self, x: float, y: float) -> None:
         """Press the spatula to the table where it is, displacing bodies there."""
@@ -114,22 +107,21 @@ class Spatula:
         """Take the spatula off the table; return the settling of the bodies that it moved."""
         self._bodies.park_spatula()
         self._wake(_SLIDE_M)
-        return Settling(self._bodies, max_speed=MAX_SPEED, sleeping=self._sleeping)
+        return Settling(self._bodies, MAX_SPEED)
 
     def lift(self) -> None:
         """Lift the spatula and let everything settle."""
         state = self._state
         hover = self._joints_at(self._tip[0], self._tip[1], ur5.SWEEP_HOVER_TIP_Z_M)
-        for point in _joint_space_path(self._joints(), hover) if self._in_joint_space else []:
+        for point in self._bent_path(self._joints(), hover):
             if point[2] > _LOW_TIP_Z_M:
                 break
             self._push_to(point)
         self._bodies.park_spatula()
         if state.num_ticks:
             self._wake(_SLIDE_M)
-            state.settle(max_speed=MAX_SPEED, sleeping=self._sleeping)
-        after = state.scene() if state.path.record else state.start
-        state.path.move(hover, scene=lambda _: after)
+            state.settle(max_speed=MAX_SPEED)
+        state.move(hover, scene=lambda _: state.scene())
 
     def _displace(self, index: int) -> bool:
         """Shift a body under the spatula to the nearest side; return whether there was one.
@@ -187,7 +179,7 @@ class Spatula:
         free = distance_to_contact(
             self._bodies, (self._bodies.spatula_geom,), self._pushed, direction=direction, length_m=length
         )
-        way = length if free is None else free
+        way = min(free, length)
         self._record_frames(direction, way)
         self._tip = _move(self._tip, direction, way)
         return length - way
@@ -227,7 +219,7 @@ class Spatula:
             left -= piece
             self._state.notify()
             num_ticks = max(1, round(piece / (SWEEP_M_S * TICK_S)))
-            self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)
+            self._state.stay(num_ticks, self._joints)
         return way
 
     def _distance_to_next(self, carried: tuple[int, ...], direction: Vector3, length: float) -> float:
@@ -243,7 +235,7 @@ class Spatula:
             distance_to_contact(bodies, (bodies.spatula_geom,), free, direction=direction, length_m=length),
             distance_to_contact(bodies, carried_geoms, [*free, *fixed], direction=direction, length_m=length),
         )
-        return min((way for way in ways if way is not None), default=length)
+        return min(*ways, length)
 
     def _push_with_physics(self, direction: Vector3, length: float, num_ticks: int) -> None:
         """Move by a length with physics, at constant speed."""
@@ -254,49 +246,60 @@ class Spatula:
 
     def _run(self, num_ticks: int, velocity: Vector3, turning: float = 0.0) -> None:
         self._wake(_STRIDE_M)
-        self._bodies.tick_with_spatula(
-            self._pose(),
-            velocity,
-            turning=turning,
-            num_ticks=num_ticks,
-            max_speed=MAX_SPEED,
-            sleeping=self._sleeping,
-        )
+        self._bodies.tick_with_spatula(self._pose(), velocity, num_ticks, turning=turning)
         self._state.count_ticks(num_ticks)
-        self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)
+        self._state.stay(num_ticks, self._joints)
 
     def _wake(self, near_m: float) -> None:
         """Wake the sleeping bodies near the spatula, those near a woken body, and so on."""
-        if not self._sleeping:
-            return
         bodies = self._bodies
+        if not bodies.sleeping:
+            return
         circles = {
             index: (x, y, bodies.shapes[index].radius_m)
             for index, (x, y) in zip(bodies.rigid, bodies.coordinates()[:, :2].tolist(), strict=True)
         }
-        awake = [circles[index] for index in bodies.rigid if index not in self._sleeping]
+        awake = [circles[index] for index in bodies.rigid if index not in bodies.sleeping]
         awake.append((*self._tip[:2], ur5.SPATULA_HALF_SIZE_M[1]))
         while awake:
             x, y, reach = awake.pop()
-            for index in tuple(self._sleeping):
+            for index in tuple(bodies.sleeping):
                 other_x, other_y, radius = circles[index]
                 if math.hypot(other_x - x, other_y - y) < reach + radius + near_m:
-                    self._sleeping.remove(index)
+                    bodies.sleeping.remove(index)
                     awake.append(circles[index])
 
     def _record_frames(self, direction: Vector3, length: float) -> None:
         """Record the frames of a motion without contact."""
         state = self._state
-        if state.path.record is None or length <= 0:
+        if state.record is None or length <= 0:
             return
-        scene = state.scene()
         joints = self._joints_at(*_move(self._tip, direction, length))
-        state.path.move(joints, scene=lambda _: scene, speed=SWEEP_SPEED)
-        state.path.waypoints.pop()
+        state.move(joints, scene=lambda _: state.scene(), speed=SWEEP_SPEED)
+        state.waypoints.pop()
 
     def _is_calm(self) -> bool:
         speed, turning = self._bodies.speeds()
         return speed < SETTLED_SPEED and turning < SETTLED_TURNING
+
+    def _bent_path(self, start: np.ndarray, end: np.ndarray) -> list[Vector3]:
+        """Points, some millimetres apart, of a path that is straight in joint space; none without such paths.
+
+        Args:
+            start: Joint angles, shape (6,), radians.
+            end: Joint angles at the last point.
+        """
+        if not self._in_joint_space:
+            return []
+        points = [
+            ur5.forward(start + (end - start) * (k / _NUM_PATH_POINTS)).position
+            for k in range(_NUM_PATH_POINTS + 1)
+        ]
+        way = [points[0]]
+        for point in points:
+            if math.dist(point, way[-1]) >= _PATH_STEP_M:
+                way.append(point)
+        return [*way[1:], points[-1]]
 
     def _joints(self) -> np.ndarray:
         return self._joints_at(*self._tip)
@@ -306,27 +309,10 @@ class Spatula:
 
     def _pose(self) -> Pose:
         x, y, tip_z = self._tip
-        return Pose.planar(x, y, self._yaw_rad, z=ur5.spatula_centre_z(tip_z))
+        centre_z = tip_z - ur5.SPATULA_BELOW_TIP_M + ur5.SPATULA_HALF_SIZE_M[2]
+        return Pose.planar(x, y, self._yaw_rad, z=centre_z)
 
 
 def _move(point: Vector3, direction: Vector3, length: float) -> Vector3:
     x, y, z = (start + part * length for start, part in zip(point, direction, strict=True))
     return (x, y, z)
-
-
-def _joint_space_path(start: np.ndarray, end: np.ndarray) -> list[Vector3]:
-    """Points, some millimetres apart, of the tip on a straight path in joint space.
-
-    Args:
-        start: Joint angles, shape (6,), radians.
-        end: Joint angles at the last point.
-    """
-    points = [
-        ur5.forward(start + (end - start) * (k / _NUM_PATH_POINTS)).position
-        for k in range(_NUM_PATH_POINTS + 1)
-    ]
-    way = [points[0]]
-    for point in points:
-        if math.dist(point, way[-1]) >= _PATH_STEP_M:
-            way.append(point)
-    return [*way[1:], points[-1]]

@@ -1,7 +1,7 @@
 """Primitives as sequences of commands: how the oracle acts under low-level control."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from openvima.scene import Action, EndEffector, Pose
@@ -66,10 +66,9 @@ def onward_path(action: Action, object_id: int, world: ToolWorld, *, compat: boo
     pose, tool = world.pose, world.scene.end_effector
     if world.is_moving and not world.holds:
         return [Waypoint(replace(pose, z=ur5.HOVER_TIP_Z_M), tool=False)]
-    if tool == "spatula":
-        plan = sweep_plan(action, compat=compat)
-        return [] if plan is None else _sweep(plan)[_count_passed(plan, world) :]
     path = tool_path(action, tool, compat=compat)
+    if tool == "spatula":
+        return path[_count_passed(path, world) :] if path else []
     if world.grasp is None:
         above, *rest = path
         return rest if _is_above(above.pose, pose) else [_approach(above, pose), *rest]
@@ -128,14 +127,15 @@ def _is_above(goal: ToolPose, pose: ToolPose, period_rad: float = 2 * math.pi) -
     return math.dist((goal.x, goal.y), (pose.x, pose.y)) <= near_m and turn <= _NEAR_RAD
 
 
-def _count_passed(plan: SweepPlan, world: ToolWorld) -> int:
+def _count_passed(path: Sequence[Waypoint], world: ToolWorld) -> int:
     """How many waypoints of a sweep the spatula has behind it."""
-    pose, (x0, y0), (x1, y1) = world.pose, plan.start, plan.legs[-1]
+    pose, start, end = world.pose, path[0].pose, path[-1].pose
+    (x0, y0), (x1, y1) = (start.x, start.y), (end.x, end.y)
     fraction = 0.0
     if world.holds:  # the nearest point of the line
         along = (pose.x - x0) * (x1 - x0) + (pose.y - y0) * (y1 - y0)
         fraction = min(max(along / max(math.dist((x0, y0), (x1, y1)) ** 2, 1e-12), 0.0), 1.0)
-    nearest = ToolPose(x0 + fraction * (x1 - x0), y0 + fraction * (y1 - y0), pose.z, plan.yaw_rad)
+    nearest = ToolPose(x0 + fraction * (x1 - x0), y0 + fraction * (y1 - y0), pose.z, start.yaw_rad)
     if not _is_above(nearest, pose, math.pi):
         return 0
     if world.holds:

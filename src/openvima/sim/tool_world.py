@@ -1,7 +1,6 @@
 """The simulated world under low-level control: one command of 0.1 s at a time."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from openvima.sim.bodies import Bodies
 from openvima.sim.model import FLOOR_Z_M, TICK_S
 from openvima.sim.primitive_state import (
     STRIDE_TICKS,
-    ArmPath,
+    Monitor,
     PrimitiveState,
     RecordFrame,
     Settling,
@@ -106,7 +105,7 @@ class ToolWorld:
         self,
         command: ToolCommand,
         *,
-        monitor: Callable[[Scene], None] | None = None,
+        monitor: Monitor | None = None,
         record: RecordFrame | None = None,
     ) -> bool:
         """Follow a command for 0.1 s.
@@ -139,10 +138,10 @@ class ToolWorld:
         self.scene_at_rest, self._state = self._state.finish(), None
         return True
 
-    def _new_state(self, monitor: Callable[[Scene], None] | None) -> PrimitiveState:
-        return PrimitiveState(self.scene_at_rest, self._bodies, ArmPath([self._joints], None), monitor)
+    def _new_state(self, monitor: Monitor | None) -> PrimitiveState:
+        return PrimitiveState(self.scene_at_rest, self._bodies, [self._joints], monitor)
 
-    def _take_hold(self, monitor: Callable[[Scene], None] | None) -> None:
+    def _take_hold(self, monitor: Monitor | None) -> None:
         """Grasp the body below the cup, or press the spatula to the table, if it is near enough."""
         pose, state = self.pose, self._state or self._new_state(monitor)
         if self.scene_at_rest.end_effector == "spatula":
@@ -161,7 +160,7 @@ class ToolWorld:
         self._held = HeldBody(caught, self._bodies.pose(caught), pose)
         self._stands_alone, carries_others = take_out(self._bodies, self._held)
         if carries_others or self._settling is not None:
-            self._settling = Settling(self._bodies, apart_from=caught)
+            self._settling = Settling(self._bodies)
 
     def _let_go(self) -> None:
         """Release the body, or take the spatula off the table."""

@@ -177,8 +177,3 @@ SWEEP_TIP_Z_M = 0.005  # leaves 1 mm between the spatula and the floor
 SPATULA_RUN_UP_M = 0.02  # the spatula starts this far before pose0 …
 SPATULA_SHORTFALL_M = 0.05  # … and stops this far before pose1
 COMPAT_SHORTFALL_M = 0.003  # what VIMA-Bench's stop tolerance adds to that
-
-
-def spatula_centre_z(tip_z: float) -> float:
-    """Height of the spatula's centre in metres for a height of the arm's tip."""
-    return tip_z - SPATULA_BELOW_TIP_M + SPATULA_HALF_SIZE_M[2]

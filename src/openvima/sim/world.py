@@ -6,20 +6,19 @@ everything is at rest.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.scene import Action, Pose, Scene
+from openvima.scene import Action, Point, Pose, Scene
 from openvima.scene.action import ToolPose
 from openvima.sim import ur5
 from openvima.sim.bodies import Bodies, body_gap, distance_to_contact, gap
 from openvima.sim.model import FLOOR_Z_M
 from openvima.sim.primitive_state import (
     RESTING_GAP_M,
-    ArmPath,
+    Monitor,
     PrimitiveState,
     RecordFrame,
     is_at_rest,
@@ -44,21 +43,21 @@ def pick_place(state: PrimitiveState, action: Action) -> int | None:
     Returns:
         Index of the moved body; None if the cup hit the floor or a fixed body.
     """
-    bodies, path = state.bodies, state.path
+    bodies = state.bodies
     x, y = action.pose0_position
     hover = reachable_joints(x, y, ur5.HOVER_TIP_Z_M, action.yaw0_rad)
-    path.move(hover, scene=lambda _: state.start)
+    state.move(hover)
     caught, surface_z = body_under_probe(bodies, x, y)
     contact_z = surface_z + ur5.PROBE_BELOW_TIP_M
-    path.move(reachable_joints(x, y, contact_z, action.yaw0_rad), scene=lambda _: state.start)
+    state.move(reachable_joints(x, y, contact_z, action.yaw0_rad))
     if caught is None or caught not in bodies.rigid:
-        path.move(hover, scene=lambda _: state.start)
+        state.move(hover)
         return None
     held = HeldBody(caught, bodies.pose(caught), ToolPose(x, y, contact_z, action.yaw0_rad))
     stands_alone, carries_others = take_out(bodies, held)
     if carries_others:
         state.settle((held.index, held.grasped_at.moved(dz=ur5.HOVER_TIP_Z_M)))
-    path.move(hover, scene=lambda joints: state.scene(held.at(joints)))
+    state.move(hover, scene=lambda joints: state.scene(held.at(joints)))
     _set_down(state, held, action, stands_alone=stands_alone)
     return caught
 
@@ -110,7 +109,7 @@ def _surface_z(bodies: Bodies, index: int, x: float, y: float) -> float:
     probe = (bodies.probe_geom,)
     depth = _ABOVE_ALL_M - FLOOR_Z_M
     drop = distance_to_contact(bodies, probe, bodies.geoms[index], direction=_DOWN, length_m=depth)
-    return bodies.highest_z(index) if drop is None else _ABOVE_ALL_M - drop
+    return bodies.highest_z(index) if math.isinf(drop) else _ABOVE_ALL_M - drop
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,8 +142,21 @@ class HeldBody:
         The body is left high above; place or park it.
         """
         target = self.carried(x, y, yaw_rad)
-        drop, on_floor = _distance_down(bodies, self.index, target.moved(dz=_ABOVE_ALL_M))
-        return target.moved(dz=_ABOVE_ALL_M - drop), on_floor
+        above = target.moved(dz=_ABOVE_ALL_M)
+        bodies.place(self.index, above)
+        bodies.refresh()
+        to_floor = above.z + bodies.lowest_z(self.index, above.quaternion) - FLOOR_Z_M
+        reach = bodies.shapes[self.index].radius_m
+        others = [
+            geom
+            for other, shape in enumerate(bodies.shapes)
+            if other != self.index and bodies.pose(other).planar_distance(above) < reach + shape.radius_m
+            for geom in bodies.geoms[other]
+        ]
+        moving = bodies.geoms[self.index]
+        to_others = distance_to_contact(bodies, moving, others, direction=_DOWN, length_m=to_floor)
+        drop = min(to_floor, to_others)
+        return target.moved(dz=_ABOVE_ALL_M - drop), math.isinf(to_others)
 
 
 def take_out(bodies: Bodies, held: HeldBody) -> tuple[bool, bool]:
@@ -166,15 +178,15 @@ def take_out(bodies: Bodies, held: HeldBody) -> tuple[bool, bool]:
 
 def _set_down(state: PrimitiveState, held: HeldBody, action: Action, *, stands_alone: bool) -> None:
     """Carry a body to pose1, lower it to first contact, release it and settle."""
-    bodies, path = state.bodies, state.path
+    bodies = state.bodies
     x, y = action.pose1_position
     yaw_rad = action.yaw1_rad
     target = held.carried(x, y, yaw_rad)
     set_down_at, on_floor = held.lowest(bodies, x, y, yaw_rad)
     hover = reachable_joints(x, y, ur5.HOVER_TIP_Z_M, yaw_rad)
     contact_z = held.grasp.z + set_down_at.z - target.z
-    path.move(hover, scene=lambda joints: state.scene(held.at(joints)))
-    path.move(reachable_joints(x, y, contact_z, yaw_rad), scene=lambda joints: state.scene(held.at(joints)))
+    state.move(hover, scene=lambda joints: state.scene(held.at(joints)))
+    state.move(reachable_joints(x, y, contact_z, yaw_rad), scene=lambda joints: state.scene(held.at(joints)))
     if on_floor and stands_alone:  # no physics needed, and its height keeps the same value
         bodies.place(held.index, target)
         bodies.refresh()
@@ -182,26 +194,7 @@ def _set_down(state: PrimitiveState, held: HeldBody, action: Action, *, stands_a
         bodies.place(held.index, set_down_at)
         bodies.refresh()
         state.settle()
-    after = state.scene() if path.record else state.start
-    path.move(hover, scene=lambda _: after)
-
-
-def _distance_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool]:
-    """How far a body can be lowered from `above` to first contact, and whether that is bare floor."""
-    bodies.place(index, above)
-    bodies.refresh()
-    to_floor = above.z + bodies.lowest_z(index, above.quaternion) - FLOOR_Z_M
-    reach = bodies.shapes[index].radius_m
-    others = [
-        geom
-        for other, shape in enumerate(bodies.shapes)
-        if other != index and bodies.pose(other).planar_distance(above) < reach + shape.radius_m
-        for geom in bodies.geoms[other]
-    ]
-    to_others = distance_to_contact(bodies, bodies.geoms[index], others, direction=_DOWN, length_m=to_floor)
-    if to_others is None:
-        return to_floor, True
-    return min(to_floor, to_others), False
+    state.move(hover, scene=lambda _: state.scene())
 
 
 def sweep(state: PrimitiveState, action: Action, *, compat: bool = False) -> None:
@@ -235,8 +228,8 @@ class SweepPlan:
     """
 
     yaw_rad: float
-    start: tuple[float, float]
-    legs: tuple[tuple[float, float], ...]
+    start: Point
+    legs: tuple[Point, ...]
 
 
 def sweep_plan(action: Action, *, compat: bool = False) -> SweepPlan | None:
@@ -260,7 +253,7 @@ def sweep_plan(action: Action, *, compat: bool = False) -> SweepPlan | None:
     return SweepPlan(math.atan2(vy, vx), start, (*overshoot, end))
 
 
-def _within_reach(x: float, y: float) -> tuple[float, float]:
+def _within_reach(x: float, y: float) -> Point:
     """Move a point towards the base until the lowered tool reaches it."""
     farthest = ur5.farthest_tip_distance(ur5.SWEEP_TIP_Z_M) - 1e-6
     shrink = min(1.0, farthest / math.hypot(x, y))
@@ -325,7 +318,7 @@ class World:
         self,
         action: Action,
         *,
-        monitor: Callable[[Scene], None] | None = None,
+        monitor: Monitor | None = None,
         record: RecordFrame | None = None,
     ) -> Execution:
         """Execute one action: pick and place, or sweep, depending on the end effector.
@@ -340,8 +333,7 @@ class World:
         Returns:
             The result; `scene` and `joints` are updated.
         """
-        path = ArmPath([self._joints], record)
-        state = PrimitiveState(self.scene, self._bodies, path, monitor)
+        state = PrimitiveState(self.scene, self._bodies, [self._joints], monitor, record)
         if not self._is_settled:
             state.settle(max_speed=SEPARATION_SPEED)
             self._is_settled = True
@@ -351,6 +343,6 @@ class World:
         else:
             sweep(state, action, compat=self._compat)
         self.scene = state.finish()
-        self._joints = path.joints
+        self._joints = state.waypoints[-1]
         grasped_id = None if grasped is None else state.placement(grasped).id
-        return Execution(grasped_id, path.array(), state.num_ticks)
+        return Execution(grasped_id, np.array(state.waypoints, np.float32), state.num_ticks)

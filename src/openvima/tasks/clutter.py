@@ -13,11 +13,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
-from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, object_spec
+from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Vector3, object_spec
 from openvima.errors import SamplingError
 from openvima.scene import AtPose, DistractorsApart, InZone, Placement, Problem, ZoneKeptClear
 from openvima.scene.goal import object_of
-from openvima.tasks.table import NO_SCALE, Reject, TableSampler, is_in_the_way, offset
+from openvima.tasks.table import NO_SCALE, Appearance, Reject, TableSampler, is_in_the_way, offset
 
 LEVEL = "L5"
 LEAST, MOST = 3, 10  # objects added
@@ -73,7 +73,7 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
         *((by_base, _OF[by_base](p.object, p.texture)) for p in bases if p not in moved),
     ]
 
-    def draw(but: tuple[str, ...] = ()) -> tuple[str, str]:
+    def draw(but: tuple[str, ...] = ()) -> Appearance:
         like = table.choose((*moved, *bases))
         while True:
             shape, texture = table.choose(OBJECTS), table.choose(TEXTURES)
@@ -84,7 +84,7 @@ def add_clutter(table: TableSampler, problem: Problem, task: str) -> Problem:
 
     blocks = _blocks_for(task, problem, moved)
 
-    def put(*, tries: int, scale: tuple[float, float, float], reject: Reject) -> None:
+    def put(*, tries: int, scale: Vector3, reject: Reject) -> None:
         with contextlib.suppress(SamplingError):
             new = table.place_one("clutter", draw, tries=tries, scale=scale, reject=reject)
             forbidden.add((new.object, new.texture))

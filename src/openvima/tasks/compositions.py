@@ -30,7 +30,7 @@ from openvima.tasks.novel_words import NOUNS, gray_image
 from openvima.tasks.options import FewDistractors
 from openvima.tasks.placing import ANGLES_DEG, rotation_goal
 from openvima.tasks.registry import register_task
-from openvima.tasks.table import TableSampler, is_in_the_way, offset
+from openvima.tasks.table import Appearance, TableSampler, is_in_the_way, offset
 
 COMPOSITIONS: dict[str, tuple[str, ...]] = {
     "put_then_put": ("put", "put"),
@@ -80,7 +80,7 @@ class Composition:
     fills: dict[str, ObjectImage | SceneImage | str | int] = field(default_factory=dict)
     object: Placement | None = None
     base: Placement | None = None
-    appearances: set[tuple[str, str]] = field(default_factory=set)
+    appearances: set[Appearance] = field(default_factory=set)
     shapes: set[str] = field(default_factory=set)
     textures: set[str] = field(default_factory=set)
     places: list[Placement] = field(default_factory=list)
@@ -89,7 +89,7 @@ class Composition:
     def put(self, shapes: tuple[str, ...], textures: tuple[str, ...], what: str = "object") -> Placement:
         """Place an object that no instruction so far means."""
 
-        def draw() -> tuple[str, str]:
+        def draw() -> Appearance:
             for _ in range(_TRIES):
                 shape, texture = self.table.choose(shapes), self.table.choose(textures)
                 is_meant = shape in self.shapes or texture in self.textures
@@ -243,12 +243,12 @@ def compose_problem(table: TableSampler, kinds: tuple[str, ...], num_distractors
     first = len(stages[0][1])
     restored = {goals.index(group[0]) for kind, group in stages if kind == "restore"}
     later = tuple(index for index in range(first, len(goals)) if index not in restored)
-    others = tuple(p.id for p in table.placements if p not in meant)
+    others = [p for p in table.placements if p not in meant]
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(template(kinds), **made.fills),
         goals=goals,
-        constraints=(InOrder(later), DistractorsApart(others)),
+        constraints=(InOrder(later), DistractorsApart.of(others)),
         stages=tuple(len(group) for _, group in stages),
         oracle_max_steps=len(goals) + _SPARE_STEPS,
     )

@@ -11,16 +11,16 @@ Source:   VIMA paper, task list of the appendix, "Follow motion".
 import math
 from itertools import accumulate
 
-from openvima.scene import EveryStepCounts, ObjectImage, Placement, Pose, Problem, Prompt
+from openvima.scene import EveryStepCounts, ObjectImage, Placement, Pose, Problem
 from openvima.tasks.options import Difficulty, NumDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
-    frame_images,
     goals_between,
+    video_problem,
     with_frame_slots,
 )
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import Appearance, TableSampler
 
 TEMPLATE = "Follow this motion for {dragged_obj}: {frames}."
 CENTRE = Pose.planar(0.5, 0.0)
@@ -68,17 +68,14 @@ def sample(
     )
 
     frames = [(dragged.at(place.moved(dz=dragged.pose.z)),) for place in walk]
-    images = frame_images([(*frame, in_frames) for frame in frames])
-    goals = goals_between(frames)
-    return Problem(
-        scene=table.scene(),
-        prompt=Prompt.parse(
-            with_frame_slots(TEMPLATE, num_frames), dragged_obj=ObjectImage(dragged), **images
-        ),
-        goals=goals,
-        constraints=(EveryStepCounts(),),
-        stages=(1,) * len(goals),
-        oracle_max_steps=len(goals),
+    return video_problem(
+        table.scene(),
+        TEMPLATE,
+        [(*frame, in_frames) for frame in frames],
+        goals_between(frames),
+        EveryStepCounts(),
+        spare_steps=0,
+        dragged_obj=ObjectImage(dragged),
     )
 
 
@@ -94,6 +91,6 @@ def _is_near_circle(placement: Placement) -> bool:
     return placement.pose.planar_distance(CENTRE) < RADIUS_M + CIRCLE_MARGIN_M
 
 
-def _put(table: TableSampler, appearance: tuple[str, str], pose: Pose) -> Placement:
+def _put(table: TableSampler, appearance: Appearance, pose: Pose) -> Placement:
     size = table.sample_size(appearance[0])
     return table.add(*appearance, size=size, pose=pose, z=size[2] if table.compat else None)

@@ -12,20 +12,21 @@ import functools
 import itertools
 from collections.abc import Iterator
 
-from openvima.scene import WORKSPACE_LOW, EveryStepCounts, Placement, Pose, Problem, Prompt
+from openvima.scene import WORKSPACE_LOW, EveryStepCounts, Placement, Pose, Problem
 from openvima.tasks.options import Difficulty, NumDistractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.scene_prompts import (
     NUM_FRAMES,
     Frame,
-    frame_images,
     goals_between,
+    video_problem,
     with_frame_slots,
 )
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Stack objects in this order {frames}."
 NUM_BLOCKS = {"easy": 3, "medium": 4, "hard": 4}
+_SPARE_STEPS = 2
 
 Stacks = tuple[tuple[int, ...], ...]
 """Blocks at each place of the row, bottom to top."""
@@ -35,7 +36,7 @@ Stacks = tuple[tuple[int, ...], ...]
     "follow_order",
     family="one_shot_video_imitation",
     template=with_frame_slots(TEMPLATE, NUM_FRAMES["easy"]),
-    oracle_max_steps=NUM_FRAMES["easy"] + 1,
+    oracle_max_steps=NUM_FRAMES["easy"] - 1 + _SPARE_STEPS,
 )
 def sample(
     table: TableSampler,
@@ -72,14 +73,7 @@ def sample(
     frames = [_stack(table, blocks, stacks) for stacks in stackings]
     images = [_by_place(frame) for frame in frames] if table.compat else frames
     goals = goals_between(frames)
-    return Problem(
-        scene=table.scene(),
-        prompt=Prompt.parse(with_frame_slots(TEMPLATE, num_frames), **frame_images(images)),
-        goals=goals,
-        constraints=(EveryStepCounts(),),
-        stages=(1,) * len(goals),
-        oracle_max_steps=num_frames + 1,
-    )
+    return video_problem(table.scene(), TEMPLATE, images, goals, EveryStepCounts(), spare_steps=_SPARE_STEPS)
 
 
 @functools.cache

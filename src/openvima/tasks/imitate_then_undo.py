@@ -9,11 +9,11 @@ Success:  the moved object of each frame within 0.1 m of its place there, in the
 Source:   level L8 of openvima; not in the VIMA paper.
 """
 
-from openvima.scene import AtPose, DistractorsApart, Placement, Problem, Prompt
+from openvima.scene import AtPose, DistractorsApart, Placement, Problem
 from openvima.tasks.options import FewDistractors
 from openvima.tasks.registry import register_task
-from openvima.tasks.scene_prompts import frame_images, goals_between, with_frame_slots
-from openvima.tasks.table import TableSampler
+from openvima.tasks.scene_prompts import goals_between, video_problem, with_frame_slots
+from openvima.tasks.table import Appearance, TableSampler
 
 TEMPLATE = "Rearrange objects in this order {frames} and then restore."
 NUM_FRAMES, NUM_OBJECTS = 6, 3
@@ -35,7 +35,7 @@ def sample(table: TableSampler, *, num_distractors: FewDistractors = 1) -> Probl
         table: Sampler of the scene.
         num_distractors: Further objects, 0 … 3.
     """
-    taken: set[tuple[str, str]] = set()
+    taken: set[Appearance] = set()
 
     def put(what: str) -> Placement:
         appearance = table.choose([each for each in table.appearances() if each not in taken])
@@ -59,11 +59,5 @@ def sample(table: TableSampler, *, num_distractors: FewDistractors = 1) -> Probl
         frame[last] = table.move(before, place)
         frames.append(tuple(frame))
     goals: tuple[AtPose, ...] = (*goals_between(frames), *goals_between(frames[::-1]))
-    return Problem(
-        scene=scene,
-        prompt=Prompt.parse(with_frame_slots(TEMPLATE, NUM_FRAMES), **frame_images(frames)),
-        goals=goals,
-        constraints=(DistractorsApart.of(distractors, at_end=True),),
-        stages=(1,) * len(goals),
-        oracle_max_steps=len(goals) + _SPARE_STEPS,
-    )
+    apart = DistractorsApart.of(distractors, at_end=True)
+    return video_problem(scene, TEMPLATE, frames, goals, apart, spare_steps=_SPARE_STEPS)

@@ -6,14 +6,13 @@ from openvima.compilation import njit
 
 
 @njit
-def mark_free_centres(
+def list_free_centres(
     labels: np.ndarray,  # (R, C) int16, 0 where free
     side: int,
     run: np.ndarray,  # (C,) int32, scratch
-    centres: np.ndarray,  # (R, C) uint8, gets 1 at free centres
-    counts: np.ndarray,  # (R,) int32, gets their number per row
+    centres: np.ndarray,  # (R · C,) int32, gets the free centres in row-major order, as row · C + column
 ) -> int:
-    """Mark cells around which a square window of `side` cells is free, and return their number.
+    """List cells around which a square window of `side` cells is free, and return their number.
 
     A window that reaches an occupied cell, the outermost ring of cells or past the raster is not free. For an
     even side the window has one cell more on the low side, as in the benchmark's erosion.
@@ -23,15 +22,11 @@ def mark_free_centres(
     behind the present cell.
     """
     num_rows, num_columns = labels.shape
-    below = side // 2  # cells of the window before its centre
-    above = side - 1 - below
+    behind = (side - 1 - side // 2) * (num_columns + 1)  # from the last cell of a window to its centre
     run[:] = 0  # free cells above and including the present row, per column
-    centres[:] = 0
-    counts[:] = 0
     total = 0
     for row in range(1, num_rows - 1):
         width = 0
-        centre_row = row - above
         for column in range(1, num_columns - 1):
             if labels[row, column] == 0:
                 run[column] += 1
@@ -42,40 +37,20 @@ def mark_free_centres(
             else:
                 width = 0
             if width >= side:
-                centres[centre_row, column - above] = 1
-                counts[centre_row] += 1
+                centres[total] = row * num_columns + column - behind
                 total += 1
     return total
 
 
 @njit
-def nth_centre(centres: np.ndarray, counts: np.ndarray, index: int) -> tuple[int, int]:
-    """Row and column of the marked cell number `index` in row-major order."""
-    row = 0
-    while index >= counts[row]:
-        index -= counts[row]
-        row += 1
-    for column in range(centres.shape[1]):
-        if centres[row, column]:
-            if index == 0:
-                return row, column
-            index -= 1
-    return -1, -1
-
-
-@njit
 def squared_depths(
-    labels: np.ndarray,  # (R, C) int16
-    object_id: int,
-    top: int,
-    left: int,
+    mask: np.ndarray,  # (H, W) bool, where the object is in a window that holds all of it
     vertical: np.ndarray,  # (H, W) int32, scratch
-    depths: np.ndarray,  # (H, W) int32, gets the result for the cells from (top, left) on
+    depths: np.ndarray,  # (H, W) int32, gets the result
 ) -> None:
     """Squared distance, in cells, of each cell of one object to the nearest cell that is not of it.
 
-    The window must hold the whole object; cells outside of it count as not of the object, and cells of others
-    get 0.
+    Cells outside of the window count as not of the object, and cells of others get 0.
 
     Source: exact distance transform in two passes, columns then rows (Felzenszwalb and Huttenlocher, 2012);
     the second is a plain search, which is fast enough at this size.
@@ -85,11 +60,11 @@ def squared_depths(
     for column in range(num_columns):
         distance = 0
         for row in range(num_rows):
-            distance = distance + 1 if labels[top + row, left + column] == object_id else 0
+            distance = distance + 1 if mask[row, column] else 0
             vertical[row, column] = distance
         distance = 0
         for row in range(num_rows - 1, -1, -1):
-            distance = distance + 1 if labels[top + row, left + column] == object_id else 0
+            distance = distance + 1 if mask[row, column] else 0
             vertical[row, column] = min(vertical[row, column], distance)
     for row in range(num_rows):
         for column in range(num_columns):

@@ -7,15 +7,9 @@ Success:  the right object within 0.1 m of the base's origin, while its twin is 
 Source:   VIMA paper, task list of the appendix, "Novel adjective".
 """
 
-from openvima.scene import Problem, Prompt
-from openvima.tasks.novel_words import (
-    COMPARISONS,
-    gray_image,
-    place_base_and_pair,
-    sample_adjective_example,
-)
+from openvima.scene import Problem
+from openvima.tasks.novel_words import COMPARISONS, adjective_problem, sample_adjective_example
 from openvima.tasks.options import Difficulty, NumDistractors
-from openvima.tasks.placing import into_base
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -43,14 +37,10 @@ def sample(
         difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the
             twin or of the target.
     """
-    example = sample_adjective_example(table)
-    base, target, others = place_base_and_pair(
-        table, example, num_distractors=num_distractors, difficulty=difficulty
-    )
-    prompt = Prompt.parse(
+    return adjective_problem(
+        table,
+        sample_adjective_example(table),
         f"{COMPARISONS} {REQUEST}",
-        **example.fills,
-        dragged_obj=gray_image(target),
-        base_obj=gray_image(base),
+        num_distractors=num_distractors,
+        difficulty=difficulty,
     )
-    return into_base(table, prompt, target=target, base=base, distractors=others)

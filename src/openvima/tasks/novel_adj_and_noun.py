@@ -8,16 +8,9 @@ Success:  the right object within 0.1 m of the base's origin, while nothing else
 Source:   VIMA paper, task list of the appendix, "Novel adjective and noun".
 """
 
-from openvima.scene import Problem, Prompt
-from openvima.tasks.novel_words import (
-    COMPARISONS,
-    NOUNS,
-    gray_image,
-    place_base_and_pair,
-    sample_adjective_example,
-)
+from openvima.scene import Problem
+from openvima.tasks.novel_words import COMPARISONS, NOUNS, adjective_problem, sample_adjective_example
 from openvima.tasks.options import Difficulty, NumDistractors
-from openvima.tasks.placing import into_base
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -48,15 +41,12 @@ def sample(
     example = sample_adjective_example(table)
     noun, base_noun = table.shuffled(NOUNS)[:2]
     introductions = table.shuffled(INTRODUCTIONS)
-    base, target, others = place_base_and_pair(
-        table, example, num_distractors=num_distractors, difficulty=difficulty
-    )
-    prompt = Prompt.parse(
+    return adjective_problem(
+        table,
+        example,
         " ".join((*introductions, COMPARISONS, REQUEST)),
-        **example.fills,
+        num_distractors=num_distractors,
+        difficulty=difficulty,
         novel_name_1=noun,
         novel_name_2=base_noun,
-        dragged_obj=gray_image(target),
-        base_obj=gray_image(base),
     )
-    return into_base(table, prompt, target=target, base=base, distractors=others)

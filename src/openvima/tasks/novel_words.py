@@ -5,8 +5,8 @@ from typing import Literal
 
 from openvima.catalog import Vector3
 from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
-from openvima.scene import ObjectImage, Placement, Pose
-from openvima.tasks.placing import APART_M, of_a_third_shape, place_distractors
+from openvima.scene import ObjectImage, Placement, Pose, Problem, Prompt
+from openvima.tasks.placing import APART_M, into_base, of_a_third_shape, place_base, place_distractors
 from openvima.tasks.table import NO_SCALE, TableSampler
 
 ADJECTIVES = ("daxer", "blicker", "modier", "kobar")
@@ -86,24 +86,29 @@ def sample_adjective_example(table: TableSampler) -> AdjectiveExample:
     return AdjectiveExample(fills, asked, other)
 
 
-def place_base_and_pair(
-    table: TableSampler, example: AdjectiveExample, *, num_distractors: int, difficulty: str
-) -> tuple[Placement, Placement, list[Placement]]:
-    """Place a base, the target and its twin, and distractors of other shapes.
+def adjective_problem(
+    table: TableSampler,
+    example: AdjectiveExample,
+    template: str,
+    *,
+    num_distractors: int,
+    difficulty: str,
+    **words: str,
+) -> Problem:
+    """Place a base, the target and its twin, and distractors of other shapes; build the problem.
 
     Args:
         table: Sampler of the scene.
         example: The attributes of target and twin.
+        template: The prompt, with slots `dragged_obj` and `base_obj` for gray images of target and base.
         num_distractors: Distractors of any shape, bases included, besides those of the difficulty.
         difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the twin
             or of the target.
-
-    Returns:
-        Base, target, and all other objects, the twin first.
+        **words: Further slots of the prompt.
     """
     pool = table.pool
     base_texture, texture = table.choose(pool.base_textures), table.choose(pool.dragged_textures)
-    base = table.place_one("base", lambda: (table.choose(pool.base_objects), base_texture))
+    base = place_base(table, base_texture)
     shape, other_shape = table.shuffled(pool.dragged_objects)[:2]
     size = table.sample_size(shape)
 
@@ -117,7 +122,10 @@ def place_base_and_pair(
         attribute = example.asked if difficulty == "hard" else example.other
         others.append(put("object of another shape", other_shape, attribute, size if table.compat else None))
     draw = of_a_third_shape(table, base, target, (*pool.dragged_textures, *pool.base_textures))
-    return base, target, others + place_distractors(table, draw, count=num_distractors)
+    others += place_distractors(table, draw, count=num_distractors)
+    images = {"dragged_obj": gray_image(target), "base_obj": gray_image(base)}
+    prompt = Prompt.parse(template, **example.fills, **words, **images)
+    return into_base(table, prompt, target=target, base=base, distractors=others)
 
 
 def _attributes(table: TableSampler, meaning: str) -> tuple[Attribute, Attribute]:

@@ -4,11 +4,10 @@ import inspect
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from openvima.errors import ConfigError, echo, unknown_name
-from openvima.tasks.registry import TaskSpec, task_spec
+from openvima.errors import ConfigError, echo
+from openvima.tasks.registry import TaskSpec
 from openvima.tasks.table import TableSampler
 
 MAX_DISTRACTORS = 6  # that find a place beside the other objects
@@ -36,75 +35,50 @@ def textures_by_difficulty(table: TableSampler, difficulty: str) -> tuple[tuple[
     return dragged, base
 
 
-@dataclass(frozen=True, slots=True)
-class TaskOptions:
-    """Options of the tasks of a run.
+Options = dict[tuple[str, str], str]
+"""Values of options by task, empty for all tasks that have the option, and name."""
 
-    Args:
-        entries: Task (empty for all tasks that have the option), name and value of each; sorted.
+
+def parse_options(text: str) -> Options:
+    """Read [TASK.]NAME=VALUE,…, sorted; whether tasks have the options is for `check_task_options` to say.
+
+    Raises:
+        ConfigError: The text has another form, is too long, or sets an option twice.
+    """
+    if not isinstance(text, str):
+        raise ConfigError(f"task_options is {echo(repr(text))}; give text such as 'num_distractors=3'.")
+    found: Options = {}
+    for entry in filter(None, (part.strip() for part in text.split(","))):
+        match = _ENTRY.fullmatch(entry)
+        if match is None:
+            raise ConfigError(
+                f"task option {echo(repr(entry))} is not [TASK.]NAME=VALUE, such as num_distractors=3 or "
+                "rotate.difficulty=hard."
+            )
+        key = (match[1] or "", match[2])
+        if key in found:
+            raise ConfigError(f"task option {echo(entry.partition('=')[0])} is given twice; give one value.")
+        found[key] = match[3]
+    return dict(sorted(found.items()))
+
+
+def options_text(options: Options) -> str:
+    """Return options as `parse_options` reads them."""
+    return ",".join(f"{task and task + '.'}{name}={value}" for (task, name), value in options.items())
+
+
+def options_of(spec: TaskSpec, text: str) -> dict[str, Any]:
+    """Return the keyword arguments of one task; an option of this task overrides one of all tasks.
 
     Example:
-        >>> TaskOptions.parse("rotate.num_distractors=2, num_distractors=3").of(task_spec("rotate"))
+        >>> options_of(task_spec("rotate"), "rotate.num_distractors=2, num_distractors=3")
         {'num_distractors': 2}
     """
-
-    entries: tuple[tuple[str, str, str], ...] = ()
-
-    @staticmethod
-    def parse(text: str) -> "TaskOptions":
-        """Read [TASK.]NAME=VALUE,…; whether tasks have the options is for `check` to say.
-
-        Raises:
-            ConfigError: The text has another form, is too long, or sets an option twice.
-        """
-        if not isinstance(text, str):
-            raise ConfigError(f"task_options is {echo(repr(text))}; give text such as 'num_distractors=3'.")
-        found: dict[tuple[str, str], str] = {}
-        for entry in filter(None, (part.strip() for part in text.split(","))):
-            match = _ENTRY.fullmatch(entry)
-            if match is None:
-                raise ConfigError(
-                    f"task option {echo(repr(entry))} is not [TASK.]NAME=VALUE, such as num_distractors=3 or "
-                    "rotate.difficulty=hard."
-                )
-            key = (match[1] or "", match[2])
-            if key in found:
-                raise ConfigError(
-                    f"task option {echo(entry.partition('=')[0])} is given twice; give one value."
-                )
-            found[key] = match[3]
-        return TaskOptions(tuple((task, name, found[task, name]) for task, name in sorted(found)))
-
-    def __str__(self) -> str:
-        return ",".join(f"{task and task + '.'}{name}={value}" for task, name, value in self.entries)
-
-    def of(self, spec: TaskSpec) -> dict[str, Any]:
-        """Return the keyword arguments of one task; an option of this task overrides one of all tasks.
-
-        Raises:
-            ConfigError: The task does not have one of its options.
-        """
-        options = {}
-        for task, name, value in self.entries:
-            if task == spec.name or (not task and name in spec.options):
-                options[name] = _convert(spec, name, value)
-        return options
-
-    def check(self, tasks: Sequence[str]) -> None:
-        """Check that the tasks of a run have the options.
-
-        Raises:
-            UnknownTaskError: There is no such task.
-            ConfigError: A task with an option is not in the run, or no task of the run has an option.
-        """
-        known = {name for task in tasks for name in task_spec(task).options}
-        for task, name, _ in self.entries:
-            if task and task_spec(task).name not in tasks:
-                raise ConfigError(
-                    f"task option {task}.{name}: this run has no {task}; its tasks are {', '.join(tasks)}."
-                )
-            if not task and name not in known:
-                raise ConfigError(unknown_name(f"option of {', '.join(tasks)}:", name, sorted(known)))
+    return {
+        name: _convert(spec, name, value)
+        for (task, name), value in parse_options(text).items()
+        if task == spec.name or (not task and name in spec.options)
+    }
 
 
 def option_descriptions(spec: TaskSpec) -> dict[str, str]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from openvima.catalog import Assets
 from openvima.errors import OracleError, echo
-from openvima.scene import Action, AtPose, InZone, Pose, Problem, Scene
+from openvima.scene import Action, AtPose, InZone, Point, Pose, Problem, Scene
 from openvima.scene.goal import object_of, oracle_move
 from openvima.tasks.goals import Progress
 from openvima.tasks.sweeping import plan_sweep
@@ -90,7 +90,7 @@ def oracle_action(
 
 def visible_point(
     scene: Scene, object_id: int, *, assets: Assets, rng: np.random.Generator | None = None
-) -> tuple[float, float]:
+) -> Point:
     """Return a point where an object is visible from straight above.
 
     Args:
@@ -117,18 +117,17 @@ def visible_point(
     if rng is not None:
         x, y = (points[rng.integers(len(points))] - CELL_M / 2).tolist()
         return x, y
-    top, left = int(rows.min()), int(columns.min())
-    window = np.empty((int(rows.max()) - top + 1, int(columns.max()) - left + 1), np.int32)
-    squared_depths(labels, object_id, top, left, np.empty_like(window), window)
-    depths = window[rows - top, columns - left]
-    deepest = points[depths == depths.max()]
+    mask = labels[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] == object_id
+    depths = np.empty(mask.shape, np.int32)
+    squared_depths(mask, np.empty_like(depths), depths)
+    deepest = points[depths[mask] == depths.max()]
     pose = scene[object_id].pose
     offsets = deepest - (pose.x, pose.y)
     x, y = deepest[np.argmin((offsets * offsets).sum(axis=1))].tolist()
     return x, y
 
 
-def _pick_and_place(goal: AtPose, pose: Pose, point: tuple[float, float], *, compat: bool) -> Action:
+def _pick_and_place(goal: AtPose, pose: Pose, point: Point, *, compat: bool) -> Action:
     """Action that moves the object's origin to the target's, with the smallest rotation that it needs."""
     in_base = goal.relative_to is not None and goal.relative_to != goal.object_id
     if in_base and goal.tolerance.yaw_rad is None and not compat:

@@ -5,10 +5,15 @@ from collections.abc import Callable, Sequence
 
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.table import TableSampler, is_in_the_way
+from openvima.tasks.table import Appearance, Draw, TableSampler, is_in_the_way
 
 TOLERANCE = Tolerance(position_m=0.1)
 APART_M = TOLERANCE.position_m  # below this the episode is decided at the start
+
+
+def place_base(table: TableSampler, texture: str) -> Placement:
+    """Place a base of any shape."""
+    return table.place_one("base", lambda: (table.choose(table.pool.base_objects), texture))
 
 
 def place_base_and_target(
@@ -26,23 +31,21 @@ def place_base_and_target(
     """
     base_texture = table.choose(base_textures)
     target_texture = table.choose(dragged_textures)
-    base = table.place_one("base", lambda: (table.choose(table.pool.base_objects), base_texture))
+    base = place_base(table, base_texture)
     target = table.place_one(
         "target", lambda: (table.choose(table.pool.dragged_objects), target_texture), apart_m=APART_M
     )
     return base, target
 
 
-def place_distractors(
-    table: TableSampler, draw: Callable[[], tuple[str, str]], *, count: int
-) -> list[Placement]:
+def place_distractors(table: TableSampler, draw: Draw, *, count: int) -> list[Placement]:
     """Place distractors; `draw` returns object and texture."""
     return table.place("distractor", draw, count=count, tries=count + 10, apart_m=APART_M)
 
 
 def of_a_third_shape(
     table: TableSampler, base: Placement, target: Placement, textures: Sequence[str]
-) -> Callable[[], tuple[str, str]]:
+) -> Draw:
     """Return a function that draws distractors of any shape but those of base and target.
 
     Args:
@@ -89,24 +92,21 @@ _SPARE_STEPS = 2
 def gathering_problem(
     table: TableSampler,
     template: str,
+    choices_for: Callable[[Placement], tuple[Sequence[str], Sequence[str], Sequence[str]]],
     *,
-    base: Placement,
-    dragged_appearances: tuple[Sequence[str], Sequence[str]],
-    distractor_objects: Sequence[str],
     difficulty: str,
     num_distractors: int | None,
     after_bowl: bool | None,
 ) -> Problem:
-    """Place the objects and build the problem.
+    """Place a base and the other objects, and build the problem.
 
     Distractors have textures of the pool's dragged ones that no dragged object has.
 
     Args:
-        table: Sampler of the scene, with the base placed.
+        table: Sampler of the scene.
         template: The prompt with the slot `base_obj`.
-        base: The base.
-        dragged_appearances: Shapes and textures of the dragged objects, drawn independently.
-        distractor_objects: Shapes of distractors.
+        choices_for: Returns, for a base, shapes and textures of the dragged objects, drawn independently, and
+            shapes of distractors.
         difficulty: "easy", "medium" or "hard": decides the number of dragged objects.
         num_distractors: By default that of the difficulty.
         after_bowl: Whether the bowl's smaller tolerance applies to every base, as in VIMA-Bench after the
@@ -115,6 +115,8 @@ def gathering_problem(
     Returns:
         The problem; without `compat`, it is undecided at the start.
     """
+    base = place_base(table, table.choose(table.pool.base_textures))
+    dragged_objects, dragged_textures, distractor_objects = choices_for(base)
     if after_bowl is None:
         after_bowl = table.compat and "bowl" in table.pool.base_objects
     tolerance = Tolerance(BOWL_TOLERANCE_M if after_bowl or base.object == "bowl" else TOLERANCE_M)
@@ -122,10 +124,10 @@ def gathering_problem(
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
     dragged: list[Placement] = []
 
-    def draw() -> tuple[str, str]:
+    def draw() -> Appearance:
         dragged[:] = table.placements[1 : 1 + num_dragged]
         if len(dragged) < num_dragged:
-            objects, textures = dragged_appearances
+            objects, textures = dragged_objects, dragged_textures
         else:
             used = {placement.texture for placement in dragged}
             objects = distractor_objects

@@ -9,7 +9,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from openvima.errors import OracleError
-from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, InZone, NeverTouches, Pose, Problem, Scene, Zone
+from openvima.scene import (
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    InZone,
+    NeverTouches,
+    Point,
+    Pose,
+    Problem,
+    Scene,
+    Zone,
+)
 from openvima.scene.goal import object_of
 
 
@@ -61,8 +71,6 @@ class Rectangle:
         angle = direction_rad - self.yaw_rad
         return self.half_x * abs(math.cos(angle)) + self.half_y * abs(math.sin(angle))
 
-
-Point = tuple[float, float]
 
 STANDOFF_M = 0.006  # distance behind a block's centre where a sweep starts: clears all corners
 SHORTFALL_M = 0.0325  # distance of the pushed block's centre from a sweep's end

@@ -15,7 +15,7 @@ from openvima.errors import SamplingError
 from openvima.scene import AtPose, DistractorsApart, Placement, Problem, Prompt, SceneImage, Tolerance
 from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.registry import register_task
-from openvima.tasks.table import Reject, TableSampler, is_in_the_way
+from openvima.tasks.table import Appearance, Reject, TableSampler, is_in_the_way
 
 TEMPLATE = "Rearrange to this {scene}."
 TOLERANCE = Tolerance(position_m=0.1)
@@ -90,7 +90,7 @@ def sample(
 
 
 def _on_target(
-    table: TableSampler, appearance: tuple[str, str], start: Placement, target: Placement
+    table: TableSampler, appearance: Appearance, start: Placement, target: Placement
 ) -> tuple[Placement, Placement]:
     """Place the distractor on the target; return it there and at its parking place."""
     z = target.pose.z if table.compat else None  # as in VIMA-Bench, at the height of the object

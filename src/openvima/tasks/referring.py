@@ -72,12 +72,12 @@ def referring_problem(table: TableSampler, kind: str) -> Problem:
     else:
         fills["angle"] = angle_deg = table.choose(ANGLES_DEG)
         goals = [rotation_goal(p, angle_deg, position_m=TOLERANCE.position_m) for p in moved]
-    others = tuple(p.id for p in table.placements if p not in moved and p is not base)
+    others = [p for p in table.placements if p not in moved and p is not base]
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(sentence(command, phrase), **fills),
         goals=tuple(goals),
-        constraints=(DistractorsApart(others),),
+        constraints=(DistractorsApart.of(others),),
         num_required=meaning.num_required,
         oracle_max_steps=(meaning.num_required or len(moved)) + _SPARE_STEPS,
     )

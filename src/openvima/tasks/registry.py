@@ -312,9 +312,5 @@ def oracle_record(task: str) -> Mapping[str, Mapping[str, int]]:
         Level to {"episodes", "successes"}; empty for a task without a measurement. `benchmarks/oracle.py`
         writes the record.
     """
-    return _records().get(task, {})
-
-
-@functools.cache
-def _records() -> dict[str, dict[str, dict[str, int]]]:
-    return json.loads((files("openvima.tasks") / ORACLE_FILE).read_text(encoding="utf-8"))["tasks"]
+    record = (files("openvima.tasks") / ORACLE_FILE).read_text(encoding="utf-8")
+    return json.loads(record)["tasks"].get(task, {})

@@ -10,12 +10,11 @@ from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, ObjectImage, Problem, Prompt
 from openvima.tasks.options import Difficulty, SomeDistractors
-from openvima.tasks.placing import ANGLES_DEG, check_angles, rotation_goal
+from openvima.tasks.placing import ANGLES_DEG, TOLERANCE, check_angles, place_distractors, rotation_goal
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Rotate the {dragged_obj} {angle_in_degree} degrees."
-TOLERANCE_M = 0.1
 NUM_DISTRACTORS = {"easy": 1, "medium": 3, "hard": 5}
 
 
@@ -48,16 +47,10 @@ def sample(
     angle_deg = table.choose(angles_deg)
     target = table.place_one("target", table.drawing(objects, textures))
     others = [texture for texture in textures if texture != target.texture]
-    distractors = table.place(
-        "distractor",
-        table.drawing(objects, others),
-        count=num_distractors,
-        tries=num_distractors + 10,
-        apart_m=TOLERANCE_M,
-    )
+    distractors = place_distractors(table, table.drawing(objects, others), count=num_distractors)
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, dragged_obj=ObjectImage(target), angle_in_degree=round(angle_deg)),
-        goals=(rotation_goal(target, angle_deg, position_m=TOLERANCE_M),),
+        goals=(rotation_goal(target, angle_deg, position_m=TOLERANCE.position_m),),
         constraints=(DistractorsApart.of(distractors),),
     )

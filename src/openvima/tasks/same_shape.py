@@ -8,8 +8,8 @@ Success:  those objects within 0.125 m of the base's origin (0.0875 m if it is a
 Source:   VIMA paper, task list of the appendix, "Visual reasoning".
 """
 
-from openvima.catalog import Pool, object_spec
-from openvima.scene import Problem
+from openvima.catalog import object_spec
+from openvima.scene import Placement, Problem
 from openvima.tasks.options import Difficulty, SomeDistractors
 from openvima.tasks.placing import gathering_problem
 from openvima.tasks.registry import register_task
@@ -35,25 +35,18 @@ def sample(
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
     pool = table.pool
-    by_base = {name: _by_profile(pool, name) for name in pool.base_objects}
-    texture = table.choose(pool.base_textures)
-    base = table.place_one("base", lambda: (table.choose(pool.base_objects), texture))
-    alike, different = by_base[base.object]
+
+    def choices_for(base: Placement) -> tuple[list[str], tuple[str, ...], list[str]]:
+        profile = object_spec(base.object).profile
+        alike = [name for name in pool.dragged_objects if object_spec(name).profile == profile]
+        different = [name for name in pool.dragged_objects if object_spec(name).profile != profile]
+        return alike, pool.dragged_textures, different
+
     return gathering_problem(
         table,
         TEMPLATE,
-        base=base,
-        dragged_appearances=(alike, pool.dragged_textures),
-        distractor_objects=different,
+        choices_for,
         difficulty=difficulty,
         num_distractors=num_distractors,
         after_bowl=after_bowl,
     )
-
-
-def _by_profile(pool: Pool, base_object: str) -> tuple[list[str], list[str]]:
-    """Split the dragged objects by whether they have the profile of a base."""
-    profile = object_spec(base_object).profile
-    alike = [name for name in pool.dragged_objects if object_spec(name).profile == profile]
-    different = [name for name in pool.dragged_objects if object_spec(name).profile != profile]
-    return alike, different

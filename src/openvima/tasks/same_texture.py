@@ -33,14 +33,10 @@ def sample(
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
     pool = table.pool
-    texture = table.choose(pool.base_textures)
-    base = table.place_one("base", lambda: (table.choose(pool.base_objects), texture))
     return gathering_problem(
         table,
         TEMPLATE,
-        base=base,
-        dragged_appearances=(pool.dragged_objects, (texture,)),
-        distractor_objects=pool.dragged_objects,
+        lambda base: (pool.dragged_objects, (base.texture,), pool.dragged_objects),
         difficulty=difficulty,
         num_distractors=num_distractors,
         after_bowl=after_bowl,

@@ -33,7 +33,7 @@ from openvima.scene.goal import (
     unmet_reason,
 )
 from openvima.tasks import clutter
-from openvima.tasks.options import TaskOptions
+from openvima.tasks.options import options_of, parse_options
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewrite
 from openvima.tasks.registry import EXTRA_STEPS, check_steps, list_tasks, task_spec
 from openvima.tasks.table import TableSampler, is_wedged
@@ -341,13 +341,20 @@ def check_task_options(tasks: tuple[str, ...], text: str) -> None:
 
     Raises:
         UnknownTaskError: An option is of an unknown task.
-        ConfigError: An option fits no task of the run, or a task refuses its value.
+        ConfigError: The task of an option is not in the run, an option fits no task of it, or a task refuses
+            its value.
     """
-    options = TaskOptions.parse(text)
-    options.check(tasks)
+    known = {name for task in tasks for name in task_spec(task).options}
+    for task, name in parse_options(text):
+        if task and task_spec(task).name not in tasks:
+            raise ConfigError(
+                f"task option {task}.{name}: this run has no {task}; its tasks are {', '.join(tasks)}."
+            )
+        if not task and name not in known:
+            raise ConfigError(unknown_name(f"option of {', '.join(tasks)}:", name, sorted(known)))
     for task in tasks:
         try:
-            if own := options.of(task_spec(task)):
+            if own := options_of(task_spec(task), text):
                 sample_episode(task, seed=0, **own)  # the task checks its options
         except SamplingError:  # another seed may succeed
             continue

@@ -3,7 +3,17 @@
 import itertools
 from collections.abc import Sequence
 
-from openvima.scene import AtPose, Placement, SceneImage, Tolerance
+from openvima.scene import (
+    AtPose,
+    Constraint,
+    ObjectImage,
+    Placement,
+    Problem,
+    Prompt,
+    Scene,
+    SceneImage,
+    Tolerance,
+)
 
 NUM_FRAMES = {"easy": 3, "medium": 4, "hard": 5}
 TOLERANCE = Tolerance(position_m=0.1)
@@ -18,9 +28,36 @@ def with_frame_slots(template: str, num_frames: int) -> str:
     return template.replace("{frames}", slots)
 
 
-def frame_images(frames: Sequence[Frame]) -> dict[str, SceneImage]:
-    """Return the images of the slots frame_0, frame_1, …."""
-    return {name: SceneImage.of(frame) for name, frame in zip(_names(len(frames)), frames, strict=True)}
+def video_problem(
+    scene: Scene,
+    template: str,
+    images: Sequence[Frame],
+    goals: tuple[AtPose, ...],
+    constraint: Constraint,
+    *,
+    spare_steps: int,
+    **fills: ObjectImage,
+) -> Problem:
+    """Build a problem whose goals are to be met one after the other.
+
+    Args:
+        scene: The scene.
+        template: The prompt, with the slot {frames} for a video.
+        images: The objects that each frame of the video shows.
+        goals: The goals, in order.
+        constraint: The constraint.
+        spare_steps: Steps of the oracle beyond one for each goal.
+        **fills: Further slots of the prompt.
+    """
+    frames = dict(zip(_names(len(images)), map(SceneImage.of, images), strict=True))
+    return Problem(
+        scene,
+        Prompt.parse(with_frame_slots(template, len(images)), **fills, **frames),
+        goals,
+        (constraint,),
+        stages=(1,) * len(goals),
+        oracle_max_steps=len(goals) + spare_steps,
+    )
 
 
 def goals_between(frames: Sequence[Frame]) -> tuple[AtPose, ...]:

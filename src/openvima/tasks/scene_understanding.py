@@ -11,7 +11,7 @@ from openvima.scene import Placement, Problem, Prompt, SceneImage
 from openvima.tasks.options import Difficulty, NumDistractors, textures_by_difficulty
 from openvima.tasks.placing import APART_M, into_base, place_base_and_target
 from openvima.tasks.registry import register_task
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import Appearance, TableSampler
 
 TEMPLATE = "Put the {dragged_texture} object in {scene} into the {base_texture} object."
 
@@ -44,7 +44,7 @@ def sample(
     other_shapes = [name for name in table.pool.dragged_objects if name != target.object]
     other_base_textures = [texture for texture in textures if texture != base.texture]
 
-    def draw_distractor() -> tuple[str, str]:
+    def draw_distractor() -> Appearance:
         if table.rng.random() < 0.5:
             return table.choose(other_shapes), target.texture
         return base.object, table.choose(other_base_textures)
@@ -66,7 +66,7 @@ def _prompt_scene(table: TableSampler, target: Placement, textures: tuple[str, .
     sampler, objects = table.blank(), (*table.pool.dragged_objects, *table.pool.base_objects)
     others = [texture for texture in textures if texture != target.texture]
 
-    def draw() -> tuple[str, str]:
+    def draw() -> Appearance:
         return sampler.choose(objects), sampler.choose(others)
 
     sampler.place_one("prompt object", lambda: (target.object, target.texture), size=target.size)

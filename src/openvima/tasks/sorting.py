@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Pose, Problem, Prompt, Tolerance
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import Appearance, Draw, TableSampler
 
 NUM_GROUPS = 3
 LEAST, MOST = 6, 8  # objects to sort
@@ -14,7 +14,6 @@ MIDDLE_X, BASES_M, ROWS_M = 0.5, 0.16, (0.025, 0.175)  # m, of the table, and ro
 BASES_Y, COLUMNS_Y = (-0.32, 0.0, 0.32), tuple(0.16 * (n - 2.5) for n in range(6))  # m
 _SPARE_STEPS = 3
 
-Appearance = tuple[str, str]  # object and texture
 Fill = ObjectImage | str
 
 
@@ -23,7 +22,7 @@ def sorting_problem(
     template: str,
     *,
     draw: Callable[[int], Appearance],
-    draw_distractor: Callable[[], Appearance],
+    draw_distractor: Draw,
     base_textures: Sequence[str],
     describe: Callable[[int, Sequence[Placement]], Mapping[str, Fill]],
     num_distractors: int,

@@ -11,6 +11,7 @@ from openvima.scene import (
     NeverTouches,
     ObjectImage,
     Placement,
+    Point,
     Pose,
     Problem,
     Prompt,
@@ -22,8 +23,6 @@ from openvima.scene import (
 from openvima.tasks.pushes import Rectangle
 from openvima.tasks.table import TableSampler
 
-Corner = tuple[float, float]
-
 BLOCK = "small block"
 _COMPAT_TRIES = 10
 _TRIES = 500  # many, so that crowded groups of three are not underrepresented
@@ -33,7 +32,7 @@ _GAP_M = 0.001
 def scattered_blocks(
     table: TableSampler,
     texture: str,
-    corner: Corner,
+    corner: Point,
     spread_m: float,
     count: int,
     *,
@@ -81,7 +80,7 @@ def scattered_blocks(
 
 
 MAGNIFICATION = 7  # of the small block in the prompt
-CORNERS: tuple[Corner, Corner] = ((0.57, -0.22), (0.58, 0.03))  # m, lower corners of the squares of blocks
+CORNERS: tuple[Point, Point] = ((0.57, -0.22), (0.58, 0.03))  # m, lower corners of the squares of blocks
 SWEPT_SPREAD_M = 0.18
 NUM_SWEPT_WEIGHTS = {"easy": (0.5, 0.25, 0.25), "medium": (0.25, 0.5, 0.25), "hard": (0.25, 0.25, 0.5)}
 NUMBER_WORDS = ("one", "two", "three")

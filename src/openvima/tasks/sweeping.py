@@ -10,12 +10,11 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from openvima.scene import WORKSPACE_HIGH, InZone, NeverTouches, Problem, Scene, Zone
+from openvima.scene import WORKSPACE_HIGH, InZone, NeverTouches, Point, Problem, Scene, Zone
 from openvima.tasks.pushes import (
     BLOCK_REACH_M,
-    Point,
     Push,
     Rectangle,
     Sweep,
@@ -31,26 +30,16 @@ _STOP_EDGE_M = 0.05  # left free at the workspace's edge
 _STOP_MARGIN_M = 0.005  # deviation of a pushed block from its waypoint
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """A point from which a block has a straight path into the zone.
-
-    Args:
-        point: x, y in metres.
-        rest_m: Length of the shortest such push.
-    """
-
-    point: Point
-    rest_m: float
-
-
 @functools.lru_cache(maxsize=32)
-def waypoints(zone: Zone, lines: tuple[Zone, ...]) -> tuple[Stop, ...]:
-    """Waypoints beside the lines in front of a zone, other blocks ignored.
+def waypoints(zone: Zone, lines: tuple[Zone, ...]) -> tuple[tuple[Point, float], ...]:
+    """Points beside the lines in front of a zone from which blocks have straight paths into it.
 
     Args:
         zone: Goal of the blocks, which come from farther away from the robot.
         lines: Forbidden zones; lines behind the zone do not matter.
+
+    Returns:
+        Each point and the length of its shortest push, in metres; other blocks are ignored.
     """
     wider = tuple(
         replace(line, size_x=line.size_x + 2 * _STOP_MARGIN_M, size_y=line.size_y + 2 * _STOP_MARGIN_M)
@@ -63,7 +52,7 @@ def waypoints(zone: Zone, lines: tuple[Zone, ...]) -> tuple[Stop, ...]:
         pushes = [Push.between(point, end) for end in ends(zone, point)]
         lengths = [push.length_m for push in pushes if not touches_line(push, wider)]
         if lengths:
-            found.append(Stop(point, min(lengths)))
+            found.append((point, min(lengths)))
     return tuple(found)
 
 
@@ -235,9 +224,9 @@ def _pushes_into_zone(view: View, goal: InZone) -> Iterator[Push]:
 def _detours(view: View) -> Iterator[Sweep]:
     """Clear sweeps to a waypoint beside the line that has a clear sweep into the zone, shortest first."""
     stops = [
-        (math.dist(view.place(goal), waypoint.point) + waypoint.rest_m, rank, waypoint.point)
+        (math.dist(view.place(goal), point) + rest_m, rank, point)
         for rank, goal in enumerate(view.goals)
-        for waypoint in waypoints(goal.zone, view.lines)
+        for point, rest_m in waypoints(goal.zone, view.lines)
     ]
     for _, rank, stop in sorted(stops):
         goal = view.goals[rank]

@@ -11,12 +11,23 @@ import numpy as np
 from openvima.catalog import Assets, Pool, Vector3, object_spec
 from openvima.catalog.geometry import CollisionShape
 from openvima.errors import SamplingError
-from openvima.scene import FIRST_OBJECT_ID, WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Placement, Pose, Scene
+from openvima.scene import (
+    FIRST_OBJECT_ID,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    EndEffector,
+    Placement,
+    Point,
+    Pose,
+    Scene,
+)
 
 _NUM_STEPS = 1000  # the error falls as one over this number
 
 
 T = TypeVar("T")
+Appearance = tuple[str, str]  # names of object and texture
+Draw = Callable[[], Appearance]
 Reject = Callable[[Placement], bool]
 
 CELL_M = 0.003125  # side of a raster cell; the benchmark's resolution for placing and picking
@@ -59,9 +70,9 @@ class TableSampler:
         self.placements: list[Placement] = []
         self.assets = assets
         self._end_effector: EndEffector = end_effector
-        self._labels, self._heights = self._stamp_all(())
+        self._labels, self._heights = self._stamped(())
 
-    def appearances(self) -> list[tuple[str, str]]:
+    def appearances(self) -> list[Appearance]:
         """All shapes and textures of dragged objects of the pool."""
         return list(itertools.product(self.pool.dragged_objects, self.pool.dragged_textures))
 
@@ -77,7 +88,7 @@ class TableSampler:
         """Draw so many different options."""
         return [options[index] for index in self.rng.choice(len(options), count, replace=False).tolist()]
 
-    def drawing(self, objects: Sequence[str], textures: Sequence[str]) -> Callable[[], tuple[str, str]]:
+    def drawing(self, objects: Sequence[str], textures: Sequence[str]) -> Draw:
         """Return a function that draws an object and its texture, for `place`."""
         return lambda: (self.choose(objects), self.choose(textures))
 
@@ -94,7 +105,7 @@ class TableSampler:
     def place(
         self,
         what: str,
-        draw: Callable[[], tuple[str, str]],
+        draw: Draw,
         *,
         count: int = 1,
         tries: int = 10,
@@ -137,7 +148,7 @@ class TableSampler:
             raise SamplingError(f"only {len(placed)} of {count} × {what} found a place in {tries} tries.")
         return placed
 
-    def place_one(self, what: str, draw: Callable[[], tuple[str, str]], **settings: Any) -> Placement:
+    def place_one(self, what: str, draw: Draw, **settings: Any) -> Placement:
         """Place one object, with the settings of `place`."""
         return self.place(what, draw, **settings)[0]
 
@@ -175,7 +186,7 @@ class TableSampler:
     def move(self, placement: Placement, place: Placement) -> Placement:
         """Move an object to a pose from `find_place`; return it there."""
         self.placements[self.placements.index(placement)] = place
-        self._labels, self._heights = self._stamp_all(self.placements)
+        self._labels, self._heights = self._stamped(self.placements)
         return place
 
     def add(
@@ -249,17 +260,17 @@ class TableSampler:
         Returns:
             The pose at height 0, or None without a free position.
         """
-        from openvima.tasks.kernels import mark_free_centres, nth_centre
+        from openvima.tasks.kernels import list_free_centres
 
         side = round(float(np.hypot(size[0], size[1])) / CELL_M)
-        centres = np.empty(self._labels.shape, np.uint8)
-        counts, run = np.empty(len(centres), np.int32), np.empty(len(centres.T), np.int32)
-        num_free = mark_free_centres(self._labels, side, run, centres, counts)
+        num_columns = self._labels.shape[1]
+        run, centres = np.empty(num_columns, np.int32), np.empty(self._labels.size, np.int32)
+        num_free = list_free_centres(self._labels, side, run, centres)
         if num_free == 0:
             return None
         is_larger = not self.compat and _reach_m(self.assets, object_name, size) > (side / 2 + 1) * CELL_M
         for _ in range(_FOOTPRINT_TRIES if is_larger else 1):
-            row, column = nth_centre(centres, counts, int(self.rng.integers(num_free)))
+            row, column = divmod(int(centres[self.rng.integers(num_free)]), num_columns)
             pose = Pose.planar(
                 WORKSPACE_LOW[0] + column * CELL_M,
                 WORKSPACE_LOW[1] + row * CELL_M,
@@ -271,10 +282,10 @@ class TableSampler:
 
     def covered(self, placement: Placement) -> np.ndarray:
         """Return the cells that an object covers from above, whatever its height; shape (320, 160), bool."""
-        geometry = self.assets.geometry(placement.object, placement.size, placement.scale)
+        geometry = placement.geometry(self.assets)
         pose = placement.pose
         raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
-        return self._stamp_all([replace(placement, id=1, pose=raised)])[0] > 0
+        return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
 
     def scene(self) -> Scene:
         """Return the scene placed so far."""
@@ -302,22 +313,19 @@ class TableSampler:
         )
 
     def _put(self, placement: Placement) -> Placement:
-        self._stamp(self._labels, self._heights, placement)
+        self._stamped([placement], onto=(self._labels, self._heights))
         self.placements.append(placement)
         return placement
 
-    def _stamp(self, labels: np.ndarray, heights: np.ndarray, placement: Placement) -> None:
-        from openvima.render.labels import stamp  # imports Numba, which a list of tasks does not need
+    def _stamped(
+        self, placements: Sequence[Placement], *, onto: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Labels and heights of these objects, on an empty table or on what is given, which changes."""
+        from openvima.render.labels import empty_labels, stamp  # Numba, which a list of tasks does not need
 
-        stamp(labels, heights, placement, self.assets)
-
-    def _stamp_all(self, placements: Sequence[Placement]) -> tuple[np.ndarray, np.ndarray]:
-        """Labels and heights of these objects."""
-        from openvima.render.labels import empty_labels
-
-        labels, heights = empty_labels()
+        labels, heights = onto or empty_labels()
         for placement in placements:
-            self._stamp(labels, heights, placement)
+            stamp(labels, heights, placement, self.assets)
         return labels, heights
 
     def _footprint_is_free(self, object_name: str, size: Vector3, pose: Pose) -> bool:
@@ -385,13 +393,11 @@ def is_wedged(placement: Placement, base: Placement, assets: Assets) -> bool:
     A top view does not show it: the hull of a pan fills the corners beside its handle, and what lies there
     would be pressed into the table.
     """
-    geometry = assets.geometry(placement.object, placement.size, placement.scale)
+    geometry = placement.geometry(assets)
     if placement.pose.z > geometry.rest_z_m + _ON_TABLE_M:
         return False
     shadows = [_shadow(part, placement.pose) for part in geometry.collision]
-    others = [
-        _shadow(part, base.pose) for part in assets.geometry(base.object, base.size, base.scale).collision
-    ]
+    others = [_shadow(part, base.pose) for part in base.geometry(assets).collision]
     return any(
         not ((low > other_high) | (other_low > high)).any()
         for low, high in shadows
@@ -413,7 +419,7 @@ def _reach_m(assets: Assets, object_name: str, size: Vector3) -> float:
 
 
 @functools.lru_cache(maxsize=256)
-def _circle_centre_m(assets: Assets, object_name: str, size: Vector3) -> tuple[float, float]:
+def _circle_centre_m(assets: Assets, object_name: str, size: Vector3) -> Point:
     """Centre of the smallest circle around an object's mesh, in its link frame, in metres.
 
     It is accurate to about a thousandth of the radius.

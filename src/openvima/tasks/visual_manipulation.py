@@ -11,7 +11,7 @@ from openvima.scene import ObjectImage, Problem, Prompt
 from openvima.tasks.options import Difficulty, NumDistractors, textures_by_difficulty
 from openvima.tasks.placing import into_base, place_base_and_target, place_distractors
 from openvima.tasks.registry import register_task
-from openvima.tasks.table import TableSampler
+from openvima.tasks.table import Appearance, TableSampler
 
 TEMPLATE = "Put the {dragged_obj_1} into the {base_obj}."
 
@@ -41,7 +41,7 @@ def sample(
     textures = (*dragged_textures, *base_textures)
     taken = {(base.object, base.texture), (target.object, target.texture)}
 
-    def draw_distractor() -> tuple[str, str]:
+    def draw_distractor() -> Appearance:
         while True:
             appearance = (table.choose(objects), table.choose(textures))
             if appearance not in taken:
