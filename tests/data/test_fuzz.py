@@ -115,7 +115,7 @@ def test_a_manifest_of_another_form_is_found(
 
 def test_a_shard_of_another_version_is_named_with_both(folder: Path) -> None:
     _replace(folder / FIRST, b'"schema": 2', b'"schema": 7')
-    with pytest.raises(DatasetError, match=rf"{FIRST}.*version 7; this package reads 2"):
+    with pytest.raises(DatasetError, match=rf"{FIRST}.*version 7; this package reads version 2"):
         Shard(folder / FIRST)
 
 

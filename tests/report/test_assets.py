@@ -50,7 +50,7 @@ def test_the_table_is_printed_before_any_video(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report_videos, "_recorded", record)
     words = "evaluate --policy oracle --tasks rotate --levels L1 --episodes 1 --workers 1 --out"
     assert main([*words.split(), str(tmp_path / "out")]) == 0
-    assert "success rates" in printed[0] and "100.0" in printed[0]
+    assert "Success rates" in printed[0] and "100.0" in printed[0]
 
 
 def test_without_trained_policies_all_are_recorded_and_none_unless_requested(results):
