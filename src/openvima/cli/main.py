@@ -23,7 +23,7 @@ from openvima.input_files import expand_home
 
 # Verb → summary. Each verb is a module of this package; its functions return an exit status, or None for 0.
 VERBS = {
-    "quickstart": "generate, train, evaluate and report in four minutes",
+    "quickstart": "generate, train, evaluate and report in three minutes",
     "tasks": "list the tasks: prompt, tool, levels, steps",
     "demo": "record a video of the oracle or a policy on one task",
     "generate": "generate demonstrations with the oracle",

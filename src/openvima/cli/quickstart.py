@@ -29,7 +29,7 @@ def main(
 ) -> None:
     """Write demonstrations, train a small pointer network on them, score it, and leave a report.
 
-    openvima-small, which comes trained with the package, is scored beside it. Takes some four minutes on
+    openvima-small, which comes trained with the package, is scored beside it. Takes some three minutes on
     two cores. It can be interrupted at any time; the same command goes on where it stopped.
 
     Example: openvima quickstart --out quickstart
