@@ -74,7 +74,7 @@ def test_differing_settings_are_named_and_force_starts_anew(settings):
 def test_a_folder_with_other_files_is_never_cleared(settings):
     settings["out"].mkdir()
     (settings["out"] / "thesis.tex").write_text("years of work")
-    with pytest.raises(ConfigError, match="not empty"):
+    with pytest.raises(ConfigError, match="other files"):
         train(TrainingConfig.of(settings))
     with pytest.raises(ConfigError, match="other files"):
         train(TrainingConfig.of({**settings, "force": True}))

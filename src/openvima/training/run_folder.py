@@ -105,7 +105,8 @@ class RunFolder:
         if differing and not force:
             raise ConfigError(
                 f"{path} holds a run with other settings: {'; '.join(differing)}. Give the same settings to "
-                "continue it, another --out (where --init-from takes its weights), or --force to delete it."
+                f"continue it, --init-from {path} and another --out to begin with its weights, or --force to "
+                "delete it."
             )
         if differing:
             self._clear()
@@ -227,7 +228,7 @@ class RunFolder:
         file = self.path / CONFIG_FILE
         if not file.is_file():
             if self.path.is_dir() and not all(map(is_lock_file, self.path.iterdir())):
-                return [f"it is not empty and has no {CONFIG_FILE}"]
+                raise ConfigError(f"{self.path} holds other files and no training run; give another --out.")
             return []
         try:
             old = read_yaml(file)
@@ -236,8 +237,6 @@ class RunFolder:
         return differences(flatten(old), flatten(settings))
 
     def _clear(self) -> None:
-        if not (self.path / CONFIG_FILE).is_file():
-            raise ConfigError(f"{self.path} holds other files and no training run; give another --out.")
         for folder in (self.checkpoints, self.path / BOARD_FOLDER, self.path / WANDB_FOLDER):
             shutil.rmtree(folder, ignore_errors=True)
         for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
