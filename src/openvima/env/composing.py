@@ -373,7 +373,9 @@ def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, a
     if moved.fixed:
         raise SceneError(f"{label} ({name}): the {moved.texture} {moved.object} is fixed to the table.")
     if moved is bound.arguments.get("b"):
-        raise SceneError(f"{label} ({name}): {moved.texture} {moved.object} cannot be in itself.")
+        raise SceneError(
+            f"{label} ({name}): {moved.texture} {moved.object} cannot be in itself; name two objects."
+        )
     try:
         return make(*bound.args, **bound.kwargs)
     except SceneError as error:

@@ -82,7 +82,7 @@ STILL_RAD = 5e-4  # … this, keeps its pose, so that nothing creeps over many s
 
 @dataclass(slots=True, eq=False)
 class PrimitiveState:
-    """Bodies and arm during one primitive, and who is told of their motion.
+    """Bodies and arm during one primitive, with the callbacks that follow their motion.
 
     Frames are computed only with a recorder.
 
