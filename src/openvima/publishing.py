@@ -45,6 +45,7 @@ _BUNDLED_RUN = "training"  # settings of the run beside a bundled checkpoint
 _SETTINGS = (
     "preset",
     "init_from",
+    "crops_from",
     "seed",
     "assets",
     "schedule.steps",

@@ -48,6 +48,7 @@ COMMON = (
     "out",
     "preset",
     "init_from",
+    "crops_from",
     "t5",
     "force",
     "seed",
@@ -63,7 +64,7 @@ COMMON = (
 )
 
 # Options that change the defaults of others.
-_DECIDING = ("preset", "init_from", "schedule.steps", "schedule.epochs", "model.image_tokens", "model.head")
+_DECIDING = ("preset", "init_from", "crops_from", "schedule.steps", "schedule.epochs", "model.image_tokens", "model.head")
 
 
 def run(words: Sequence[str]) -> None:

@@ -109,12 +109,12 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
         config = replace(config, pretraining=replace(config.pretraining, steps=steps))
     if (
         config.pretraining.finetune_crop_encoder is False
-        and not (config.pretraining.steps or config.init_from)
+        and not (config.pretraining.steps or config.init_from or config.crops_from)
         and sizes.inputs.tokens != "frames"
     ):
         raise ConfigError(
             "pretraining.finetune_crop_encoder is False, but nothing has trained the crop encoder; set "
-            "pretraining.steps or init_from, or train it with pretraining.finetune_crop_encoder True."
+            "pretraining.steps, crops_from or init_from, or train it with pretraining.finetune_crop_encoder True."
         )
     attributes, weight = getattr(sizes, "attributes", None), config.pretraining.attribute_loss_weight
     if weight and not attributes:
@@ -160,7 +160,8 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
 
     Raises:
         InputFileError: T5 or the initial weights are not where the settings say.
-        ConfigError: The initial weights are those of a network of other sizes, or lack a tokenizer.
+        ConfigError: The initial weights are those of a network of other sizes, or lack a tokenizer; or the
+            crop encoder is of another size than that of `crops_from`.
         PromptError: The texts have too many different words, or one that T5 lacks.
         MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
     """
@@ -191,6 +192,8 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         _copy_weights(initial, network)
     elif config.t5:
         load_t5(network, config.t5)
+    if config.crops_from:
+        _copy_crop_encoder(config.crops_from, network)
     return PolicyLearner(network, Processor(*sizes.inputs, tokenizer), config.augmentation)
 
 
@@ -238,6 +241,27 @@ def _copy_weights(initial: PolicyNetwork, network: PolicyNetwork) -> None:
             fresh[name][: len(weights[name])] = weights[name]
             weights[name] = fresh[name]
     network.load_state_dict({name: weights.get(name, tensor) for name, tensor in fresh.items()})
+
+
+def _copy_crop_encoder(source: str, network: PolicyNetwork) -> None:
+    """Copy the crop encoder of other weights, which may be those of another architecture."""
+    theirs, ours = load_network(source)[0].object_encoder, network.object_encoder
+    if theirs is None or ours is None:
+        raise ConfigError(
+            f"crops_from is {source!r}, but {'it' if theirs is None else 'the preset'} takes whole frames; "
+            "leave it out."
+        )
+    if ours.config.appearance_width:
+        raise ConfigError(
+            f"crops_from is {source!r}, but the preset matches objects by an embedding, which only its own "
+            "pretraining teaches; leave it out."
+        )
+    if theirs.config.crop != ours.config.crop:
+        raise ConfigError(
+            f"crops_from is {source!r}, whose crop encoder is {theirs.config.crop}; that of the preset is "
+            f"{ours.config.crop}. Leave it out, or take a preset of the same size."
+        )
+    ours.crop_encoder.load_state_dict(theirs.crop_encoder.state_dict())
 
 
 def training_texts(

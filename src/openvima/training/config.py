@@ -431,6 +431,8 @@ class TrainingConfig(RunConfig):
         preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
             "module:function" for a `Learner` of your own.
         init_from: Initial weights: another run, or other weights that `load_policy` takes.
+        crops_from: Take the crop encoder of other weights, such as "openvima-vima", instead of pretraining one;
+            it stays frozen as if this run had pretrained it.
         t5: Source of the T5 weights and tokenizer, for presets that use them: a folder, or an id on the
             Hugging Face Hub such as "t5-base".
         assets: Asset pack of pretraining: "procedural", the folder of the original one, or FILE.py:FUNCTION.
@@ -445,6 +447,7 @@ class TrainingConfig(RunConfig):
     preset: str = "nano"
     model: ModelConfig = ModelConfig()
     init_from: str | None = None
+    crops_from: str | None = None
     t5: str | None = None
     assets: str = "procedural"
     object_cache: Path | None = None
@@ -454,7 +457,7 @@ class TrainingConfig(RunConfig):
     augmentation: AugmentationConfig = AugmentationConfig()
 
     def _texts(self) -> tuple[str, ...]:
-        return ("preset", "init_from", "t5", "assets")
+        return ("preset", "init_from", "crops_from", "t5", "assets")
 
     def _unknown(self) -> Iterator[str]:
         if not isinstance(self.preset, str) or self.preset in PRESETS or ":" in self.preset:

@@ -241,10 +241,13 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
 
     Steps replace epochs. `init_from` comes with a trained crop encoder, so it resets pretraining to the
     default of the preset, which is then none, and shows no tasks first, unless the others set it as well.
+    `crops_from` leaves pretraining out.
     Settings of the recipe `papers` that other image tokens or another head cannot have are dropped.
     """
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     trained = {"pretraining.steps": None, "loader.first_steps": 0} if others.get("init_from") else {}
+    if others.get("crops_from"):
+        trained = {"pretraining.steps": 0}
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
     if tokens != "objects":
         unfit |= {"model.points"}
