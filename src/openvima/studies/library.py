@@ -143,7 +143,8 @@ def _fill(value: Any, names: Mapping[str, Any]) -> Any:
     own = {**value, **value.get("nano" if inputs.scale.is_nano else "papers", {})}
     filled = {key: _fill(each, names) for key, each in own.items() if key not in ("nano", "papers", "for")}
     if (network := filled.pop("network", None)) is not None:
-        filled = {**(NANO_POINTER if network == "pointer" else inputs.network(network)), **filled}
+        recipe = filled.pop("recipe", None)
+        filled = {**(NANO_POINTER if network == "pointer" else inputs.network(network, recipe)), **filled}
     return filled
 
 

@@ -8,9 +8,10 @@ from typing import Any, Literal
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, unknown_name
 from openvima.evaluation.sources import policy_sources
-from openvima.policies.naming import SMALL
+from openvima.policies.naming import SMALL, VIMA
 from openvima.policies.presets import SIZE_NAMES
 from openvima.report.published import PublishedModel
+from openvima.training.recipes import default_recipe, override, recipe_settings
 
 NANO = "nano"
 TRAINING_TASKS = (  # of the papers
@@ -66,6 +67,11 @@ class Scale:
 NANO_POINTER: Mapping[str, Any] = MappingProxyType(
     {"preset": NANO, "pretraining.steps": 150, "pretraining.num_scenes": 1200}
 )
+# Of the recipes of the papers' networks on two cores. With the crops of a finished training no run pretrains
+# its own; without random appearance it sees the demonstrations of the study alone.
+_NANO_PAPERS: Mapping[str, Any] = MappingProxyType(
+    {"schedule.steps": 1500, "loader.rerendered_prob": 0.0, "runtime.processes": 1}
+)
 # Two cores: one training takes minutes.
 _NANO = Scale(
     name=NANO,
@@ -73,7 +79,7 @@ _NANO = Scale(
     settings=MappingProxyType({"schedule.steps": 400, "loader.batch_size": 64, "runtime.tensorboard": False}),
     tasks=("visual_manipulation", "scene_understanding", "rotate", "novel_noun"),
     new_tasks=("novel_adj_and_noun",),
-    demonstrations=1000,
+    demonstrations=4000,
     episodes=50,
 )
 
@@ -155,14 +161,22 @@ class StudyInputs:
     assets: str = "procedural"
     checkpoint: str | None = None
 
-    def network(self, architecture: str) -> Settings:
+    def network(self, architecture: str, recipe: str | None = None) -> Settings:
         """Return the training settings of an architecture of the papers, such as "vima", at this scale.
+
+        Args:
+            architecture: Its name.
+            recipe: At scale nano, a recipe other than the default of the preset.
 
         Raises:
             ConfigError: It needs T5, which is not given.
         """
         preset = f"{architecture}-{self.scale.name}"
-        return {"preset": preset} if self.scale.is_nano else {"preset": preset, "t5": self.needed_t5()}
+        if not self.scale.is_nano:
+            return {"preset": preset, "t5": self.needed_t5()}
+        settings = recipe_settings(recipe or default_recipe(preset))
+        crops = {"crops_from": VIMA} if settings.get("pretraining.steps") else {}
+        return override(settings, {"preset": preset, **_NANO_PAPERS, **crops})
 
     def needed_t5(self) -> str:
         """Return the source of T5.
