@@ -64,7 +64,15 @@ COMMON = (
 )
 
 # Options that change the defaults of others.
-_DECIDING = ("preset", "init_from", "crops_from", "schedule.steps", "schedule.epochs", "model.image_tokens", "model.head")
+_DECIDING = (
+    "preset",
+    "init_from",
+    "crops_from",
+    "schedule.steps",
+    "schedule.epochs",
+    "model.image_tokens",
+    "model.head",
+)
 
 
 def run(words: Sequence[str]) -> None:

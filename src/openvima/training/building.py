@@ -114,7 +114,8 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
     ):
         raise ConfigError(
             "pretraining.finetune_crop_encoder is False, but nothing has trained the crop encoder; set "
-            "pretraining.steps, crops_from or init_from, or train it with pretraining.finetune_crop_encoder True."
+            "pretraining.steps, crops_from or init_from, or train it with pretraining.finetune_crop_encoder "
+            "True."
         )
     attributes, weight = getattr(sizes, "attributes", None), config.pretraining.attribute_loss_weight
     if weight and not attributes:

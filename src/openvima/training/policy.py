@@ -132,8 +132,9 @@ def _variants(config: TrainingConfig, boxes: Boxes | None) -> list[tuple[Variant
 
 def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:
     """Return what identifies the demonstrations besides their index."""
-    weights = [source for source in (config.init_from, config.crops_from) if source]
-    seen = {*held_out_demonstrations(dataset), *(each for source in weights for each in held_out_data(source))}
+    seen = set(held_out_demonstrations(dataset))
+    for source in filter(None, (config.init_from, config.crops_from)):
+        seen.update(held_out_data(source))
     return {**({"boxes": boxes.name} if boxes else {}), **({"held_out": sorted(seen)} if seen else {})}
 
 
