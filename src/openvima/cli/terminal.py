@@ -165,7 +165,7 @@ def rich_table(table: "report.Table") -> "Table":
 
 
 def print_left_out(tasks: Sequence[str], prompts: str, levels: Sequence[str]) -> None:
-    """Say on stderr what a run leaves out: tasks whose prompts have no text form, levels without its tasks."""
+    """Say on stderr what a run leaves out: tasks whose prompts lack a text form, levels without its tasks."""
     from openvima.tasks.registry import named_tasks, task_spec, tasks_of
     from openvima.tasks.sampling import takes_prompts
 
