@@ -67,7 +67,7 @@ def test_a_figure_has_the_panels_and_the_axis_of_the_study(
     assert all(points for curves in figure.panels.values() for points in curves.values())
 
 
-@pytest.mark.parametrize("name", ["corrupted-prompts", "level-drop"])
+@pytest.mark.parametrize("name", ["corrupted-prompts", "level-drop", "midas"])
 def test_a_page_shows_every_run_and_loads_nothing(name: str, tmp_path: Path) -> None:
     study, plan, points = made_up(name, tmp_path)
     page = study_page(plan, points, costs=study_costs(plan), versions={}, command="openvima study")
