@@ -1,6 +1,8 @@
 """Training of attributes: labels of rendered objects, captions, and the losses."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,9 +31,9 @@ from openvima.training.pretraining.losses import (
     attribute_loss,
 )
 from openvima.training.pretraining.pairs import (
-    AttributeLabeller,
     AttributeLabels,
     Pairs,
+    attributes_of_object,
     render_pairs,
 )
 from openvima.training.pretraining.stage import (
@@ -62,15 +64,15 @@ def pairs() -> Pairs:
 
 
 @pytest.fixture(scope="module")
-def labeller() -> AttributeLabeller:
-    return AttributeLabeller(RandomAppearanceAssets(load_assets("procedural")))
+def labeller() -> Callable:
+    return partial(attributes_of_object, assets=RandomAppearanceAssets(load_assets("procedural")))
 
 
 def placement(name: str, texture: str = "red", height: float = 1.0) -> Placement:
     return Placement(5, name, texture, (0.07, 0.07, 0.07), Pose.planar(0.5, 0.0), scale=(1.0, 1.0, height))
 
 
-def labels_of(labeller: AttributeLabeller, *placements: Placement) -> AttributeLabels:
+def labels_of(labeller: Callable, *placements: Placement) -> AttributeLabels:
     """Labels of objects that look in their prompt image as in their scene."""
     columns = [torch.from_numpy(np.stack(column)) for column in zip(*map(labeller, placements), strict=True)]
     boxes = torch.zeros(len(placements), 3, 2, 4, dtype=torch.int64)

@@ -209,11 +209,10 @@ def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | No
 
 def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
     """Compare attributes as the weights to begin with have learned to, which is no matter of size."""
-    if not (isinstance(ours, PointerConfig) and isinstance(theirs, PointerConfig)):
-        return ours
-    if ours.attributes is None or theirs.attributes is None:
-        return ours
-    return replace(ours, attributes=replace(ours.attributes, exclusive=theirs.attributes.exclusive))
+    if isinstance(ours, PointerConfig) and isinstance(theirs, PointerConfig):
+        if ours.attributes and theirs.attributes:
+            return replace(ours, attributes=replace(ours.attributes, exclusive=theirs.attributes.exclusive))
+    return ours
 
 
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
@@ -313,10 +312,6 @@ def _descriptions(dataset: Dataset) -> set[str]:
         images = pa.Table.from_struct_array(table.column("prompt_images").combine_chunks().flatten())
         shown = images.filter(pc.field("kind") == "object").column("objects").combine_chunks().flatten()
         records = pa.Table.from_struct_array(shown).select(["object", "texture"])
-        names.update((record["object"], record["texture"]) for record in _different(records))
+        different = records.group_by(["object", "texture"]).aggregate([]).to_pylist()
+        names.update((record["object"], record["texture"]) for record in different)
     return {description_of(ObjectRecord(0, *each)) for each in names} - {""}
-
-
-def _different(table: pa.Table) -> list[dict[str, str]]:
-    """Return the different rows of a table."""
-    return table.group_by(table.column_names).aggregate([]).to_pylist()

@@ -48,11 +48,6 @@ def setting_types(kind: type, prefix: str = "") -> dict[str, Any]:
     return types
 
 
-def path_settings(kind: type) -> list[str]:
-    """Return the settings of a dataclass itself that are paths."""
-    return [name for name, hint in get_type_hints(kind).items() if Path in options_of(hint)]
-
-
 @dataclass(frozen=True, slots=True)
 class LoaderConfig:
     """Batches and held-out demonstrations.
@@ -384,7 +379,9 @@ class RunConfig:
     runtime: RuntimeConfig = RuntimeConfig()
 
     def __post_init__(self) -> None:
-        settle(self, paths=path_settings(type(self)), texts=self._texts())
+        kinds = {name: options_of(hint) for name, hint in get_type_hints(type(self)).items()}
+        paths, texts = ([name for name, kind in kinds.items() if each in kind] for each in (Path, str))
+        settle(self, paths=paths, texts=texts)
         if problems := [*self._unknown(), *problems_of(self)]:
             raise ConfigError(" ".join(problems))
 
@@ -414,10 +411,6 @@ class RunConfig:
                 values.get(section, {}).pop(name, None)
         return {name: str(v) if isinstance(v, Path) else v for name, v in values[""].items()}
 
-    def _texts(self) -> tuple[str, ...]:
-        """Return the settings that are a name or a path."""
-        return ()
-
     def _unknown(self) -> Iterator[str]:
         """Yield further problems."""
         yield from ()
@@ -431,8 +424,8 @@ class TrainingConfig(RunConfig):
         preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
             "module:function" for a `Learner` of your own.
         init_from: Initial weights: another run, or other weights that `load_policy` takes.
-        crops_from: Take the crop encoder of other weights, such as "openvima-vima", instead of pretraining one;
-            it stays frozen as if this run had pretrained it.
+        crops_from: Take the crop encoder of other weights, such as "openvima-vima", instead of pretraining
+            one; it stays frozen as if this run had pretrained it.
         t5: Source of the T5 weights and tokenizer, for presets that use them: a folder, or an id on the
             Hugging Face Hub such as "t5-base".
         assets: Asset pack of pretraining: "procedural", the folder of the original one, or FILE.py:FUNCTION.
@@ -455,9 +448,6 @@ class TrainingConfig(RunConfig):
     rollout: RolloutConfig = RolloutConfig()
     pretraining: PretrainingConfig = PretrainingConfig()
     augmentation: AugmentationConfig = AugmentationConfig()
-
-    def _texts(self) -> tuple[str, ...]:
-        return ("preset", "init_from", "crops_from", "t5", "assets")
 
     def _unknown(self) -> Iterator[str]:
         if not isinstance(self.preset, str) or self.preset in PRESETS or ":" in self.preset:

@@ -3,7 +3,6 @@
 `start_peers` starts the processes of one machine, with the environment in which `torchrun` starts them.
 """
 
-import contextlib
 import datetime
 import os
 import socket
@@ -12,7 +11,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,19 +112,14 @@ class Parallel:
             warnings.filterwarnings("ignore", "`broadcast_buffers` is deprecated", FutureWarning)
             return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
 
-    @contextlib.contextmanager
-    def synchronized(self, module: nn.Module, *, last: bool) -> Iterator[None]:
+    def synchronized(self, module: nn.Module, *, last: bool) -> AbstractContextManager[None]:
         """Synchronize gradients in the last backward pass of a step only.
 
         Args:
             module: The wrapped module.
             last: Whether the block is the last pass of the step.
         """
-        if self.num_ranks == 1 or last:
-            yield
-        else:
-            with module.no_sync():  # type: ignore[operator]
-                yield
+        return nullcontext() if self.num_ranks == 1 or last else module.no_sync()  # type: ignore[operator]
 
     def with_all_gradients(self, loss: torch.Tensor, parameters: Iterable[nn.Parameter]) -> torch.Tensor:
         """Let every parameter have a gradient, if only of zero: DDP waits for all of them.
@@ -136,11 +130,9 @@ class Parallel:
             return loss
         return loss + 0.0 * torch.stack([parameter.sum() for parameter in parameters]).sum()
 
-    def autocast(self, precision: str) -> contextlib.AbstractContextManager[Any]:
+    def autocast(self, precision: str) -> AbstractContextManager[Any]:
         """Return a context for mixed precision, "float32" or "bfloat16"."""
-        if precision == "float32":
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, torch.bfloat16)
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=precision == "bfloat16")
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
         """Average metrics over all processes; a missing metric counts as 0."""
@@ -212,7 +204,7 @@ class _Gathered(torch.autograd.Function):
 ONE_PROCESS = Parallel(0, 1, torch.device("cpu"))
 
 
-@contextlib.contextmanager
+@contextmanager
 def join_processes(device: str) -> Iterator[Parallel]:
     """Join the process group of `torchrun`, if there is one.
 

@@ -15,9 +15,10 @@ from openvima.data.object_cache import (
     open_object_cache,
 )
 from openvima.data.reader import Dataset
-from openvima.detector.plugins import detected_object_cache, plugged_boxes
+from openvima.detector.plugins import plugged_boxes
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
+from openvima.policies.base import torch_threads
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.batches import ExampleSource
@@ -132,8 +133,8 @@ def _variants(config: TrainingConfig, boxes: Boxes | None) -> list[tuple[Variant
 
 def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:
     """Return what identifies the demonstrations besides their index."""
-    weights = [source for source in (config.init_from, config.crops_from) if source]
-    seen = {*held_out_demonstrations(dataset), *(each for source in weights for each in held_out_data(source))}
+    weights = filter(None, (config.init_from, config.crops_from))
+    seen = set(held_out_demonstrations(dataset)).union(*map(held_out_data, weights))
     return {**({"boxes": boxes.name} if boxes else {}), **({"held_out": sorted(seen)} if seen else {})}
 
 
@@ -208,23 +209,21 @@ class _Stages:
     @cached_property
     def _caches(self) -> list[tuple[ObjectCache, float]]:
         """Object caches of `_variants`, with their probabilities; the first process builds missing ones."""
-        # Another training may write the cache now.
-        common: dict[str, Any] = {"folder": self.config.object_cache, "timeout_s": math.inf}
         workers = self._workers(len(self.dataset) // _DEMONSTRATIONS_PER_WORKER)
         caches = []
         if not self.parallel.is_first:
             self.parallel.wait()
         for variant, prob in _variants(self.config, self.boxes):
-            if variant.boxes is not None:
-                cache = detected_object_cache(self.dataset, variant.boxes, report=self._say, **common)
-            else:
+            with torch_threads(1):  # so that detections are those of any other run
                 cache = open_object_cache(
                     self.dataset,
                     self.learner.input_kind,
+                    folder=self.config.object_cache,
+                    boxes=variant.boxes,
                     appearance=variant.appearance,
-                    workers=workers,
+                    workers=1 if variant.boxes else workers,
                     report=self._say,
-                    **common,
+                    timeout_s=math.inf,  # another training may write the cache now
                 )
             caches.append((cache, prob))
         if self.parallel.is_first:

@@ -16,7 +16,8 @@ import json
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -151,8 +152,7 @@ class RunFolder:
             write_safetensors(tensors, partial / OPTIMIZER_FILE)
             atomic_write_file(partial / STATE_FILE, json.dumps(asdict(progress)))
             sync_files(partial)  # as well as the metrics of the steps before it
-            if (self.path / METRICS_FILE).exists():
-                sync_file(self.path / METRICS_FILE)
+            sync_file(self.path / METRICS_FILE)
             shutil.rmtree(final, ignore_errors=True)
             partial.rename(final)
             sync_file(self.checkpoints)
@@ -203,15 +203,9 @@ class RunFolder:
         What a kill just after that checkpoint was written left undone is done.
         """
         self._settle(progress)
-        file = self.path / METRICS_FILE
-        if not file.is_file():
-            return
-        kept = [
-            line + "\n"
-            for line, values in whole_lines(file)
-            if (values["stage"], values["step"]) <= (progress.stage, progress.step)
-        ]
-        atomic_write_file(file, "".join(kept))
+        file, reached = self.path / METRICS_FILE, (progress.stage, progress.step)
+        kept = [each for each in read_lines(file) if (each["stage"], each["step"]) <= reached]
+        atomic_write_file(file, "".join(json.dumps(each) + "\n" for each in kept))
 
     def _settle(self, progress: Progress) -> None:
         """Name the best checkpoint, and delete those that are neither it, the last nor permanent."""
@@ -243,16 +237,16 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
 
 
-def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the lines of `METRICS_FILE` or `TIMINGS_FILE`, each as text and as values.
+def read_lines(file: Path) -> list[dict[str, Any]]:
+    """Read `METRICS_FILE`, `TIMINGS_FILE` or `SESSIONS_FILE`; empty without a file.
 
     An interruption may have cut the last line, also of an earlier session; such lines are left out.
     """
-    for line in file.read_text(encoding="utf-8").splitlines():
-        try:
-            yield line, json.loads(line)
-        except json.JSONDecodeError:
-            continue
+    found = []
+    for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
+        with suppress(json.JSONDecodeError):
+            found.append(json.loads(line))
+    return found
 
 
 def provenance(dataset: Dataset) -> dict[str, Any]:
@@ -295,23 +289,16 @@ def git_state(folder: Path) -> dict[str, Any] | None:
         `commit` and `changed`; None without checkout or git.
     """
 
-    def ask(*words: str) -> str | None:
-        try:
-            result = subprocess.run(
-                ["git", "-C", str(folder), *words],
-                capture_output=True,
-                encoding="utf-8",
-                check=True,
-                timeout=10,
-            )
-        except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
-            return None
-        return result.stdout.strip()
+    def ask(*words: str) -> str:
+        command, silent = ["git", "-C", str(folder), *words], subprocess.DEVNULL
+        return subprocess.check_output(command, stderr=silent, encoding="utf-8", timeout=10).strip()
 
-    commit = ask("rev-parse", "HEAD")
-    if commit is None or ask("ls-files", "--error-unmatch", ".") is None:  # installed inside a checkout
+    try:
+        ask("ls-files", "--error-unmatch", ".")  # fails for a package that is installed inside a checkout
+        changes = ask("status", "--porcelain", "--untracked-files=no")
+        return {"commit": ask("rev-parse", "HEAD"), "changed": bool(changes)}
+    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
         return None
-    return {"commit": commit, "changed": bool(ask("status", "--porcelain", "--untracked-files=no"))}
 
 
 def read_costs(run: Path) -> dict[str, Any]:
@@ -327,10 +314,10 @@ def read_costs(run: Path) -> dict[str, Any]:
         "steps" of each stage by name, "seconds" and "cpu_seconds" of all sessions together.
     """
     steps: dict[str, int] = {}
-    for record in _records(run / METRICS_FILE):
+    for record in read_lines(run / METRICS_FILE):
         steps[record["name"]] = max(record["step"], steps.get(record["name"], 0))
     seconds, cpu_seconds, last = 0.0, 0.0, (0.0, 0.0)
-    for record in _records(run / TIMINGS_FILE):
+    for record in read_lines(run / TIMINGS_FILE):
         now = (record["seconds_since_start"], record["cpu_seconds_since_start"])
         if now[0] < last[0]:  # a session begins at 0
             last = (0.0, 0.0)
@@ -338,8 +325,3 @@ def read_costs(run: Path) -> dict[str, Any]:
         cpu_seconds += now[1] - last[1]
         last = now
     return {"steps": steps, "seconds": round(seconds, 1), "cpu_seconds": round(cpu_seconds, 1)}
-
-
-def _records(file: Path) -> list[dict[str, Any]]:
-    """Read a log; empty without one."""
-    return [values for _, values in whole_lines(file)] if file.is_file() else []

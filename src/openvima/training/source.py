@@ -89,9 +89,6 @@ def split_examples(cache: ObjectCache, loader: LoaderConfig) -> tuple[ExampleSou
         DatasetError: There is none to train on.
     """
     hashes = split_hashes(cache.dataset.index)
-    counts = cache.image_counts()
-    bases = np.cumsum(counts) - counts
-    lengths = cache.lengths()
     training = np.flatnonzero(hashes >= loader.validation_fraction)
     kept = np.flatnonzero(hashes < loader.validation_fraction)
     if not len(training):
@@ -99,8 +96,12 @@ def split_examples(cache: ObjectCache, loader: LoaderConfig) -> tuple[ExampleSou
             "there is no demonstration to train on; generate some, or lower loader.validation_fraction."
         )
     kept = np.sort(kept[np.argsort(hashes[kept], kind="stable")[: loader.validation_episodes]])
-    first, second = (ExampleSource(cache, rows, bases, lengths[rows]) for rows in (training, kept))
-    return first, second
+    return _source(cache, training), _source(cache, kept)
+
+
+def _source(cache: ObjectCache, rows: np.ndarray, first_image: int = 0) -> ExampleSource:
+    counts = cache.image_counts()
+    return ExampleSource(cache, rows, np.cumsum(counts) - counts + first_image, cache.lengths()[rows])
 
 
 def repeat_tasks(source: ExampleSource, repeats: Mapping[str, int]) -> ExampleSource:
@@ -128,11 +129,7 @@ def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: i
         source: The demonstrations.
         first_image: Number of its first image: its images follow those of other caches.
     """
-    counts = cache.image_counts()
-    bases = np.cumsum(counts) - counts + first_image
-    lengths = cache.lengths()
-    rows = source.rows[lengths[source.rows, 0] > 0]
-    return ExampleSource(cache, rows, bases, lengths[rows])
+    return _source(cache, source.rows[cache.lengths()[source.rows, 0] > 0], first_image)
 
 
 def read_actions(source: ExampleSource) -> torch.Tensor:

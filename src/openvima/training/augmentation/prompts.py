@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from openvima.data.preprocessed import PreprocessedEpisode
-from openvima.errors import UnknownTaskError
 from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, image_names
 from openvima.policies.tokenizer import UNKNOWN
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
@@ -203,11 +202,8 @@ def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> Prepro
     phrasings = training_paraphrases().get(episode.task)
     if not phrasings:
         return episode
-    try:
-        template = task_spec(episode.task).template
-    except UnknownTaskError:  # demonstrations of a task that is not installed here
-        return episode
-    text = rephrase(episode.prompt.text, template, phrasings[rng.integers(len(phrasings))])
+    template, phrasing = task_spec(episode.task).template, phrasings[rng.integers(len(phrasings))]
+    text = rephrase(episode.prompt.text, template, phrasing)
     return episode if text is None else with_prompt(episode, text)
 
 

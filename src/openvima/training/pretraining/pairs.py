@@ -9,7 +9,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -61,35 +61,21 @@ class AttributeLabels(TensorRecord):
     boxes: torch.Tensor
 
 
-class AttributeLabeller:
-    """Labels placements.
-
-    Args:
-        assets: Source of shapes and textures.
-    """
-
-    def __init__(self, assets: Assets) -> None:
-        self._assets = assets
-        self._colours: dict[str, np.ndarray] = {}
-
-    def __call__(
-        self, placement: Placement, *, is_magnified: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return categories (3,), colours (64,) and lengths (2,) of an object."""
-        vertices = self._vertices(placement)
-        # Ears are drawn after the container of the same seed; they change its outline, and not its profile.
-        body = replace(placement, object=placement.object.replace("random eared", "random"))
-        names = (placement.texture, placement.object, profile(body.object, self._vertices(body)))
-        if placement.texture not in self._colours:
-            self._colours[placement.texture] = _histogram(self._assets.texture(placement.texture))
-        # The mean width of a footprint is twice its mean reach, whatever the middle.
-        lengths = [np.ptp(vertices[:, 2]), 2 * _reach(vertices[:, :2]).mean()]
-        known = np.array(lengths, np.float32) if not is_magnified else np.full(2, np.nan, np.float32)
-        return np.array([name_id(name) for name in names]), self._colours[placement.texture], known
-
-    def _vertices(self, placement: Placement) -> np.ndarray:
-        mesh = self._assets.geometry(placement.object, placement.size, placement.scale).visual
-        return mesh.vertices.reshape(-1, 3)
+def attributes_of_object(
+    placement: Placement, assets: Assets, *, is_magnified: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return categories (3,), colours (64,) and lengths (2,) of an object."""
+    # Ears are drawn after the container of the same seed; they change its outline, and not its profile.
+    body = placement.object.replace("random eared", "random")
+    vertices, of_body = (
+        assets.geometry(name, placement.size, placement.scale).visual.vertices.reshape(-1, 3)
+        for name in (placement.object, body)
+    )
+    names = (placement.texture, placement.object, profile(body, of_body))
+    # The mean width of a footprint is twice its mean reach, whatever the middle.
+    lengths = [np.ptp(vertices[:, 2]), 2 * _reach(vertices[:, :2]).mean()]
+    known = np.array([math.nan, math.nan] if is_magnified else lengths, np.float32)
+    return np.array([name_id(name) for name in names]), _histogram(assets, placement.texture), known
 
 
 def name_id(*names: str) -> np.int64:
@@ -136,8 +122,10 @@ def _rotation(angle_rad: float) -> np.ndarray:
     return np.array([(cos, sin), (-sin, cos)])
 
 
-def _histogram(texture: np.ndarray) -> np.ndarray:
+@lru_cache(4096)
+def _histogram(assets: Assets, name: str) -> np.ndarray:
     """Soft histogram of the colours of a texture, shape (64,), float32; its sum is 1."""
+    texture = assets.texture(name)
     pixels = texture.reshape(-1, 3)[:: max(1, texture.shape[0] * texture.shape[1] // 4096)]
     position = pixels / 255 * (_NUM_LEVELS - 1)
     weights = np.maximum(0, 1 - np.abs(position[..., None] - np.arange(_NUM_LEVELS)))  # (N, 3, levels)
@@ -227,15 +215,14 @@ def render_pairs(
     numbers = parallel.part_of(num_scenes)
     workers = max(1, workers // parallel.num_ranks)
     chunks = [numbers[start : start + _CHUNK] for start in range(0, len(numbers), _CHUNK)]
-    job = partial(_columns_of_scenes, tuple(tasks), seed, assets, augmentation, second_view, with_attributes)
+    job = partial(_pairs_of_scenes, tuple(tasks), seed, assets, augmentation, second_view, with_attributes)
     say = report and (lambda done: report(done, len(numbers), "rendering scenes"))
-    found = {chunk.start: columns for chunk, columns in imap_unordered(job, chunks, workers, report=say)}
-    columns = zip(*(found[chunk.start] for chunk in chunks), strict=True)
-    pairs = _record([np.concatenate(column) for column in columns])
+    found = {chunk.start: rows for chunk, rows in imap_unordered(job, chunks, workers, report=say)}
+    pairs = stack_rows([row for chunk in chunks for row in found[chunk.start]])
     return map_tensors(pairs.to(parallel.device), parallel.rows_of_all)
 
 
-def _columns_of_scenes(
+def _pairs_of_scenes(
     tasks: Sequence[str],
     seed: int,
     assets: str,
@@ -244,11 +231,10 @@ def _columns_of_scenes(
     with_attributes: bool,
     numbers: range,
     count: Callable[..., None],
-) -> list[np.ndarray]:
-    """Render some scenes; return the fields of their pairs, see `pairs_of_scene`, each as one array."""
+) -> list[tuple]:
+    """Render some scenes; return their pairs, see `pairs_of_scene`."""
     pack = load_assets(assets)
     rasteriser = Rasteriser(RandomAppearanceAssets(pack))
-    labeller = AttributeLabeller(rasteriser.assets) if with_attributes else None
     pools = {task: task_spec(task).pool("train") for task in tasks}
     shades = {name for names in pools.values() for name in names.dragged_textures}
     rows: list[tuple] = []
@@ -272,19 +258,15 @@ def _columns_of_scenes(
             number,
             view,
             gray_slots=gray_slots,
-            labeller=labeller,
+            with_attributes=with_attributes,
         )
         count(number - numbers.start + 1)
-    return [np.stack(column) for column in zip(*rows, strict=True)]
+    return rows
 
 
 def stack_rows(rows: Sequence[tuple]) -> Pairs:
     """Stack the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
-    return _record([np.stack(column) for column in zip(*rows, strict=True)])
-
-
-def _record(columns: Sequence[np.ndarray]) -> Pairs:
-    tensors = list(map(torch.from_numpy, columns))
+    tensors = [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
     labels = tensors[_NUM_COLUMNS:]
     return Pairs(*tensors[:_NUM_COLUMNS], attributes=AttributeLabels(*labels) if labels else None)
 
@@ -297,7 +279,7 @@ def pairs_of_scene(
     second_view: tuple[Scene, dict[int, float]] | None = None,
     *,
     gray_slots: Sequence[int] | np.ndarray = (),
-    labeller: AttributeLabeller | None = None,
+    with_attributes: bool = False,
 ) -> list[tuple]:
     """Render a scene and prompt images of its visible objects.
 
@@ -308,7 +290,7 @@ def pairs_of_scene(
         number: Index of the scene.
         second_view: The rearranged scene, and rotations by object id.
         gray_slots: Which objects of the scene have a grayscale prompt image.
-        labeller: Labels what the objects are like; only with a second view.
+        with_attributes: Label what the objects are like; only with a second view.
 
     Returns:
         For each visible object the fields of `Pairs`, without rotations if there is no second view, and
@@ -337,8 +319,10 @@ def pairs_of_scene(
         )
         if second_view:
             pair = (*pair, _rotations(placement, second_view[1][placement.id]))
-            if labeller:
-                labels = (labeller(shown, is_magnified=magnification != 1), labeller(placement))
+            if with_attributes:
+                assets = rasteriser.assets
+                in_prompt = attributes_of_object(shown, assets, is_magnified=magnification != 1)
+                labels = in_prompt, attributes_of_object(placement, assets)
                 boxes = np.stack([image.boxes[:, place] for image, place in images])
                 pair = (*pair, *map(np.stack, zip(*labels, strict=True)), boxes)
         pairs.append(pair)
