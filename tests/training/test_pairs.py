@@ -1,6 +1,7 @@
 """Pairs of contrastive pretraining: where they come from, augmentation, and rotations between their views."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -40,11 +41,14 @@ from openvima.training.pretraining.pairs import (
 )
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
+PLAIN = PretrainingConfig()
+LABELLED = PretrainingConfig(attribute_loss_weight=0.5)
 HARD = PretrainingConfig(appearance_randomization_prob=0.5, hard_negative_prob=0.6)
 
 
-def rendered(num_scenes: int, *, seed: int = 0, tasks: tuple[str, ...] = TASKS, **options) -> Pairs:
-    return render_pairs(tasks, num_scenes=num_scenes, seed=seed, assets="procedural", **options)
+def rendered(num_scenes: int, *, seed=0, tasks=TASKS, augmentation=PLAIN, **options) -> Pairs:
+    config = replace(augmentation, num_scenes=num_scenes)
+    return render_pairs(tasks, config, seed=seed, assets="procedural", **options)
 
 
 def test_pairs_follow_from_the_seed():
@@ -70,8 +74,8 @@ def test_processes_share_the_scenes(monkeypatch):
     one, *parts = (
         rendered(
             5,
+            augmentation=LABELLED,
             second_view=True,
-            with_attributes=True,
             parallel=Parallel(rank, count, torch.device("cpu")),
         )
         for rank, count in ((0, 1), (0, 2), (1, 2))

@@ -158,7 +158,7 @@ def _frames(
     seed: int,
 ) -> "Iterator[FrameSampler]":
     """Frames of a folder, or of temporary demonstrations."""
-    from openvima.data import Dataset
+    from openvima.data import Dataset, GenerateConfig, generate
     from openvima.detector.frames import FrameSampler
 
     problems = []
@@ -182,18 +182,11 @@ def _frames(
         yield FrameSampler(dataset, episodes)
         return
     with tempfile.TemporaryDirectory() as folder:
-        _generate(Path(folder, "demos"), level or LEVEL, frames, seed)
-        yield FrameSampler(Dataset(Path(folder, "demos")))
-
-
-def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
-    """Generate enough episodes for the frames."""
-    from openvima.data import GenerateConfig, generate
-
-    config = GenerateConfig(out=folder, level=level, start_seed=seed)
-    episodes = -(-frames // (FRAMES_PER_EPISODE * len(config.resolved_tasks())))
-    with progress_bar("demonstrations") as report:
-        generate(replace(config, episodes=episodes), report)
+        config = GenerateConfig(out=Path(folder, "demos"), level=level or LEVEL, start_seed=seed)
+        episodes = -(-frames // (FRAMES_PER_EPISODE * len(config.resolved_tasks())))
+        with progress_bar("demonstrations") as report:
+            generate(replace(config, episodes=episodes), report)
+        yield FrameSampler(Dataset(config.out))
 
 
 def _counted(frames: "Iterable[Frame]", total: int, report: Report) -> "Iterator[Frame]":

@@ -116,13 +116,13 @@ class Table:
         self,
         name: str,
         placement: Placement,
+        pose: Pose,
         *,
-        pose: Pose | None = None,
         colour: Colour = PLACE,
         opacity: float = 0.3,
         grow: float = 1.0,
     ) -> viser.MeshHandle:
-        """Add a translucent copy of an object, where it is or at a pose, below the table's root."""
+        """Add a translucent copy of an object at a pose, below the table's root."""
         mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
         centre = mesh.vertices.reshape(-1, 3).mean(axis=0)
         vertices = (mesh.vertices.reshape(-1, 3) - centre) * grow + centre
@@ -136,7 +136,7 @@ class Table:
             cast_shadow=False,
             receive_shadow=False,
         )
-        move(node, placement.pose if pose is None else pose)
+        move(node, pose)
         return node
 
     def _show_objects(self, scene: Scene) -> None:

@@ -198,7 +198,7 @@ class UserPanel:
             action = clicked_action(current.scene, first, first, turn_rad=math.radians(self._turn.value))
             pose = pose_after(placement.pose, action)
             self._help.content = f"Picked {current.scene.describe(placement.id)}. Now click its **place**."
-            self._nodes.append(self.session.table.add_ghost(_GHOST, placement, pose=pose, grow=1.05))
+            self._nodes.append(self.session.table.add_ghost(_GHOST, placement, pose, grow=1.05))
 
     def _forget(self) -> None:
         self._first = None
@@ -321,7 +321,7 @@ class WhyPanel:
             if placement is not None and each.probability >= LEAST_SHOWN:
                 style = {"colour": PICK, "opacity": 0.15 + 0.6 * each.probability, "grow": 1.04}
                 name = f"objects/{placement.id}/why"  # moves with the object
-                self._nodes.append(table.add_ghost(name, placement, pose=Pose((0.0, 0.0, 0.0)), **style))
+                self._nodes.append(table.add_ghost(name, placement, Pose((0.0, 0.0, 0.0)), **style))
                 xy = placement.pose.x, placement.pose.y
                 self._add_label(table, f"pick{placement.id}", percent(each.probability), xy)
         picked = max(explanation.objects, key=lambda each: each.probability, default=None)
@@ -334,7 +334,7 @@ class WhyPanel:
             if placement is not None and run.scene.end_effector == "suction":
                 moved = replace(action, pose1_position=place.position)
                 pose, opacity = pose_after(placement.pose, moved), 0.12 + 0.4 * place.probability
-                ghost = table.add_ghost(f"why/{number}", placement, pose=pose, opacity=opacity)
+                ghost = table.add_ghost(f"why/{number}", placement, pose, opacity=opacity)
                 self._nodes.append(ghost)
 
     def _add_label(self, table: Table, name: str, text: str, position: tuple[float, float]) -> None:

@@ -30,7 +30,6 @@ class BehaviourCloning:
 
     Args:
         learner: The trained module.
-        module: The learner, wrapped for distributed training if needed.
         config: All settings.
         training: Demonstrations to train on.
         validation: Held-out demonstrations.
@@ -43,7 +42,6 @@ class BehaviourCloning:
     def __init__(
         self,
         learner: Learner,
-        module: nn.Module,
         config: TrainingConfig,
         training: ExampleSource,
         validation: ExampleSource,
@@ -52,7 +50,8 @@ class BehaviourCloning:
     ) -> None:
         self.learning_rate = config.optimizer.learning_rate
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
-        self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
+        self._learner, self._module = learner, parallel.wrap(learner)
+        self._config, self._parallel = config, parallel
         self._training, self._validation, self._alternatives = training, validation, alternatives
         self._order = make_order(training, config.loader, config.seed, parallel)
         self._batches: Iterator[list[tuple[Any, int]]] = iter(())
@@ -143,7 +142,9 @@ def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
         return False
     if pretraining.finetune_crop_encoder is not None:
         return not pretraining.finetune_crop_encoder
-    return bool(pretraining.steps or config.crops_from or (config.init_from and encoder.config.appearance_width))
+    return bool(
+        pretraining.steps or config.crops_from or (config.init_from and encoder.config.appearance_width)
+    )
 
 
 def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache], parallel: Parallel) -> None:

@@ -206,10 +206,8 @@ class Trainer:
         self._animate, self._trackers = animate, list[Tracker]()
         data = {"episodes": len(dataset), "index": index_hash(dataset.path), **(demonstrations or {})}
         self.run = RunFolder(
-            config.out,
+            config,
             {"training": config.identity(), "demonstrations": data, "network": learner.description()},
-            force=config.force,
-            keep_every=config.schedule.keep_every,
             is_first=parallel.is_first,
         )
         parallel.wait()

@@ -6,6 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from openvima.catalog.packs import load_assets
 from openvima.data.object_cache import (
     Boxes,
@@ -161,15 +163,13 @@ class _Stages:
     def _pretraining(self) -> Stage:
         assert isinstance(self.learner, PolicyLearner)  # `resolve` has checked it
         network, config = self.learner.network, self.config.pretraining
-        with_attributes = config.attribute_loss_weight > 0
         pairs = render_pairs(
             scene_tasks(self.dataset),
-            num_scenes=config.num_scenes,
+            config,
             seed=self.config.seed,
             assets=self.config.assets,
-            augmentation=config,
-            second_view=compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes,
-            with_attributes=with_attributes,
+            second_view=compares_rotations(network)
+            or max(config.hard_negative_prob, config.attribute_loss_weight) > 0,
             report=self._say,
             parallel=self.parallel,
             workers=self._workers(config.num_scenes // _SCENES_PER_WORKER),
@@ -186,18 +186,15 @@ class _Stages:
             if freezes_crops(learner.network, config):
                 self.trainer.report("encoding the images of all demonstrations")
                 freeze_crops(learner, caches, self.parallel)
-        module = self.parallel.wrap(learner)
         training, validation = self._examples
         alternatives = self._alternatives(training)
-        return BehaviourCloning(learner, module, config, training, validation, self.parallel, alternatives)
+        return BehaviourCloning(learner, config, training, validation, self.parallel, alternatives)
 
     def _alternatives(self, training: ExampleSource) -> tuple[tuple[ExampleSource, float], ...]:
         """Return the training demonstrations as the other caches have them, with their probabilities."""
-        alternatives, num_images = [], int(self._caches[0][0].image_counts().sum())
-        for cache, prob in self._caches[1:]:
-            alternatives.append((alternative_source(cache, training, num_images), prob))
-            num_images += int(cache.image_counts().sum())
-        return tuple(alternatives)
+        num_images = np.cumsum([cache.image_counts().sum() for cache, _ in self._caches])
+        others = zip(self._caches[1:], num_images.tolist(), strict=False)
+        return tuple((alternative_source(cache, training, first), prob) for (cache, prob), first in others)
 
     @cached_property
     def _examples(self) -> tuple[ExampleSource, ExampleSource]:

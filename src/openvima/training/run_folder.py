@@ -47,7 +47,7 @@ from openvima.policies.naming import (
     checkpoint_order,
 )
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
-from openvima.training.config import flatten
+from openvima.training.config import RunConfig, flatten
 from openvima.training.learner import Learner
 from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER
 
@@ -79,31 +79,21 @@ class RunFolder:
     """Reads and writes one run.
 
     Args:
-        path: The folder; created if missing.
+        config: Its `out`, the folder, is created if missing; `force` deletes a run with other settings.
         settings: Plain values that identify the run.
-        force: Delete a run with other settings.
-        keep_every: Steps between permanent checkpoints; None keeps the latest and the best only.
         is_first: Whether this process writes the folder; others only read.
 
     Raises:
         ConfigError: The folder belongs to a run with other settings.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        settings: dict[str, Any],
-        *,
-        force: bool = False,
-        keep_every: int | None = None,
-        is_first: bool = True,
-    ) -> None:
-        self.path, self._keep_every = path, keep_every
-        self.checkpoints = path / CHECKPOINTS_FOLDER
+    def __init__(self, config: RunConfig, settings: dict[str, Any], *, is_first: bool) -> None:
+        self.path, self._keep_every = config.out, config.schedule.keep_every
+        path, self.checkpoints = self.path, self.path / CHECKPOINTS_FOLDER
         if not is_first:
             return
         differing = self._differences(settings)
-        if differing and not force:
+        if differing and not config.force:
             raise ConfigError(
                 f"{path} holds a run with other settings: {'; '.join(differing)}. Give the same settings to "
                 f"continue it, --init-from {path} and another --out to begin with its weights, or --force to "

@@ -86,7 +86,8 @@ def _draw(prob: float, rng: np.random.Generator) -> bool:
     return bool(prob) and bool(rng.random() < prob)  # draws nothing at 0, so that other draws stay
 
 
-EDGE_M = 0.06  # from the edge of the workspace to the middle of an object
+_EDGE_M = 0.06  # from the edge of the workspace to the middle of an object
+_LOW, _HIGH = np.array(WORKSPACE_LOW) + _EDGE_M, np.array(WORKSPACE_HIGH) - _EDGE_M
 _JITTER_M = 0.02
 
 
@@ -112,8 +113,7 @@ def rearrange(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int, 
 def _near(pose: Pose, rng: np.random.Generator) -> tuple[float, float]:
     """Return a position near another one, inside the workspace."""
     x, y = np.array((pose.x, pose.y)) + rng.uniform(-_JITTER_M, _JITTER_M, 2)
-    low, high = np.array(WORKSPACE_LOW) + EDGE_M, np.array(WORKSPACE_HIGH) - EDGE_M
-    x, y = np.clip((x, y), low, high).tolist()
+    x, y = np.clip((x, y), _LOW, _HIGH).tolist()
     return x, y
 
 
@@ -186,9 +186,8 @@ def _other_shade(texture: str, shades: AbstractSet[str]) -> str | None:
 
 def _free_position(placements: Sequence[Placement], rng: np.random.Generator) -> tuple[float, float] | None:
     """Return a position clear of other objects, or None where none was found."""
-    low, high = np.array(WORKSPACE_LOW) + EDGE_M, np.array(WORKSPACE_HIGH) - EDGE_M
     for _ in range(_TRIES):
-        x, y = rng.uniform(low, high).tolist()
+        x, y = rng.uniform(_LOW, _HIGH).tolist()
         distances = [math.hypot(x - p.pose.x, y - p.pose.y) for p in placements]
         if all(d >= _CLEARANCE_M[p.fixed] for d, p in zip(distances, placements, strict=True)):
             return x, y

@@ -18,6 +18,7 @@ from openvima.training.learner import LossAndMetrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.pairs import PROMPT, SCENE, SECOND_VIEW, AttributeLabels, Pairs
 
+TEMPERATURE = 0.07  # of every softmax
 _CHUNK = 256  # pairs that are encoded at a time in validation
 
 
@@ -25,7 +26,6 @@ def contrastive_loss(
     encoder: ObjectEncoder,
     pairs: Pairs,
     *,
-    temperature: float,
     generator: torch.Generator,
     attributes: Attributes | None = None,
     attribute_weight: float = 1.0,
@@ -39,7 +39,6 @@ def contrastive_loss(
     Args:
         encoder: Gets the gradient. Without rotation bins only appearances count.
         pairs: A batch.
-        temperature: Softmax temperature.
         generator: Draws the mixing of channels.
         attributes: Also gets the gradient of its own loss, on labelled pairs; None for none.
         attribute_weight: Weight of that loss.
@@ -54,13 +53,13 @@ def contrastive_loss(
     features = _encode(encoder, pairs.crops, mixing, parallel)
     masks = pairs.masks.permute(1, 2, 0)
     prompt, scene, *second = encoder.embed_appearance(features, masks)
-    loss, accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
+    loss, accuracy = info_nce(prompt, scene, find_matches(pairs))
     metrics = {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
     if pairs.rotations is None:
         return loss, metrics
     rows = pairs.masks[:, SECOND_VIEW].any(dim=1)
     is_same = pairs.appearances[rows, None] == pairs.appearances[None, rows]
-    view_loss, accuracy = info_nce(second[0][rows], scene[rows], is_same, temperature=temperature)
+    view_loss, accuracy = info_nce(second[0][rows], scene[rows], is_same)
     loss = (loss + view_loss) / 2
     metrics |= {"loss/second_view": view_loss.detach(), "second_view_accuracy": accuracy}
     if encoder.config.rotation_bins:
@@ -69,7 +68,7 @@ def contrastive_loss(
         loss, metrics["loss/rotation"] = loss + of_rotations, of_rotations.detach()
         metrics["rotation_accuracy"] = is_correct.float().mean()
     if attributes and pairs.attributes:
-        of_attributes = attribute_loss(attributes, features, masks, pairs.attributes, temperature=temperature)
+        of_attributes = attribute_loss(attributes, features, masks, pairs.attributes)
         loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes.detach()
     return loss, metrics
 
@@ -94,7 +93,7 @@ def find_matches(pairs: Pairs) -> torch.Tensor:
 
 
 def info_nce(
-    first: torch.Tensor, second: torch.Tensor, is_match: torch.Tensor, *, temperature: float
+    first: torch.Tensor, second: torch.Tensor, is_match: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Symmetric InfoNCE loss of K objects, and the accuracy from first to second.
 
@@ -102,9 +101,8 @@ def info_nce(
         first: Embeddings, shape (K, A).
         second: Those of other images of the same objects, shape (K, A).
         is_match: Pairs that are no negatives, shape (K, K), bool.
-        temperature: Softmax temperature.
     """
-    scores = first @ second.T / temperature
+    scores = first @ second.T / TEMPERATURE
     count = len(scores)
     diagonal = torch.eye(count, dtype=torch.bool, device=scores.device)
     # Others of the same appearance are no negatives: they are masked, and the diagonal stays the target.
@@ -223,8 +221,6 @@ def attribute_loss(
     features_3VKF: torch.Tensor,
     masks_3VK: torch.Tensor,
     labels: AttributeLabels,
-    *,
-    temperature: float,
 ) -> torch.Tensor:
     """Supervised contrastive loss, mean over attributes.
 
@@ -236,7 +232,6 @@ def attribute_loss(
         features_3VKF: Crop features in the prompt image, the scene, and the second view.
         masks_3VK: Whether the object is visible there, shape (3, 2, K).
         labels: Of the objects.
-        temperature: Softmax temperature.
 
     Source: SupCon (Khosla et al. 2020), its loss "out", with one positive at a time in the denominator.
     """
@@ -248,7 +243,7 @@ def attribute_loss(
     is_pair_MM = is_seen_M & is_seen_M[:, None]
     different_PMM = different_PMM & is_pair_MM
     same_PMM = same_PMM & is_pair_MM & ~torch.eye(len(is_seen_M), dtype=torch.bool, device=is_seen_M.device)
-    scores_PMM = projected_PMW @ projected_PMW.mT / temperature
+    scores_PMM = projected_PMW @ projected_PMW.mT / TEMPERATURE
     lowest = torch.finfo(scores_PMM.dtype).min
     # Each pair that is alike is one softmax against all that differ, summed as softplus; pairs that are
     # neither alike nor different take no part. Rows (M) are the objects of all three images, one matrix per

@@ -180,18 +180,13 @@ class Pairs(TensorRecord):
         return pairs.select(torch.nonzero(self.masks[:, SECOND_VIEW].any(dim=1))[:, 0])
 
 
-NO_AUGMENTATION = PretrainingConfig()
-
-
 def render_pairs(
     tasks: Sequence[str],
+    config: PretrainingConfig,
     *,
-    num_scenes: int,
     seed: int,
     assets: str,
-    augmentation: PretrainingConfig = NO_AUGMENTATION,
     second_view: bool = False,
-    with_attributes: bool = False,
     report: Report | None = None,
     parallel: Parallel = ONE_PROCESS,
     workers: int = 1,
@@ -202,20 +197,19 @@ def render_pairs(
 
     Args:
         tasks: Tasks whose training partition and layouts are used, in turn.
-        num_scenes: Number of scenes.
+        config: How many scenes, and how they are augmented. With a weight of attributes the pairs are
+            labelled; this needs a second view.
         seed: Seed of the run.
         assets: Asset pack, as `load_assets` takes it.
-        augmentation: Settings that say how the scenes are augmented.
         second_view: Add a rearranged view of each scene.
-        with_attributes: Label what objects are like; needs a second view.
         report: Called with scenes done, scenes in all, and a note.
         parallel: Processes of the run that share the scenes; each returns all pairs, on its device.
         workers: Processes that render for them.
     """
-    numbers = parallel.part_of(num_scenes)
+    numbers = parallel.part_of(config.num_scenes)
     workers = max(1, workers // parallel.num_ranks)
     chunks = [numbers[start : start + _CHUNK] for start in range(0, len(numbers), _CHUNK)]
-    job = partial(_pairs_of_scenes, tuple(tasks), seed, assets, augmentation, second_view, with_attributes)
+    job = partial(_pairs_of_scenes, tuple(tasks), config, seed, assets, second_view)
     say = report and (lambda done: report(done, len(numbers), "rendering scenes"))
     found = {chunk.start: rows for chunk, rows in imap_unordered(job, chunks, workers, report=say)}
     pairs = stack_rows([row for chunk in chunks for row in found[chunk.start]])
@@ -224,11 +218,10 @@ def render_pairs(
 
 def _pairs_of_scenes(
     tasks: Sequence[str],
+    config: PretrainingConfig,
     seed: int,
     assets: str,
-    augmentation: PretrainingConfig,
     second_view: bool,
-    with_attributes: bool,
     numbers: range,
     count: Callable[..., None],
 ) -> list[tuple]:
@@ -245,12 +238,12 @@ def _pairs_of_scenes(
         scene = _retexture(episode.problem.scene, pools[task], np.random.default_rng(episode_seed))
         # A generator of its own, so that the scenes below are the same with any augmentation.
         rng = np.random.default_rng([episode_seed, 1])
-        if prob := augmentation.appearance_randomization_prob:
-            scene = with_random_appearance(scene, prob, rasteriser.assets, rng, augmentation)
-        if prob := augmentation.hard_negative_prob:
+        if prob := config.appearance_randomization_prob:
+            scene = with_random_appearance(scene, prob, rasteriser.assets, rng, config)
+        if prob := config.hard_negative_prob:
             scene = with_hard_negatives(scene, prob, shades, rasteriser.assets, rng)
         view = rearrange(scene, rng) if second_view else None
-        gray_slots = np.flatnonzero(rng.random(len(scene.placements)) < augmentation.grayscale_prob)
+        gray_slots = np.flatnonzero(rng.random(len(scene.placements)) < config.grayscale_prob)
         rows += pairs_of_scene(
             scene,
             _magnifications(episode),
@@ -258,7 +251,7 @@ def _pairs_of_scenes(
             number,
             view,
             gray_slots=gray_slots,
-            with_attributes=with_attributes,
+            with_attributes=config.attribute_loss_weight > 0,
         )
         count(number - numbers.start + 1)
     return rows

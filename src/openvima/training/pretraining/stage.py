@@ -95,7 +95,6 @@ def caption_texts() -> Iterator[str]:
 
 
 _NUM_CAPTIONS, _CAPTION_BATCH = 4096, 64
-_TEMPERATURE = 0.07
 _VALIDATION_SCENES = 0.05  # the last ones
 _PURPOSE = "1-matching"  # hashed into the seed of every batch; changing it would change all runs
 
@@ -159,7 +158,6 @@ class ContrastivePretraining:
         loss, metrics = contrastive_loss(
             self.encoder,
             batch,
-            temperature=_TEMPERATURE,
             generator=generator,
             attributes=self._attributes,
             attribute_weight=config.attribute_loss_weight,
