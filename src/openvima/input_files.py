@@ -137,14 +137,14 @@ def read_text(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputFileError(f"{file} is no UTF-8 text ({error.reason} at byte {error.start}).") from None
 
 
-def read_yaml(file: Path) -> Any:
+def read_yaml(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
     """Read a YAML file of limited size, without code and repeated keys.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
         InputFileError: It is no YAML, or too large.
     """
-    text = read_text(file)
+    text = read_text(file, max_bytes=max_bytes)
     try:
         return yaml.load(text, _StrictLoader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:

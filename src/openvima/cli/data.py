@@ -9,15 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from openvima.cli.options import Folder, Json, Out, Repository
-from openvima.cli.terminal import parse_list, parse_tasks, print_files, print_table, progress_bar
+from openvima.cli.terminal import (
+    Folder,
+    Json,
+    Out,
+    Repository,
+    parse_list,
+    parse_tasks,
+    print_files,
+    print_table,
+    progress_bar,
+)
 from openvima.data.chat_settings import DEFAULT_ENLARGE, ChatView, Points
 from openvima.errors import ConfigError, echo
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-    from openvima.data.verification import Verification
 
 _BAR_WIDTH = 40
 
@@ -64,7 +71,9 @@ def _summary(manifest: dict[str, Any], name: str) -> "Iterator[str | Table]":
         f"{name}: {counts['episodes']:,} episodes, {counts['steps']:,} steps, "
         f"{counts['shards']:,} shards, {summary['file_bytes'] / 1e6:,.1f} MB"
     )
-    yield f"written by {manifest['command']}{_settings(manifest['config'])}"
+    config = {n: v for n, v in manifest["config"].items() if isinstance(v, str | int | float | bool)}
+    settings = "".join(f", {name.replace('_', ' ')} {value}" for name, value in sorted(config.items()))
+    yield f"written by {manifest['command']}{settings}"
     yield ", ".join(f"{name} {versions[name]}" for name in sorted(versions))
     yield f"finished; content {manifest['content_hash']}, licence {manifest['licence']}"
     for name, size in summary["object_caches"].items():
@@ -76,12 +85,6 @@ def _summary(manifest: dict[str, Any], name: str) -> "Iterator[str | Table]":
             yield ""
             yield title
             yield from _bars(counts)
-
-
-def _settings(config: dict[str, Any]) -> str:
-    """Format scalar settings in one line."""
-    plain = {name: value for name, value in config.items() if isinstance(value, str | int | float | bool)}
-    return "".join(f", {name.replace('_', ' ')} {value}" for name, value in sorted(plain.items()))
 
 
 def _task_table(tasks: dict[str, dict[str, Any]]) -> "Table":
@@ -148,22 +151,20 @@ def verify(
         found = verify_folder(folder, config, report)
     if as_json:
         print(json.dumps(found.record(), indent=2, ensure_ascii=False))
-    else:
-        print("\n".join(_text(found)))
-    return 0 if found.is_clean else 1
-
-
-def _text(found: "Verification") -> Iterator[str]:
-    yield (
+        return 0 if found.is_clean else 1
+    print(
         f"{found.folder}: {found.num_shards:,} shards, {found.num_episodes:,} episodes compared with their "
         f"hashes, {found.num_replayed:,} replayed"
     )
-    yield from (f"note: {note}" for note in found.notes)
+    for note in found.notes:
+        print(f"note: {note}")
     count = len(found.problems)
-    yield "no problems" if found.is_clean else f"{count} problem{'s' * (count > 1)}"
+    print("no problems" if found.is_clean else f"{count} problem{'s' * (count > 1)}")
     for problem in found.problems:
-        yield f"  {problem.file}: {problem.cause}"
-    yield from (f"  → {remedy}" for remedy in sorted({problem.remedy for problem in found.problems}))
+        print(f"  {problem.file}: {problem.cause}")
+    for remedy in sorted({problem.remedy for problem in found.problems}):
+        print(f"  → {remedy}")
+    return 0 if found.is_clean else 1
 
 
 def sample(

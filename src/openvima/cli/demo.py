@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment, Task
+from openvima.cli.terminal import DEFAULT_ENVIRONMENT, Environment, Task
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
 
 if TYPE_CHECKING:

@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.cli.options import Json, Out
-from openvima.cli.terminal import Report, progress_bar, refuse_existing
+from openvima.cli.terminal import Json, Out, Report, progress_bar, refuse_existing
 from openvima.errors import ConfigError
 from openvima.policies.base import require_torch, torch_threads
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
 if TYPE_CHECKING:
-    from openvima.detector.evaluation import CocoEvaluation
     from openvima.detector.frames import Frame, FrameSampler
 
 Folder = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DETECTOR")]
@@ -86,7 +84,11 @@ def evaluate(
         name = str(detector or "bundled")
         print(json.dumps({"detector": name, **source, "seed": seed, **asdict(result)}))
     else:
-        _print_result(result)
+        print(f"{result.objects:,} objects in {result.frames:,} frames")
+        print(f"{'':<8}{'AP':>8}{'AP50':>8}{'AP75':>8}{'recall':>8}")
+        for name, metrics in (("boxes", result.boxes), ("masks", result.masks)):
+            cells = (metrics.ap, metrics.ap50, metrics.ap75, metrics.recall)
+            print(f"{name:<8}" + "".join(f"{cell:>8.3f}" for cell in cells))
 
 
 def show(
@@ -194,14 +196,6 @@ def _counted(frames: "Iterable[Frame]", total: int, report: Report) -> "Iterator
         report(number, total, "")
         yield frame
     report(total, total, "")
-
-
-def _print_result(result: "CocoEvaluation") -> None:
-    print(f"{result.objects:,} objects in {result.frames:,} frames")
-    print(f"{'':<8}{'AP':>8}{'AP50':>8}{'AP75':>8}{'recall':>8}")
-    for name, metrics in (("boxes", result.boxes), ("masks", result.masks)):
-        cells = (metrics.ap, metrics.ap50, metrics.ap75, metrics.recall)
-        print(f"{name:<8}" + "".join(f"{cell:>8.3f}" for cell in cells))
 
 
 COMMANDS = {"train": train, "evaluate": evaluate, "show": show, "convert": convert}

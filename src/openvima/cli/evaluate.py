@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment, Json
 from openvima.cli.terminal import (
+    DEFAULT_ENVIRONMENT,
+    Environment,
+    Json,
     parse_list,
     parse_shard_range,
     print_left_out,

@@ -1,6 +1,7 @@
 """The `openvima` program: dispatches to the module of the verb and reports errors in one line."""
 
 import importlib
+import io
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -9,7 +10,6 @@ from typing import Any
 
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE, NO_SPACE
-from openvima.cli.terminal import accept_any_text
 from openvima.errors import (
     OpenVimaError,
     Terminated,
@@ -68,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit status: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted, 143 ended by SIGTERM.
     """
-    accept_any_text()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # letters that their encoding lacks
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in (*_HELP, "help"):
         verbs = "\n".join(f"  {verb:<15} {summary}" for verb, summary in VERBS.items())

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from openvima.cli.options import Json
-from openvima.cli.terminal import parse_list
+from openvima.cli.terminal import Json, parse_list
 
 
 def main(

@@ -5,7 +5,7 @@ import os
 import sys
 from dataclasses import asdict
 
-from openvima.cli.options import Policy
+from openvima.cli.terminal import Policy
 
 
 def main(

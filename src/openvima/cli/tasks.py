@@ -1,10 +1,8 @@
 """`openvima tasks`: list the tasks."""
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from openvima.cli.options import Task
-from openvima.cli.terminal import print_table
+from openvima.cli.terminal import Task, print_table
 from openvima.tasks.options import option_descriptions
 from openvima.tasks.registry import oracle_record
 
@@ -38,6 +36,8 @@ def main(
     columns = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
     table = Table(*columns, title=f"{len(specs)} tasks", show_lines=True)
     for spec in specs:
+        record = oracle_record(spec.name).values()
+        episodes, solved = (sum(level[name] for level in record) for name in ("episodes", "successes"))
         table.add_row(
             spec.name,
             ", ".join(spec.families).replace("_", " "),
@@ -45,7 +45,7 @@ def main(
             spec.end_effector,
             " ".join(spec.levels),
             f"{spec.oracle_max_steps} + 2",
-            _percent(oracle_record(spec.name)),
+            f"{100 * solved / episodes:.2f}" if episodes else "-",
         )
     print_table(table)
     print("steps: the oracle's limit, and what a policy may add to it")
@@ -78,9 +78,3 @@ def _shown(default: object) -> str:
     if isinstance(default, tuple | list):
         return "+".join(map(str, default))
     return "" if default is None else str(default)
-
-
-def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
-    episodes = sum(level["episodes"] for level in record.values())
-    solved = sum(level["successes"] for level in record.values())
-    return f"{100 * solved / episodes:.2f}" if episodes else "-"

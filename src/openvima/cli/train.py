@@ -64,7 +64,15 @@ COMMON = (
 )
 
 # Options that change the defaults of others.
-_DECIDING = ("preset", "init_from", "crops_from", "schedule.steps", "schedule.epochs", "model.image_tokens", "model.head")
+_DECIDING = (
+    "preset",
+    "init_from",
+    "crops_from",
+    "schedule.steps",
+    "schedule.epochs",
+    "model.image_tokens",
+    "model.head",
+)
 
 
 def run(words: Sequence[str]) -> None:
@@ -153,6 +161,8 @@ def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: st
     Returns:
         The run folder.
     """
+    import torch
+
     from openvima.training import train
     from openvima.training.parallel import start_peers
 
@@ -161,7 +171,9 @@ def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: st
     if not log.handlers:
         log.addHandler(_Lines())
     is_first = os.environ.get("RANK", "0") == "0"
-    others = _num_processes(config) - 1 if "WORLD_SIZE" not in os.environ else 0
+    others = 0 if "WORLD_SIZE" in os.environ else config.runtime.processes - 1
+    if config.runtime.device in ("auto", "cuda") and (num_gpus := torch.cuda.device_count()):
+        others = min(others, num_gpus - 1)  # at most one on each
     with (
         start_peers(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
         progress_bar(label) if is_first else nullcontext() as report,
@@ -176,16 +188,6 @@ class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         prefix = "openvima: warning: " if record.levelno >= logging.WARNING else ""
         print(prefix + record.getMessage(), file=sys.stderr)
-
-
-def _num_processes(config: "TrainingConfig") -> int:
-    """Return how many processes to start: on GPUs at most one on each."""
-    import torch
-
-    runtime = config.runtime
-    if runtime.device in ("auto", "cuda") and (num_gpus := torch.cuda.device_count()):
-        return min(runtime.processes, num_gpus)
-    return runtime.processes
 
 
 def _rollout(config: "TrainingConfig") -> "OnlineEval":

@@ -38,7 +38,7 @@ from openvima.serving.protocol import (
 from openvima.tasks.prompts import check_prompts, describe
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 _MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
@@ -325,7 +325,8 @@ class _PolicyServer:
                 close_timeout=CLOSE_S,
                 logger=_TRANSPORT_LOG,
             ) as server:
-                ready(_address(server))
+                host, port = next(iter(server.sockets)).getsockname()[:2]
+                ready(f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}")
                 await stop.wait()
 
     def _admit(self, connection: "ServerConnection", request: "Request") -> "Response | None":
@@ -381,11 +382,6 @@ def _set_threads(num_threads: int) -> None:
     """Runs in the thread that computes: torch keeps the number for each thread."""
     if (torch := sys.modules.get("torch")) is not None:  # else no policy can use it
         torch.set_num_threads(num_threads)
-
-
-def _address(server: "Server") -> str:
-    host, port = next(iter(server.sockets)).getsockname()[:2]
-    return f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
 
 
 def _name(connection: "ServerConnection") -> str:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -15,12 +14,11 @@ from openvima.policies.build import PolicyConfig, appearance_width, build_networ
 from openvima.policies.checkpoint import load_network
 from openvima.policies.naming import find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.presets import PRESETS, own_policies, preset
 from openvima.policies.processor import Processor
 from openvima.policies.sizes import t5_name
 from openvima.policies.t5 import load_t5, tokenizer_for
-from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import image_tokens, with_variant
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
@@ -114,7 +112,8 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
     ):
         raise ConfigError(
             "pretraining.finetune_crop_encoder is False, but nothing has trained the crop encoder; set "
-            "pretraining.steps, crops_from or init_from, or train it with pretraining.finetune_crop_encoder True."
+            "pretraining.steps, crops_from or init_from, or train it with pretraining.finetune_crop_encoder "
+            "True."
         )
     attributes, weight = getattr(sizes, "attributes", None), config.pretraining.attribute_loss_weight
     if weight and not attributes:
@@ -179,7 +178,13 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         _check_sizes(sizes, initial.config, config.init_from)
         sizes = replace(sizes, prompt=initial.config.prompt)
     if sizes.prompt.tokenizer == "t5":
-        tokenizer = _t5_tokenizer(config, sizes, stored)
+        where = config.t5 or stored
+        if where is None:
+            raise ConfigError(
+                f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to "
+                "the folder that holds it, or to 't5-base'. Its weights are then not read."
+            )
+        tokenizer = tokenizer_for(sizes.prompt, where)
         for text in texts:  # a word that T5 lacks is named before the first step
             tokenizer.encode(text)
     else:
@@ -197,22 +202,10 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
     return PolicyLearner(network, Processor(*sizes.inputs, tokenizer), config.augmentation)
 
 
-def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | None) -> Tokenizer:
-    where = config.t5 or stored
-    if where is None:
-        raise ConfigError(
-            f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to the "
-            "folder that holds it, or to 't5-base'. Its weights are then not read."
-        )
-    return tokenizer_for(sizes.prompt, where)
-
-
 def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
     """Compare attributes as the weights to begin with have learned to, which is no matter of size."""
-    if isinstance(ours, PointerConfig) and isinstance(theirs, PointerConfig):
-        if ours.attributes and theirs.attributes:
-            return replace(ours, attributes=replace(ours.attributes, exclusive=theirs.attributes.exclusive))
-    return ours
+    here, there = (getattr(sizes, "attributes", None) for sizes in (ours, theirs))
+    return replace(ours, attributes=replace(here, exclusive=there.exclusive)) if here and there else ours
 
 
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:

@@ -20,6 +20,7 @@ import torch
 from torch import nn
 
 from openvima.atomic_io import folder_lock
+from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, Terminated
 from openvima.multiprocess import Report
@@ -28,7 +29,7 @@ from openvima.policies.naming import METRICS_FILE
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
 from openvima.training.parallel import Parallel, join_processes, load_named_state, named_state
-from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, RunFolder, index_hash, provenance
+from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, RunFolder, provenance
 from openvima.training.trackers import Tracker, open_trackers
 from openvima.video.encoder import Animation
 
@@ -204,7 +205,12 @@ class Trainer:
         self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel
         self._on_report, self._rollout, self._rollout_every = report, rollout, rollout_every
         self._animate, self._trackers = animate, list[Tracker]()
-        data = {"episodes": len(dataset), "index": index_hash(dataset.path), **(demonstrations or {})}
+        index = (dataset.path / INDEX_NAME).read_bytes()
+        data = {
+            "episodes": len(dataset),
+            "index": hashlib.blake2b(index, digest_size=16).hexdigest(),
+            **(demonstrations or {}),
+        }
         self.run = RunFolder(
             config,
             {"training": config.identity(), "demonstrations": data, "network": learner.description()},
@@ -253,13 +259,16 @@ class Trainer:
         if self.progress.step:
             load_named_state(self.learner, optimizer, self.run.optimizer_state())
         self._last = (self.progress.step, time.monotonic())
+        schedule = self.config.schedule
+        # Checkpoints are due at multiples of these, and at the end.
+        periods = [*filter(None, (schedule.checkpoint_every, schedule.keep_every, self._rollout_every))]
         sigterms: list[int] = []
         with exchange_sigterm(_raise_terminated, lambda number, frame: sigterms.append(number)):
             window: list[Metrics] = []
             for step in range(self.progress.step, num_steps):
                 window.append(self._step(stage, optimizer, step, num_steps))
                 self.progress = replace(self.progress, step=step + 1)
-                saves = self._saves_at(step + 1) or step + 1 == num_steps
+                saves = step + 1 == num_steps or any((step + 1) % every == 0 for every in periods)
                 logs = saves or (step + 1) % LOG_EVERY == 0
                 # Several processes stop after the same step, and so ask each other, when they log anyway.
                 may_end = logs or self.parallel.num_ranks == 1
@@ -271,14 +280,6 @@ class Trainer:
                     self._save(stage, optimizer, validates=saves)
                 if ends:
                     raise Terminated
-
-    def _saves_at(self, step: int) -> bool:
-        """Whether a checkpoint is due."""
-        schedule = self.config.schedule
-        return any(
-            every and step % every == 0
-            for every in (schedule.checkpoint_every, schedule.keep_every, self._rollout_every)
-        )
 
     def _step(self, stage: Stage, optimizer: torch.optim.Optimizer, step: int, num_steps: int) -> Metrics:
         config = self.config

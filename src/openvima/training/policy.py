@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -94,6 +93,10 @@ def train(
     boxes = None
     if config.loader.boxes is not None:
         boxes = plugged_boxes(config.loader.boxes, fraction=config.loader.detected_fraction)
+    weights = filter(None, (config.init_from, config.crops_from))
+    held_out = set(held_out_demonstrations(dataset)).union(*map(held_out_data, weights))
+    # What identifies the demonstrations besides their index.
+    origin = {"boxes": boxes and boxes.name, "held_out": sorted(held_out)}
     with open_run(config) as parallel:
         with_captions = config.pretraining.attribute_loss_weight > 0
         texts = training_texts(dataset, config.augmentation, with_captions=with_captions)
@@ -115,7 +118,7 @@ def train(
             rollout=rollout,
             rollout_every=config.rollout.every,
             animate=animate,
-            demonstrations=_origin(config, dataset, boxes),
+            demonstrations={name: what for name, what in origin.items() if what},
         )
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
 
@@ -131,13 +134,6 @@ def _variants(config: TrainingConfig, boxes: Boxes | None) -> list[tuple[Variant
     detected = [(Variant(boxes), detected_prob)] if detected_prob > 0 else []
     rerendered = [(Variant(appearance=0), loader.rerendered_prob)] if loader.rerendered_prob else []
     return [*stored, *detected, *rerendered]
-
-
-def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:
-    """Return what identifies the demonstrations besides their index."""
-    weights = filter(None, (config.init_from, config.crops_from))
-    seen = set(held_out_demonstrations(dataset)).union(*map(held_out_data, weights))
-    return {**({"boxes": boxes.name} if boxes else {}), **({"held_out": sorted(seen)} if seen else {})}
 
 
 @dataclass(eq=False)
@@ -187,14 +183,12 @@ class _Stages:
                 self.trainer.report("encoding the images of all demonstrations")
                 freeze_crops(learner, caches, self.parallel)
         training, validation = self._examples
-        alternatives = self._alternatives(training)
+        num_images = np.cumsum([cache.image_counts().sum() for cache in caches])
+        alternatives = tuple(  # the training demonstrations as the other caches have them
+            (alternative_source(cache, training, first), prob)
+            for (cache, prob), first in zip(self._caches[1:], num_images.tolist(), strict=False)
+        )
         return BehaviourCloning(learner, config, training, validation, self.parallel, alternatives)
-
-    def _alternatives(self, training: ExampleSource) -> tuple[tuple[ExampleSource, float], ...]:
-        """Return the training demonstrations as the other caches have them, with their probabilities."""
-        num_images = np.cumsum([cache.image_counts().sum() for cache, _ in self._caches])
-        others = zip(self._caches[1:], num_images.tolist(), strict=False)
-        return tuple((alternative_source(cache, training, first), prob) for (cache, prob), first in others)
 
     @cached_property
     def _examples(self) -> tuple[ExampleSource, ExampleSource]:

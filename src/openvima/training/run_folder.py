@@ -34,7 +34,7 @@ from openvima.atomic_io import (
     sync_file,
     sync_files,
 )
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
+from openvima.data.manifest import MANIFEST_NAME
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, InputFileError, differences
 from openvima.imports import versions_of
@@ -100,7 +100,10 @@ class RunFolder:
                 "delete it."
             )
         if differing:
-            self._clear()
+            for folder in (self.checkpoints, path / BOARD_FOLDER, path / WANDB_FOLDER):
+                shutil.rmtree(folder, ignore_errors=True)
+            for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
+                (path / name).unlink(missing_ok=True)
         # First, since a folder without it, perhaps of a run that was killed at once, is refused.
         atomic_write_file(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
         self.checkpoints.mkdir(parents=True, exist_ok=True)
@@ -220,12 +223,6 @@ class RunFolder:
             return [str(error).rstrip(".")]
         return differences(flatten(old), flatten(settings))
 
-    def _clear(self) -> None:
-        for folder in (self.checkpoints, self.path / BOARD_FOLDER, self.path / WANDB_FOLDER):
-            shutil.rmtree(folder, ignore_errors=True)
-        for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
-            (self.path / name).unlink(missing_ok=True)
-
 
 def read_lines(file: Path) -> list[dict[str, Any]]:
     """Read `METRICS_FILE`, `TIMINGS_FILE` or `SESSIONS_FILE`; empty without a file.
@@ -265,11 +262,6 @@ def held_out_demonstrations(dataset: Dataset) -> list[str]:
         for row in found.aggregate([]).to_pylist()
         if row["level"] != "train" or row["domain"] == "eval"
     )
-
-
-def index_hash(folder: Path) -> str:
-    """Return a hash of the index of a folder of demonstrations."""
-    return hashlib.blake2b((folder / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:

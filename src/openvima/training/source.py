@@ -35,19 +35,9 @@ def open_demonstrations(
         ConfigError: There is no such task, or none is left.
         DatasetError: The folder is no finished data set, or holds demonstrations that are held out.
     """
-    dataset = _open_tasks(folder, loader or LoaderConfig())
-    if (found := held_out_demonstrations(dataset)) and not allow_heldout:
-        raise DatasetError(
-            f"{folder} holds demonstrations for evaluation only: {', '.join(found)}. Train on level train, "
-            "leave these tasks out, or give --allow-heldout, which is recorded with the policy."
-        )
-    return dataset
-
-
-def _open_tasks(folder: Path, loader: LoaderConfig) -> Dataset:
-    dataset, excluded = Dataset(folder), loader.excluded_tasks
+    loader, dataset = loader or LoaderConfig(), Dataset(folder)
     present = sorted(dataset.manifest["tasks"])
-    known = {*present, *list_tasks()}
+    known, excluded = {*present, *list_tasks()}, loader.excluded_tasks
     named = {"exclude_tasks": excluded, "first_tasks": loader.early_tasks, "repeat_tasks": loader.repeats}
     for setting, tasks in named.items():
         if problems := [
@@ -56,13 +46,19 @@ def _open_tasks(folder: Path, loader: LoaderConfig) -> Dataset:
             if name not in known
         ]:
             raise ConfigError(f"loader.{setting}: {' '.join(problems)}")
-    kept = [task for task in present if task not in excluded]
-    if not kept:
-        raise ConfigError(
-            f"loader.exclude_tasks is {', '.join(excluded)}; {dataset.path} has no other task, only "
-            f"{', '.join(present)}."
+    if excluded:
+        if not (kept := [task for task in present if task not in excluded]):
+            raise ConfigError(
+                f"loader.exclude_tasks is {', '.join(excluded)}; {dataset.path} has no other task, only "
+                f"{', '.join(present)}."
+            )
+        dataset = Dataset(folder, tasks=kept)
+    if (found := held_out_demonstrations(dataset)) and not allow_heldout:
+        raise DatasetError(
+            f"{folder} holds demonstrations for evaluation only: {', '.join(found)}. Train on level train, "
+            "leave these tasks out, or give --allow-heldout, which is recorded with the policy."
         )
-    return Dataset(folder, tasks=kept) if excluded else dataset
+    return dataset
 
 
 def check_scenes(dataset: Dataset) -> None:

@@ -66,20 +66,18 @@ def _with_random_shape(
     is_container = placement.object in _CONTAINERS
     if not is_container and placement.object not in _MOVABLE:
         return placement
-    name = random_name(_random_kind(is_container=is_container, settings=settings, rng=rng), rng)
+    if is_container and _draw(settings.grating_prob, rng):
+        kind = "grating"
+    elif is_container:
+        kind = "eared container" if _draw(settings.eared_prob, rng) else "container"
+    elif _draw(settings.ring_and_block_prob, rng):
+        kind = "ring" if rng.random() < 0.5 else "block"
+    else:
+        kind = "shape"
+    name = random_name(kind, rng)
     if common is not None and is_container:
         name = common.setdefault(placement.object, name)
     return at_rest(replace(placement, object=name), assets)
-
-
-def _random_kind(*, is_container: bool, settings: PretrainingConfig, rng: np.random.Generator) -> str:
-    if is_container:
-        if _draw(settings.grating_prob, rng):
-            return "grating"
-        return "eared container" if _draw(settings.eared_prob, rng) else "container"
-    if not _draw(settings.ring_and_block_prob, rng):
-        return "shape"
-    return "ring" if rng.random() < 0.5 else "block"
 
 
 def _draw(prob: float, rng: np.random.Generator) -> bool:
@@ -100,21 +98,18 @@ def rearrange(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int, 
     rotations = {p.id: rng.uniform(0, 2 * math.pi) for p in scene.placements}
     movable = [p for p in scene.placements if not p.fixed]
     positions = {p.id: (p.pose.x, p.pose.y) for p in scene.placements}
+    swapped = dict[int, tuple[float, float]]()
     if rng.random() < 0.5:
-        others = [movable[index].pose for index in rng.permutation(len(movable))]
-        positions |= {p.id: _near(other, rng) for p, other in zip(movable, others, strict=True)}
+        for placement, index in zip(movable, rng.permutation(len(movable)), strict=True):
+            near = np.array(positions[movable[index].id]) + rng.uniform(-_JITTER_M, _JITTER_M, 2)
+            x, y = np.clip(near, _LOW, _HIGH).tolist()  # inside the workspace
+            swapped[placement.id] = x, y
+    positions |= swapped
     poses = {
         p.id: Pose((*positions[p.id], p.pose.z), p.pose.rotated(rotations[p.id]).quaternion)
         for p in scene.placements
     }
     return scene.with_poses(poses), rotations
-
-
-def _near(pose: Pose, rng: np.random.Generator) -> tuple[float, float]:
-    """Return a position near another one, inside the workspace."""
-    x, y = np.array((pose.x, pose.y)) + rng.uniform(-_JITTER_M, _JITTER_M, 2)
-    x, y = np.clip((x, y), _LOW, _HIGH).tolist()
-    return x, y
 
 
 _KINDS = ("height", "shade", "texture", "shape")

@@ -50,7 +50,10 @@ def contrastive_loss(
     Source: InfoNCE (van den Oord et al. 2018), symmetric as in CLIP.
     """
     mixing = draw_channel_mixing(generator).to(pairs.crops.device)
-    features = _encode(encoder, pairs.crops, mixing, parallel)
+    crops_SKVCYX = pairs.crops.transpose(0, 1).contiguous()
+    mixed = torch.einsum("cd,skvdyx->skvcyx", mixing, crops_SKVCYX.to(mixing.dtype))
+    features_NF = parallel.in_parts(encoder.encode_images, mixed.flatten(0, 2))
+    features = features_NF.unflatten(0, crops_SKVCYX.shape[:3]).transpose(1, 2)  # (S, V, K, F)
     masks = pairs.masks.permute(1, 2, 0)
     prompt, scene, *second = encoder.embed_appearance(features, masks)
     loss, accuracy = info_nce(prompt, scene, find_matches(pairs))
@@ -71,16 +74,6 @@ def contrastive_loss(
         of_attributes = attribute_loss(attributes, features, masks, pairs.attributes)
         loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes.detach()
     return loss, metrics
-
-
-def _encode(
-    encoder: ObjectEncoder, crops_KSVCYX: torch.Tensor, mixing: torch.Tensor, parallel: Parallel
-) -> torch.Tensor:
-    """Encode crops of S images of K objects, with mixed channels, to features (S, V, K, F)."""
-    crops_SKVCYX = crops_KSVCYX.transpose(0, 1).contiguous()
-    mixed = torch.einsum("cd,skvdyx->skvcyx", mixing, crops_SKVCYX.to(mixing.dtype))
-    features_NF = parallel.in_parts(encoder.encode_images, mixed.flatten(0, 2))
-    return features_NF.unflatten(0, crops_SKVCYX.shape[:3]).transpose(1, 2)
 
 
 def find_matches(pairs: Pairs) -> torch.Tensor:

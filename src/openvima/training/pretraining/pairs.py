@@ -23,7 +23,7 @@ from openvima.multiprocess import Report, imap_unordered
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.policies.nn.layers import TensorRecord, map_tensors
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
-from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
+from openvima.scene import ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
 from openvima.training.augmentation.scenes import (
     rearrange,
@@ -244,9 +244,11 @@ def _pairs_of_scenes(
             scene = with_hard_negatives(scene, prob, shades, rasteriser.assets, rng)
         view = rearrange(scene, rng) if second_view else None
         gray_slots = np.flatnonzero(rng.random(len(scene.placements)) < config.grayscale_prob)
+        fills = [fill for _, fill in episode.problem.prompt.images]
+        shown = [fill for fill in fills if isinstance(fill, ObjectImage)]
         rows += pairs_of_scene(
             scene,
-            _magnifications(episode),
+            {image.placement.object: image.magnification for image in shown},
             rasteriser,
             number,
             view,
@@ -299,7 +301,9 @@ def pairs_of_scene(
         is_gray = slot in gray_slots
         shown = to_grayscale(placement) if is_gray else placement
         magnification = magnifications.get(placement.object, 1.0)
-        images = [(_prompt_image(shown, magnification, rasteriser), 0), *((view, slot) for view in views)]
+        prompt = rasteriser.prompt(Prompt("{object}", (("object", ObjectImage(shown, magnification)),)))
+        in_prompt = observe_prompt_image(prompt.images["object"])
+        images = [(in_prompt, 0), *((view, slot) for view in views)]
         # Hard negatives, which come with a second view, may be stretched.
         scale = placement.scale if second_view else ()
         pair = (
@@ -311,21 +315,21 @@ def pairs_of_scene(
             np.bool_(is_gray),
         )
         if second_view:
-            pair = (*pair, _rotations(placement, second_view[1][placement.id]))
+            from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad
+            rotations = np.array([from_prompt, second_view[1][placement.id]], dtype=np.float32)
+            if not has_visible_heading(placement.object):
+                rotations[:] = np.nan
+            pair = (*pair, rotations)
             if with_attributes:
                 assets = rasteriser.assets
-                in_prompt = attributes_of_object(shown, assets, is_magnified=magnification != 1)
-                labels = in_prompt, attributes_of_object(placement, assets)
+                labels = (
+                    attributes_of_object(shown, assets, is_magnified=magnification != 1),
+                    attributes_of_object(placement, assets),
+                )
                 boxes = np.stack([image.boxes[:, place] for image, place in images])
                 pair = (*pair, *map(np.stack, zip(*labels, strict=True)), boxes)
         pairs.append(pair)
     return pairs
-
-
-def _rotations(placement: Placement, to_second_view: float) -> np.ndarray:
-    from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad
-    rotations = np.array([from_prompt, to_second_view], dtype=np.float32)
-    return rotations if has_visible_heading(placement.object) else np.full_like(rotations, np.nan)
 
 
 def _retexture(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
@@ -346,20 +350,8 @@ def _retexture(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
     return replace(scene, placements=tuple(placements))
 
 
-def _magnifications(episode: Episode) -> dict[str, float]:
-    """Return the magnification of each object in prompts of this task."""
-    images = [fill for _, fill in episode.problem.prompt.images if isinstance(fill, ObjectImage)]
-    return {image.placement.object: image.magnification for image in images}
-
-
 def _observe(scene: Scene, rasteriser: Rasteriser) -> ObjectViews:
     views = rasteriser.scene(scene)
     rgb = {name: image.rgb for name, image in views.items()}
     segm = {name: image.segm for name, image in views.items()}
     return extract_objects(rgb, segm, [placement.id for placement in scene.placements])
-
-
-def _prompt_image(placement: Placement, magnification: float, rasteriser: Rasteriser) -> ObjectViews:
-    image = ObjectImage(placement, magnification)
-    prompt = rasteriser.prompt(Prompt("{object}", (("object", image),)))
-    return observe_prompt_image(prompt.images["object"])
