@@ -21,7 +21,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, one_line, unknown_words
 from openvima.imports import import_extra
@@ -51,11 +51,8 @@ Report = Callable[[int, int, str], None]
 """Called with the number of things done, that of all, and a note."""
 
 
-class Job(Protocol):
-    """A function of one item that calls `count` with the number of things done so far."""
-
-    def __call__(self, item: Any, count: Callable[[int], None], /) -> Any:
-        """Run the job."""
+Job = Callable[[Any, Callable[[int], None]], Any]
+"""A function of one item that calls its second argument with the number of things done so far."""
 
 
 def imap_unordered(

@@ -15,11 +15,6 @@ from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConf
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
 from openvima.tasks import sample_episode
-from openvima.training.augmentation.crops import (
-    draw_channel_mixing,
-    with_horizontal_flips,
-    with_occlusion,
-)
 from openvima.training.augmentation.scenes import (
     rearrange,
     with_hard_negatives,
@@ -28,8 +23,8 @@ from openvima.training.augmentation.scenes import (
 from openvima.training.config import PretrainingConfig
 from openvima.training.loop import step_generator
 from openvima.training.parallel import Parallel
-from openvima.training.pretraining import pairs as pairs_module
 from openvima.training.pretraining.losses import (
+    draw_channel_mixing,
     is_rotation_correct,
     rotation_loss,
 )
@@ -39,6 +34,7 @@ from openvima.training.pretraining.pairs import (
     render_pairs,
     stack_rows,
 )
+from openvima.training.pretraining.stage import with_horizontal_flips, with_occlusion
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
 PLAIN = PretrainingConfig()
@@ -174,13 +170,13 @@ def encoder() -> ObjectEncoder:
 def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
     """Pairs show training objects in textures of their role, and random ones where it is asked for."""
     shown = []
-    original = pairs_module._prompt_image
+    original = Rasteriser.prompt
 
-    def spy(placement, *rest):
-        shown.append(placement)
-        return original(placement, *rest)
+    def spy(self, prompt):
+        shown.append(prompt.images[0][1].placement)
+        return original(self, prompt)
 
-    monkeypatch.setattr(pairs_module, "_prompt_image", spy)
+    monkeypatch.setattr(Rasteriser, "prompt", spy)
     tasks = (*TASKS, "rotate", "sweep_without_exceeding")
     pairs = rendered(30, seed=3, tasks=tasks, augmentation=augmentation, second_view=augmentation is HARD)
     pools = [pool(task, "train") for task in tasks]

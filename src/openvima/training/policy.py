@@ -38,7 +38,7 @@ from openvima.training.loop import (
 )
 from openvima.training.parallel import Parallel
 from openvima.training.pretraining.pairs import render_pairs
-from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
+from openvima.training.pretraining.stage import ContrastivePretraining
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
     alternative_source,
@@ -159,13 +159,13 @@ class _Stages:
     def _pretraining(self) -> Stage:
         assert isinstance(self.learner, PolicyLearner)  # `resolve` has checked it
         network, config = self.learner.network, self.config.pretraining
+        rotation_bins = network.object_encoder.config.rotation_bins if network.object_encoder else 0
         pairs = render_pairs(
             scene_tasks(self.dataset),
             config,
             seed=self.config.seed,
             assets=self.config.assets,
-            second_view=compares_rotations(network)
-            or max(config.hard_negative_prob, config.attribute_loss_weight) > 0,
+            second_view=max(rotation_bins, config.hard_negative_prob, config.attribute_loss_weight) > 0,
             report=self._say,
             parallel=self.parallel,
             workers=self._workers(config.num_scenes // _SCENES_PER_WORKER),

@@ -15,9 +15,8 @@ import numpy as np
 from openvima.catalog.geometry import Assets
 from openvima.catalog.partitions import OBJECT_SETS
 from openvima.catalog.random_pack import is_random, random_name
-from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
+from openvima.catalog.textures import texture_spec
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Placement, Pose, Scene
-from openvima.tasks.table import NO_SCALE
 from openvima.training.config import PretrainingConfig
 
 _MOVABLE, _CONTAINERS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
@@ -187,8 +186,3 @@ def _free_position(placements: Sequence[Placement], rng: np.random.Generator) ->
         if all(d >= _CLEARANCE_M[p.fixed] for d, p in zip(distances, placements, strict=True)):
             return x, y
     return None
-
-
-def to_grayscale(placement: Placement) -> Placement:
-    """Return an object as a grayscale prompt image shows it: neutral texture, no scale."""
-    return replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE)

@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.pointer.words import Attributes
-from openvima.training.augmentation.crops import draw_channel_mixing
 from openvima.training.learner import LossAndMetrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.pairs import PROMPT, SCENE, SECOND_VIEW, AttributeLabels, Pairs
@@ -74,6 +73,19 @@ def contrastive_loss(
         of_attributes = attribute_loss(attributes, features, masks, pairs.attributes)
         loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes.detach()
     return loss, metrics
+
+
+def draw_channel_mixing(generator: torch.Generator) -> torch.Tensor:
+    """Draw a (3, 3) matrix that mixes R, G and B: half of the time the identity, else a blended permutation.
+
+    Rows sum to 1, so that white, grey and black stay what they are.
+    """
+    if torch.rand((), generator=generator) < 0.5:
+        return torch.eye(3)
+    permutation = torch.eye(3)[torch.randperm(3, generator=generator)]
+    blending = torch.rand(3, 3, generator=generator)
+    weight = 0.5 * torch.rand((), generator=generator)
+    return (1 - weight) * permutation + weight * blending / blending.sum(1, keepdim=True)
 
 
 def find_matches(pairs: Pairs) -> torch.Tensor:

@@ -19,15 +19,16 @@ from openvima.catalog.objects import object_spec
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random
+from openvima.catalog.textures import NEUTRAL_TEXTURE
 from openvima.multiprocess import Report, imap_unordered
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.policies.nn.layers import TensorRecord, map_tensors
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
+from openvima.tasks.table import NO_SCALE
 from openvima.training.augmentation.scenes import (
     rearrange,
-    to_grayscale,
     with_hard_negatives,
     with_random_appearance,
 )
@@ -299,7 +300,7 @@ def pairs_of_scene(
         if not views[0].masks[:, slot].any():
             continue
         is_gray = slot in gray_slots
-        shown = to_grayscale(placement) if is_gray else placement
+        shown = replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE) if is_gray else placement
         magnification = magnifications.get(placement.object, 1.0)
         prompt = rasteriser.prompt(Prompt("{object}", (("object", ObjectImage(shown, magnification)),)))
         in_prompt = observe_prompt_image(prompt.images["object"])
