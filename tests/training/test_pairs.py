@@ -57,7 +57,7 @@ def test_pairs_follow_from_the_seed():
 
 @pytest.mark.slow
 def test_workers_change_nothing(monkeypatch):
-    monkeypatch.setattr(pairs_module, "_CHUNK", 3)
+    monkeypatch.setattr("openvima.training.pretraining.pairs._CHUNK", 3)
     options = {"augmentation": HARD, "second_view": True}
     one, three = (rendered(7, **options, workers=workers) for workers in (1, 3))
     for name in ("crops", "appearances", "scenes", "is_grayscale"):

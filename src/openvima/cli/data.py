@@ -65,6 +65,9 @@ def info(
 
 
 def _summary(manifest: dict[str, Any], name: str) -> "Iterator[str | Table]":
+    from rich.markup import escape
+    from rich.table import Table
+
     summary = manifest["summary"]
     counts, versions = manifest["counts"], manifest["versions"]
     yield (
@@ -79,23 +82,11 @@ def _summary(manifest: dict[str, Any], name: str) -> "Iterator[str | Table]":
     for name, size in summary["object_caches"].items():
         yield f"object cache {name}: {size / 1e6:,.1f} MB"
     yield ""
-    yield _task_table(summary["tasks"])
-    for title, counts in summary["histograms"].items():
-        if len(counts) > 1:
-            yield ""
-            yield title
-            yield from _bars(counts)
-
-
-def _task_table(tasks: dict[str, dict[str, Any]]) -> "Table":
-    from rich.markup import escape
-    from rich.table import Table
-
     table = Table("task", box=None, pad_edge=False, header_style="")
     for name in ("episodes", "steps", "kB/episode", "seeds tried", "oracle success", "resamples"):
         table.add_column(name, justify="right", no_wrap=True)
     table.columns[0].no_wrap = True
-    for task, entry in tasks.items():
+    for task, entry in summary["tasks"].items():
         table.add_row(
             escape(echo(task, len(task))),
             f"{entry['episodes']:,}",
@@ -105,14 +96,15 @@ def _task_table(tasks: dict[str, dict[str, Any]]) -> "Table":
             f"{entry['success_rate']:.1%}",
             f"{entry['redraws']:,}",
         )
-    return table
-
-
-def _bars(counts: dict[str, int]) -> Iterator[str]:
-    width, total, most = max(map(len, counts)), sum(counts.values()), max(counts.values())
-    for label, count in counts.items():
-        bar = f"{'█' * max(1, round(_BAR_WIDTH * count / most))} {count:,} ({count / total:.1%})"
-        yield f"  {label:>{width}}  {bar}".rstrip()
+    yield table
+    for title, counts in summary["histograms"].items():
+        if len(counts) > 1:
+            yield ""
+            yield title
+            width, total, most = max(map(len, counts)), sum(counts.values()), max(counts.values())
+            for label, count in counts.items():
+                bar = f"{'█' * max(1, round(_BAR_WIDTH * count / most))} {count:,} ({count / total:.1%})"
+                yield f"  {label:>{width}}  {bar}"
 
 
 def verify(

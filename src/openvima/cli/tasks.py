@@ -1,13 +1,8 @@
 """`openvima tasks`: list the tasks."""
 
-from typing import TYPE_CHECKING
-
 from openvima.cli.terminal import Task, print_table
 from openvima.tasks.options import option_descriptions
 from openvima.tasks.registry import oracle_record
-
-if TYPE_CHECKING:
-    from openvima.tasks import TaskSpec
 
 
 def main(
@@ -23,16 +18,26 @@ def main(
         name: Task to describe, with its options for --task-options.
         level: List the tasks of this level only: train, L1 to L8.
     """
+    from rich.table import Table
+    from rich.text import Text
+
     from openvima.tasks import task_spec
     from openvima.tasks.registry import tasks_of
 
     if name is not None:
-        _describe(task_spec(name))
+        spec = task_spec(name)
+        descriptions, families = option_descriptions(spec), ", ".join(spec.families).replace("_", " ")
+        print(f"{name}: {spec.summary}\nPrompt: {spec.template}")
+        print(f"Levels: {', '.join(spec.levels)}. At most {spec.max_steps} steps. Family: {families}.")
+        if descriptions:
+            table = Table("option", "default", "description", title=f"options of {name}")
+            for option, default in spec.options.items():
+                table.add_row(option, _shown(default), descriptions[option])
+            print_table(table)
+        if "difficulty" in descriptions:
+            print(f"Example: openvima demo {name} --task-options difficulty=hard")
         return
     specs = [task_spec(name) for name in tasks_of(level)]
-    from rich.table import Table
-    from rich.text import Text
-
     columns = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
     table = Table(*columns, title=f"{len(specs)} tasks", show_lines=True)
     for spec in specs:
@@ -51,24 +56,6 @@ def main(
     print("steps: the oracle's limit, and what a policy may add to it")
     print("oracle: success rate in %, over all levels")
     print("`openvima tasks TASK` lists the options of a task")
-
-
-def _describe(spec: "TaskSpec") -> None:
-    """Print one task with its options."""
-    from rich.table import Table
-
-    descriptions = option_descriptions(spec)
-    table = Table("option", "default", "description", title=f"options of {spec.name}")
-    for name, default in spec.options.items():
-        table.add_row(name, _shown(default), descriptions[name])
-    families = ", ".join(spec.families).replace("_", " ")
-    for line in (f"{spec.name}: {spec.summary}", f"Prompt: {spec.template}"):
-        print(line)
-    print(f"Levels: {', '.join(spec.levels)}. At most {spec.max_steps} steps. Family: {families}.")
-    if descriptions:
-        print_table(table)
-    if "difficulty" in descriptions:
-        print(f"Example: openvima demo {spec.name} --task-options difficulty=hard")
 
 
 def _shown(default: object) -> str:

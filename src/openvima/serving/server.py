@@ -354,8 +354,16 @@ class _PolicyServer:
             return
         self._num_connections += 1
         _LOG.info("%s: connected", _name(connection))
+        session, loop = Session(self._new_policy(), self._config), asyncio.get_running_loop()
+        reply: bytes | str = self._metadata
         try:
-            await self._converse(connection)
+            while True:
+                async with asyncio.timeout(self._config.idle_s):
+                    await connection.send(reply)
+                    data = await connection.recv()
+                reply = await loop.run_in_executor(self._computing, session.answer, data)
+                if isinstance(reply, str):
+                    _LOG.warning("%s: refused: %s", _name(connection), reply)
         except TimeoutError:
             reason = f"no whole message within {self._config.idle_s:g} s"
             _LOG.warning("%s: dropped, %s", _name(connection), reason)
@@ -364,18 +372,6 @@ class _PolicyServer:
             _LOG.info("%s: gone (%s)", _name(connection), echo(str(closed)))
         finally:
             self._num_connections -= 1
-
-    async def _converse(self, connection: "ServerConnection") -> None:
-        session = Session(self._new_policy(), self._config)
-        reply: bytes | str = self._metadata
-        loop = asyncio.get_running_loop()
-        while True:
-            async with asyncio.timeout(self._config.idle_s):
-                await connection.send(reply)
-                data = await connection.recv()
-            reply = await loop.run_in_executor(self._computing, session.answer, data)
-            if isinstance(reply, str):
-                _LOG.warning("%s: refused: %s", _name(connection), reply)
 
 
 def _set_threads(num_threads: int) -> None:

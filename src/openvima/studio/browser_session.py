@@ -303,13 +303,6 @@ class BrowserSession:
         config = self.config
         return load_own_rollout_policy(name, device=config.device, trust_code=config.trust_code)
 
-    def choose_policy(self, name: str) -> None:
-        """Let a policy decide from here on."""
-        self.policy, self.policy_name = self.load_policy(name), name
-        if self.current is not None:
-            self.current.policy = self.policy
-            self.changed()
-
     def choose_assets(self, name: str) -> None:
         """Use an asset pack for what is opened from here on."""
         self.assets = self.table.assets = load_assets(name)

@@ -198,7 +198,8 @@ class RunFolder:
         self._settle(progress)
         file, reached = self.path / METRICS_FILE, (progress.stage, progress.step)
         kept = [each for each in read_lines(file) if (each["stage"], each["step"]) <= reached]
-        atomic_write_file(file, "".join(json.dumps(each) + "\n" for each in kept))
+        if file.is_file():
+            atomic_write_file(file, "".join(json.dumps(each) + "\n" for each in kept))
 
     def _settle(self, progress: Progress) -> None:
         """Name the best checkpoint, and delete those that are neither it, the last nor permanent."""

@@ -156,15 +156,10 @@ def make_order(source: ExampleSource, loader: LoaderConfig, seed: int, parallel:
         rank=parallel.rank,
         num_ranks=num_ranks,
     )
-    return _show_first(order, source, loader) if loader.first_steps else order
-
-
-def _show_first(order: BatchOrder, source: ExampleSource, loader: LoaderConfig) -> BatchOrder:
-    """Let the first batches show the demonstrations of some tasks alone, if there are these and others."""
     is_first = np.isin(_tasks_of(source), loader.early_tasks)
-    if is_first.all() or not is_first.any():
+    if not loader.first_steps or is_first.all() or not is_first.any():
         return order
-    # Those that are repeated are taken once.
+    # The first batches show these tasks alone; demonstrations that are repeated are taken once.
     places = np.flatnonzero(is_first)
     places = places[np.unique(source.rows[places], return_index=True)[1]]
     return replace(order, first_batches=loader.first_steps, first_episodes=places)

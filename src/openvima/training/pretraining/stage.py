@@ -244,7 +244,13 @@ class ContrastivePretraining:
         """Draw a batch of pairs and add its gradients."""
         config = self._config
         generator = step_generator(self._seed, _PURPOSE, step)
-        batch = self._training.select(self._rows(generator).to(self._training.scenes.device))
+        scenes = self._training.scenes
+        if config.hard_negative_prob:  # whole scenes, as these contain hard negatives
+            rank = torch.rand(int(scenes.max()) + 1, generator=generator)
+            order = rank[scenes.cpu()].argsort(stable=True)
+        else:
+            order = torch.randperm(len(scenes), generator=generator)
+        batch = self._training.select(order[: config.batch_size].to(scenes.device))
         if self.encoder.config.rotation_bins:
             batch = with_horizontal_flips(batch, generator)
         if config.occlusion_prob:
@@ -283,14 +289,6 @@ class ContrastivePretraining:
             of_attributes = attribute_accuracy(self.encoder, self._attributes, pairs)
             metrics |= {f"{name}_accuracy": value for name, value in of_attributes.items()}
         return metrics
-
-    def _rows(self, generator: torch.Generator) -> torch.Tensor:
-        """Draw a batch: of whole scenes if they contain hard negatives, else of any objects."""
-        batch_size, scenes = self._config.batch_size, self._training.scenes
-        if not self._config.hard_negative_prob:
-            return torch.randperm(len(scenes), generator=generator)[:batch_size]
-        rank = torch.rand(int(scenes.max()) + 1, generator=generator)
-        return rank[scenes.cpu()].argsort(stable=True)[:batch_size]
 
 
 def attributes_of(network: PolicyNetwork) -> Attributes | None:
