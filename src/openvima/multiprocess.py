@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, one_line, unknown_words
+from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, handle_unknown_words, one_line
 from openvima.imports import import_extra
 
 POLL_S = 0.2
@@ -197,7 +197,8 @@ def _start_worker(counters: Any) -> None:
 
 def _run_one(job: Job, item: Any, slot: int) -> tuple[Any, list[UnknownWordWarning]]:
     """Run a job in a worker; return its result, and the unknown words to warn of where all come together."""
-    with unknown_words() as found:
+    found = list[UnknownWordWarning]()
+    with handle_unknown_words(found.append):
         return job(item, partial(_counters.__setitem__, slot)), found
 
 
@@ -377,6 +378,6 @@ def _run_counted(job: Job, item: Any, folder: str) -> tuple[Any, int, list[Unkno
     """
     with contextlib.suppress(OSError):
         os.chdir(folder)
-    counts = [0]
-    with unknown_words() as found:
+    counts, found = [0], list[UnknownWordWarning]()
+    with handle_unknown_words(found.append):
         return job(item, counts.append), counts[-1], found

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 
 def gallery(*, out: Path, assets: str = "procedural") -> int:
@@ -33,7 +33,7 @@ def gallery(*, out: Path, assets: str = "procedural") -> int:
 
 
 def import_(
-    checkout: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKOUT")],
+    checkout: Annotated[Positional[Path], arg(metavar="CHECKOUT")],
 ) -> int:
     """Import the asset pack of the original benchmark; then "--assets original" uses it everywhere.
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from openvima.cli.terminal import (
     Folder,
@@ -233,7 +233,7 @@ def split(
 
 
 def merge(
-    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER… OUT")],
+    folders: Annotated[tuple[Path, ...], Positional, arg(metavar="FOLDER… OUT")],
     *,
     tasks: str = "all",
     duplicates: Literal["refuse", "skip"] = "refuse",
@@ -262,7 +262,7 @@ def merge(
 
 
 def import_published(
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
+    source: Annotated[Path, Positional, arg(metavar="SOURCE")],
     out: Out,
     *,
     tasks: str = "all",

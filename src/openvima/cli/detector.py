@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from openvima.cli.terminal import Json, Out, Report, progress_bar, refuse_existing
 from openvima.errors import ConfigError
@@ -20,8 +20,8 @@ from openvima.training.detector import DetectorTrainingConfig  # tyro reads its 
 if TYPE_CHECKING:
     from openvima.detector.frames import Frame, FrameSampler
 
-Folder = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DETECTOR")]
-Training = Annotated[DetectorTrainingConfig, tyro.conf.arg(name="")]
+Folder = Annotated[Positional[Path | None], arg(metavar="DETECTOR")]
+Training = Annotated[DetectorTrainingConfig, arg(name="")]
 LEVEL = "L3"  # with objects and textures that are not in the training set
 FRAMES_PER_EPISODE = 2  # one time step in both views
 
@@ -129,7 +129,7 @@ def show(
 
 
 def convert(
-    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")],
+    source: Annotated[Positional[Path], arg(metavar="IN")],
     out: Out,
     *,
     force: bool = False,

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
+from tyro.conf import OmitArgPrefixes
 
 from openvima.cli.terminal import (
     DEFAULT_ENVIRONMENT,
@@ -135,11 +135,11 @@ def main(
     force: bool = False,
     as_json: Json = False,
     environment: Environment = DEFAULT_ENVIRONMENT,
-    ablation: tyro.conf.OmitArgPrefixes[AblationOptions] = AblationOptions(),
-    recording: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions(),
-    network: tyro.conf.OmitArgPrefixes[NetworkOptions] = NetworkOptions(),
-    jobs: tyro.conf.OmitArgPrefixes[JobOptions] = JobOptions(),
-    chat: tyro.conf.OmitArgPrefixes[ChatOptions] = ChatOptions(),
+    ablation: OmitArgPrefixes[AblationOptions] = AblationOptions(),
+    recording: OmitArgPrefixes[RecordingOptions] = RecordingOptions(),
+    network: OmitArgPrefixes[NetworkOptions] = NetworkOptions(),
+    jobs: OmitArgPrefixes[JobOptions] = JobOptions(),
+    chat: OmitArgPrefixes[ChatOptions] = ChatOptions(),
     vlm: VlmOptions = DEFAULT_OPTIONS,
 ) -> None:
     """Score policies on tasks and levels, and write results.json and report.html.

@@ -3,18 +3,16 @@
 import importlib
 import io
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from typing import Any
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE, NO_SPACE
 from openvima.errors import (
     OpenVimaError,
     Terminated,
-    UnknownWordWarning,
     echo,
+    handle_unknown_words,
     one_word_warning,
     unknown_name,
 )
@@ -82,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] not in VERBS:
         return _fail(unknown_name("verb", words[0], VERBS), 2)
     one_warning = one_word_warning() if words[0] in _SCORING else nullcontext()
-    with _warnings_in_one_line(), one_warning:
+    with handle_unknown_words(lambda found: _fail(f"UnknownWordWarning: {found}", 0)), one_warning:
         return _run(words[0], words[1:])
 
 
@@ -133,22 +131,6 @@ def _explained(error: Exception) -> tuple[str, int]:
     if error.filename is None:
         return f"{name}: {error}", 1
     return f"cannot use {error.filename}: {reason}. Give a path that can be read and written.", 2
-
-
-@contextmanager
-def _warnings_in_one_line() -> Iterator[None]:
-    """Print warnings of unknown words as errors are, without the line of code that gave them."""
-    shown = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
-        if issubclass(category, UnknownWordWarning):
-            _fail(f"{category.__name__}: {message}", 0)
-        else:
-            shown(message, category, *place)
-
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield
 
 
 def _fail(message: str, status: int) -> int:

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from openvima.cli.terminal import (
     Out,
@@ -102,7 +102,7 @@ def show(policy: Policy) -> None:
 
 
 def convert(
-    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IN")],
+    source: Annotated[Positional[str], arg(metavar="IN")],
     out: Out,
     *,
     tokenizer: str | None = None,
@@ -148,7 +148,7 @@ def convert(
 
 
 def push_to_hub(
-    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")],
+    source: Annotated[Positional[str], arg(metavar="SOURCE")],
     name: Repository,
     *,
     results: Path | None = None,

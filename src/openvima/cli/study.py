@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from openvima.cli.terminal import parse_list, print_table, progress_bar
 
 
 def main(
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")],
+    name: Annotated[Positional[str], arg(metavar="NAME")],
     *,
     out: Path,
     scale: Literal["nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m"] = "nano",

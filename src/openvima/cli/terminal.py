@@ -15,17 +15,17 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
 
-Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-Out = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-Policy = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
-Repository = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OWNER/NAME")]
-Task = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-Json = Annotated[bool, tyro.conf.arg(name="json")]
+Folder = Annotated[Path, Positional, arg(metavar="FOLDER")]
+Out = Annotated[Path, Positional, arg(metavar="OUT")]
+Policy = Annotated[str, Positional, arg(metavar="POLICY")]
+Repository = Annotated[str, Positional, arg(metavar="OWNER/NAME")]
+Task = Annotated[str | None, Positional, arg(metavar="TASK")]
+Json = Annotated[bool, arg(name="json")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class EnvironmentOptions:
     control: Literal["primitives", "end_effector"] = "primitives"
 
 
-Environment = tyro.conf.OmitArgPrefixes[EnvironmentOptions]
+Environment = OmitArgPrefixes[EnvironmentOptions]
 DEFAULT_ENVIRONMENT = EnvironmentOptions()
 
 
