@@ -77,7 +77,15 @@ def imap_unordered(
     check_workers(num_workers)
     report = report or (lambda done: None)
     if num_workers == 1 or len(items) <= 1:
-        yield from _run_serially(job, items, report)
+        counts = list[int]()
+
+        def count(number: int) -> None:
+            counts[-1] = number
+            report(sum(counts))
+
+        for item in items:
+            counts.append(0)
+            yield item, job(item, count)
         return
     context = multiprocessing.get_context("spawn")
     # One number per job, and whether a worker has started: no lock that a killed worker could hold.
@@ -123,18 +131,6 @@ def check_workers(num_workers: int) -> None:
     """
     if not 1 <= num_workers <= MAX_WORKERS:
         raise ConfigError(f"workers is {num_workers}; it must lie within 1 … {MAX_WORKERS}.")
-
-
-def _run_serially(job: Job, items: Sequence[Any], report: Callable[[int], None]) -> Iterator[tuple[Any, Any]]:
-    counts: list[int] = []
-
-    def count(number: int) -> None:
-        counts[-1] = number
-        report(sum(counts))
-
-    for item in items:
-        counts.append(0)
-        yield item, job(item, count)
 
 
 @contextlib.contextmanager

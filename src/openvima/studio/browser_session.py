@@ -145,7 +145,6 @@ class Table:
             placement = placements.get(object_id)
             if placement is None or self._shape(placement) != self._shapes[object_id]:
                 self.objects.pop(object_id).remove()
-                del self._shapes[object_id]
         for object_id, placement in placements.items():
             if object_id not in self.objects:
                 self._shapes[object_id] = self._shape(placement)

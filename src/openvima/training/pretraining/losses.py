@@ -56,22 +56,22 @@ def contrastive_loss(
     masks = pairs.masks.permute(1, 2, 0)
     prompt, scene, *second = encoder.embed_appearance(features, masks)
     loss, accuracy = info_nce(prompt, scene, find_matches(pairs))
-    metrics = {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
+    metrics = {"loss/contrastive": loss, "contrastive_accuracy": accuracy}
     if pairs.rotations is None:
         return loss, metrics
     rows = pairs.masks[:, SECOND_VIEW].any(dim=1)
     is_same = pairs.appearances[rows, None] == pairs.appearances[None, rows]
     view_loss, accuracy = info_nce(second[0][rows], scene[rows], is_same)
     loss = (loss + view_loss) / 2
-    metrics |= {"loss/second_view": view_loss.detach(), "second_view_accuracy": accuracy}
+    metrics |= {"loss/second_view": view_loss, "second_view_accuracy": accuracy}
     if encoder.config.rotation_bins:
         of_rotations = rotation_loss(encoder, features, masks, pairs.rotations)
         is_correct = is_rotation_correct(encoder, features, masks, pairs.rotations)
-        loss, metrics["loss/rotation"] = loss + of_rotations, of_rotations.detach()
+        loss, metrics["loss/rotation"] = loss + of_rotations, of_rotations
         metrics["rotation_accuracy"] = is_correct.float().mean()
     if attributes and pairs.attributes:
         of_attributes = attribute_loss(attributes, features, masks, pairs.attributes)
-        loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes.detach()
+        loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes
     return loss, metrics
 
 
@@ -114,9 +114,7 @@ def info_nce(
     scores = scores.masked_fill(is_match & ~diagonal, torch.finfo(scores.dtype).min)
     target = torch.arange(count, device=scores.device)
     loss = (F.cross_entropy(scores, target) + F.cross_entropy(scores.T, target)) / 2
-    with torch.no_grad():
-        accuracy = (scores.argmax(1) == target).to(scores.dtype).mean()
-    return loss, accuracy
+    return loss, (scores.argmax(1) == target).to(scores.dtype).mean()
 
 
 def _chunks(pairs: Pairs) -> list[Pairs]:
