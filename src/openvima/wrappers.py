@@ -192,7 +192,10 @@ class FlatObservation(_PromptedObservation):
                 filled[:, 6:8] = np.clip(_scaled(objects.grasp_points()), -1, 1)
             filled[:, 3:5] = objects.boxes[TOP][:, 2:] / (CAMERAS["top"].height, CAMERAS["top"].width)
             filled[:, 5] = index / num_rows
-            filled[:, 8:] = _patches(objects.crops[TOP])
+            # Crops, (N, 3, 32, 32), averaged over patches.
+            crops, side = objects.crops[TOP], objects.crops.shape[-1] // PATCHES
+            tiles = crops.reshape(len(crops), 3, PATCHES, side, PATCHES, side)
+            filled[:, 8:] = tiles.mean(axis=(3, 5)).reshape(len(crops), -1) / 255
             start += len(objects)
         return rows
 
@@ -338,10 +341,3 @@ def _shrunk(image: np.ndarray) -> np.ndarray:
     channels, height, width = image.shape
     tiles = image.reshape(channels, height // 2, 2, width // 2, 2)
     return tiles.mean(axis=(2, 4)).astype(np.uint8)
-
-
-def _patches(crops: np.ndarray) -> np.ndarray:
-    """Average crops, shape (N, 3, 32, 32), over patches: shape (N, 48), 0 … 1."""
-    side = crops.shape[-1] // PATCHES
-    tiles = crops.reshape(len(crops), 3, PATCHES, side, PATCHES, side)
-    return tiles.mean(axis=(3, 5)).reshape(len(crops), -1) / 255

@@ -111,8 +111,7 @@ def _run(verb: str, rest: list[str]) -> int:
         sys.stderr.close()
         return 1
     except Exception as error:
-        message, status = _explained(error)
-        return _fail(message, status)
+        return _fail(*_explained(error))
 
 
 def _explained(error: Exception) -> tuple[str, int]:

@@ -105,10 +105,10 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
     first.add_argument("--trust-code", action="store_true")
     first.add_argument("--help-all", action="store_true")
     chosen, rest = first.parse_known_args(list(words))
-    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in _DECIDING:
-        peek.add_argument(f"--{name.replace('_', '-')}", f"--{name}", dest=name)
-    known = vars(peek.parse_known_args(rest)[0])
+    for name in _DECIDING:  # these are parsed again, with the others
+        first.add_argument(f"--{name.replace('_', '-')}", f"--{name}", dest=name)
+    peeked = vars(first.parse_known_args(rest)[0])
+    known = {name: peeked[name] for name in _DECIDING}
     file = read_settings(chosen.config, trust_code=chosen.trust_code) if chosen.config else {}
     preset = known.pop("preset") or file.get("preset")
     settings = override(recipe_settings(chosen.recipe or default_recipe(preset or "nano")), file)

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 _MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
 HEALTH_PATH = "/healthz"
 CLOSE_S = 2.0  # for the other side to say goodbye
+_Started = Future[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]]  # URL, loop, and what stops it
 _LOG = logging.getLogger(__name__)
 _TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
 _TRANSPORT_LOG.setLevel(logging.CRITICAL)  # a traceback for every port scan; `serve_client` says what matters
@@ -264,15 +265,11 @@ def serve_in_thread(
     require_extra()
     server = _PolicyServer(policy, config := ServerConfig(port=port, **settings), about or {})
     check_can_listen(config.host, config.port)
-    started: Future[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
-
-    async def run() -> None:
-        loop, stop = asyncio.get_running_loop(), asyncio.Event()
-        await server.run(lambda url: started.set_result((url, loop, stop)), stop)
+    started: _Started = Future()
 
     def work() -> None:
         try:
-            asyncio.run(run())
+            asyncio.run(server.run(started))
         except BaseException as error:
             if started.done():
                 raise
@@ -306,11 +303,11 @@ class _PolicyServer:
         first = {"protocol": PROTOCOL, "versions": {"openvima": __version__}}
         self._metadata = pack({**first, **about, "modalities": modalities, "control": control})
 
-    async def run(self, ready: Callable[[str], None], stop: asyncio.Event) -> None:
-        """Serve until `stop` is set, or this is cancelled."""
+    async def run(self, started: _Started) -> None:
+        """Serve until the event is set that is given once clients can connect."""
         from websockets.asyncio.server import serve
 
-        config = self._config
+        config, stop = self._config, asyncio.Event()
         with ThreadPoolExecutor(1, "openvima-policy", _set_threads, (config.num_threads,)) as self._computing:
             async with serve(
                 self._serve_client,
@@ -326,7 +323,8 @@ class _PolicyServer:
                 logger=_TRANSPORT_LOG,
             ) as server:
                 host, port = next(iter(server.sockets)).getsockname()[:2]
-                ready(f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}")
+                url = f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
+                started.set_result((url, asyncio.get_running_loop(), stop))
                 await stop.wait()
 
     def _admit(self, connection: "ServerConnection", request: "Request") -> "Response | None":

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -68,9 +69,15 @@ class BehaviourCloning:
         for number, (batch, num_steps) in enumerate(parts):
             # Gradients are averaged over processes: each counts by its fraction of all steps.
             weight = num_steps * self._parallel.num_ranks / total
-            with self._parallel.synchronized(self._module, last=number == len(parts) - 1):
+            is_alone, is_last = self._parallel.num_ranks == 1, number == len(parts) - 1
+            # Gradients are synchronized in the last backward pass of a step only.
+            with nullcontext() if is_alone or is_last else self._module.no_sync():  # type: ignore[operator]
                 loss, metrics = self._call(batch, self._module)
-                self._parallel.with_all_gradients(loss * weight, self.parameters).backward()
+                weighted = loss * weight
+                # DDP waits for a gradient of every parameter; prompts without images leave some out.
+                if not is_alone:
+                    weighted = weighted + 0.0 * torch.stack([each.sum() for each in self.parameters]).sum()
+                weighted.backward()
             _add(sums, {"loss": loss, **metrics}, weight)
         return sums
 
@@ -90,9 +97,7 @@ class BehaviourCloning:
         sums: Metrics = {}
         # Sorted by length, to reduce padding; processes take parts in turn.
         rows = np.lexsort(source.lengths.T[::-1])
-        for number, start in enumerate(range(0, len(rows), size)):
-            if number % ranks != self._parallel.rank:
-                continue
+        for start in range(self._parallel.rank * size, len(rows), ranks * size):
             for group in source.by_length(rows[start : start + size]):
                 batch = collate([source[index] for index in group.tolist()], None)
                 loss, metrics = self._call(batch, self._learner)

@@ -130,11 +130,11 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
 
 
 def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
-    augmentation = {f"augmentation.{n}": v for n, v in flatten(config.identity()["augmentation"]).items()}
+    augmentation = flatten(asdict(config.augmentation), "augmentation")
     augmentation.pop("augmentation.false_positive_prob")  # ignored unless its collator uses it
     given = {
         "pretraining.steps": config.pretraining.steps,
-        **{f"model.{name}": value for name, value in asdict(config.model).items()},
+        **flatten(asdict(config.model), "model"),
         "t5": config.t5,
         **augmentation,
     }

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,24 +111,6 @@ class Parallel:
             # Its successor does not exist in the oldest torch that is allowed.
             warnings.filterwarnings("ignore", "`broadcast_buffers` is deprecated", FutureWarning)
             return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
-
-    def synchronized(self, module: nn.Module, *, last: bool) -> AbstractContextManager[None]:
-        """Synchronize gradients in the last backward pass of a step only.
-
-        Args:
-            module: The wrapped module.
-            last: Whether the block is the last pass of the step.
-        """
-        return nullcontext() if self.num_ranks == 1 or last else module.no_sync()  # type: ignore[operator]
-
-    def with_all_gradients(self, loss: torch.Tensor, parameters: Iterable[nn.Parameter]) -> torch.Tensor:
-        """Let every parameter have a gradient, if only of zero: DDP waits for all of them.
-
-        Prompts without images, as text prompts are, leave some out.
-        """
-        if self.num_ranks == 1:
-            return loss
-        return loss + 0.0 * torch.stack([parameter.sum() for parameter in parameters]).sum()
 
     def autocast(self, precision: str) -> AbstractContextManager[Any]:
         """Return a context for mixed precision, "float32" or "bfloat16"."""

@@ -257,10 +257,10 @@ def held_out_demonstrations(dataset: Dataset) -> list[str]:
 
     Each episode says its own level and domain, so merging or sampling folders hides nothing.
     """
-    found = dataset.index.select(["task", "level", "domain"]).group_by(["task", "level", "domain"])
+    found = dataset.index.group_by(["task", "level", "domain"]).aggregate([])
     return sorted(
         f"{row['task']} {row['level']}" + (" eval" if row["domain"] == "eval" else "")
-        for row in found.aggregate([]).to_pylist()
+        for row in found.to_pylist()
         if row["level"] != "train" or row["domain"] == "eval"
     )
 

@@ -269,10 +269,9 @@ def attribute_accuracy(encoder: ObjectEncoder, attributes: Attributes, pairs: Pa
     labels = pairs.attributes
     assert labels is not None
     projected = []
-    for part in _chunks(pairs):
-        assert part.attributes is not None
+    for part, boxes in zip(_chunks(pairs), labels.boxes.split(_CHUNK), strict=True):
         features, masks = _features(encoder, part, [PROMPT, SCENE])
-        boxes = part.attributes.boxes[:, : len(masks)].permute(1, 2, 0, 3)
+        boxes = boxes[:, : len(masks)].permute(1, 2, 0, 3)
         projected.append(attributes(features, boxes, masks).transpose(1, 2))  # (2, P, K, W)
     prompt_PKW, scene_PKW = torch.cat(projected, dim=2)  # of (2, P, K, W)
     same_PKK, different_PKK = _compare_attributes(_images(labels, [PROMPT]), _images(labels, [SCENE]))
