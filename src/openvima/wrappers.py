@@ -107,7 +107,11 @@ class _PromptedObservation(gymnasium.ObservationWrapper):
             parts = prompt.sequence()
             self._images = self._encode_images([part for part in parts if not isinstance(part, str)])
             self._prompt, self._words = prompt, _words(parts)
-        tool = _tool(observation["tool"]) if "tool" in observation else ()
+        tool = ()
+        if "tool" in observation:
+            x, y, z, yaw_rad, holds = observation["tool"]
+            height, (x, y) = 2 * z / HIGHEST_TIP_Z_M - 1, _scaled(np.array([x, y]))
+            tool = np.clip([x, y, height, np.sin(yaw_rad), np.cos(yaw_rad), holds], -1, 1)
         return np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
 
     def _encode_images(self, images: list[PromptImage]) -> np.ndarray:
@@ -320,12 +324,6 @@ class ProgressReward(gymnasium.Wrapper):
 
 def _scaled(points: np.ndarray) -> np.ndarray:
     return (points - _LOW) / (_HIGH - _LOW) * 2 - 1
-
-
-def _tool(tool: np.ndarray) -> np.ndarray:
-    x, y, z, yaw_rad, holds = tool
-    height = 2 * z / HIGHEST_TIP_Z_M - 1
-    return np.clip([*_scaled(np.array([x, y])), height, np.sin(yaw_rad), np.cos(yaw_rad), holds], -1, 1)
 
 
 def _words(parts: Sequence[object]) -> np.ndarray:

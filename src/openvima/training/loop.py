@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -149,17 +149,8 @@ class Stage(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedStage:
-    """A stage that is built when it starts.
-
-    Args:
-        num_steps: Its length.
-        make: Builds it.
-    """
-
-    num_steps: int
-    make: Callable[[], Stage]
+PlannedStage = tuple[int, Callable[[], Stage]]
+"""The number of steps of a stage, and the function that builds it when it starts."""
 
 
 def num_steps(schedule: ScheduleConfig, num_examples: Callable[[], int], batch_size: int) -> int:
@@ -241,8 +232,9 @@ class Trainer:
             for number in range(self.progress.stage, len(stages)):
                 if number > self.progress.stage:
                     self.progress = replace(self.progress, stage=number, step=0)
-                if self.progress.step < stages[number].num_steps:
-                    self._run_stage(stages[number].make(), stages[number].num_steps)
+                num_steps, make = stages[number]
+                if self.progress.step < num_steps:
+                    self._run_stage(make(), num_steps)
         finally:
             for tracker in self._trackers:
                 tracker.close()
@@ -251,7 +243,7 @@ class Trainer:
     def report(self, note: str) -> None:
         """Report the progress with a note."""
         if self._on_report and self.parallel.is_first:
-            self._on_report(self._done(), sum(stage.num_steps for stage in self._stages), note)
+            self._on_report(self._done(), sum(num_steps for num_steps, _ in self._stages), note)
 
     def _run_stage(self, stage: Stage, num_steps: int) -> None:
         """Take the remaining steps of a stage; after a SIGTERM write a checkpoint and stop."""
@@ -389,8 +381,8 @@ class Trainer:
 
     def _done(self) -> int:
         """Return the steps done, counted through all stages."""
-        done = [stage.num_steps for stage in self._stages[: self.progress.stage]]
-        return sum(done) + self.progress.step
+        done = sum(num_steps for num_steps, _ in self._stages[: self.progress.stage])
+        return done + self.progress.step
 
 
 def _optimizer(learner: Learner, stage: Stage, weight_decay: float) -> torch.optim.Optimizer:

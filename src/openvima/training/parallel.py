@@ -133,9 +133,8 @@ class Parallel:
         """Concatenate the rows of all processes, on their device."""
         if self.num_ranks == 1:
             return rows_N
-        counts = [torch.tensor(0, device=self.device) for _ in range(self.num_ranks)]
-        dist.all_gather(counts, torch.tensor(len(rows_N), device=self.device))
-        lengths = [int(count) for count in counts]
+        lengths = [0] * self.num_ranks
+        dist.all_gather_object(lengths, len(rows_N))
         longest = rows_N.new_zeros(max(lengths), *rows_N.shape[1:])
         longest[: len(rows_N)] = rows_N
         parts = [torch.empty_like(longest) for _ in lengths]
@@ -234,15 +233,10 @@ def load_named_state(module: nn.Module, optimizer: torch.optim.Optimizer, state:
     """
     names = {id(parameter): name for name, parameter in module.named_parameters()}
     ordered = [p for group in optimizer.param_groups for p in group["params"]]
-    values = {
-        number: {key: _copy_layout(parameter, value) for key, value in state[names[id(parameter)]].items()}
-        for number, parameter in enumerate(ordered)
-        if names[id(parameter)] in state
-    }
+    values = dict[int, dict[str, torch.Tensor]]()
+    for number, parameter in enumerate(ordered):
+        for key, value in state.get(names[id(parameter)], {}).items():
+            if value.shape == parameter.shape:  # not the step count
+                value = torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)
+            values.setdefault(number, {})[key] = value
     optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
-
-
-def _copy_layout(parameter: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-    if value.shape != parameter.shape:
-        return value  # the step count
-    return torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)

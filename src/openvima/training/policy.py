@@ -151,10 +151,10 @@ class _Stages:
         """Return the stages in order."""
         config = self.config
         steps = num_steps(config.schedule, lambda: len(self._examples[0]), config.loader.batch_size)
-        cloning = PlannedStage(steps, self._behaviour_cloning)
-        if not config.pretraining.steps:
-            return [cloning]
-        return [PlannedStage(config.pretraining.steps, self._pretraining), cloning]
+        stages: list[PlannedStage] = [(steps, self._behaviour_cloning)]
+        if config.pretraining.steps:
+            stages.insert(0, (config.pretraining.steps, self._pretraining))
+        return stages
 
     def _pretraining(self) -> Stage:
         assert isinstance(self.learner, PolicyLearner)  # `resolve` has checked it
