@@ -43,8 +43,20 @@ def with_random_appearance(
         if rng.random() < prob:
             dark = "dark " if rng.random() < 0.25 else ""
             placement = replace(placement, texture=dark + palette[rng.integers(_PALETTE_SIZE)])
-        if rng.random() < prob:
-            placement = _with_random_shape(placement, assets, rng, common, settings)
+        if rng.random() < prob and placement.object in (*_MOVABLE, *_CONTAINERS):
+            is_container = placement.object in _CONTAINERS
+            if is_container and _draw(settings.grating_prob, rng):
+                kind = "grating"
+            elif is_container:
+                kind = "eared container" if _draw(settings.eared_prob, rng) else "container"
+            elif _draw(settings.ring_and_block_prob, rng):
+                kind = "ring" if rng.random() < 0.5 else "block"
+            else:
+                kind = "shape"
+            name = random_name(kind, rng)
+            if common is not None and is_container:
+                name = common.setdefault(placement.object, name)
+            placement = at_rest(replace(placement, object=name), assets)
         placements.append(placement)
     return replace(scene, placements=tuple(placements))
 
@@ -53,30 +65,6 @@ def at_rest(placement: Placement, assets: Assets) -> Placement:
     """Put an object on the table at the height of its own shape."""
     height = assets.geometry(placement.object, placement.size, placement.scale).rest_z_m
     return placement.at(Pose((placement.pose.x, placement.pose.y, height), placement.pose.quaternion))
-
-
-def _with_random_shape(
-    placement: Placement,
-    assets: Assets,
-    rng: np.random.Generator,
-    common: dict[str, str] | None,
-    settings: PretrainingConfig,
-) -> Placement:
-    is_container = placement.object in _CONTAINERS
-    if not is_container and placement.object not in _MOVABLE:
-        return placement
-    if is_container and _draw(settings.grating_prob, rng):
-        kind = "grating"
-    elif is_container:
-        kind = "eared container" if _draw(settings.eared_prob, rng) else "container"
-    elif _draw(settings.ring_and_block_prob, rng):
-        kind = "ring" if rng.random() < 0.5 else "block"
-    else:
-        kind = "shape"
-    name = random_name(kind, rng)
-    if common is not None and is_container:
-        name = common.setdefault(placement.object, name)
-    return at_rest(replace(placement, object=name), assets)
 
 
 def _draw(prob: float, rng: np.random.Generator) -> bool:
@@ -129,45 +117,32 @@ def with_hard_negatives(
         assets: Source of shapes.
         rng: Source of all draws.
     """
-    placements = list(scene.placements)
-    for original in scene.placements:
+    placements, movable = list(scene.placements), [p for p in scene.placements if not p.fixed]
+    for original in movable:
         is_eligible = original.object in _MOVABLE or is_random(original.object)
-        if original.fixed or not is_eligible or rng.random() >= prob:
+        if not is_eligible or rng.random() >= prob:
             continue
         position = _free_position(placements, rng)
-        kind = _KINDS[rng.integers(len(_KINDS))]
-        negative = _change(original, kind, scene.placements, shades, assets, rng)
+        kind, negative = _KINDS[rng.integers(len(_KINDS))], None
+        if kind == "height":
+            x, y, z = original.scale
+            stretch = rng.uniform(*_STRETCH)
+            factor = stretch if rng.random() < 0.5 else 1 / stretch
+            negative = at_rest(replace(original, scale=(x, y, z * factor)), assets)
+        elif kind == "shade":
+            if shade := _other_shade(original.texture, shades):
+                negative = replace(original, texture=shade)
+        elif kind == "texture":
+            if names := [p.texture for p in movable if p.texture != original.texture]:
+                negative = replace(original, texture=names[rng.integers(len(names))])
+        elif shapes := [p for p in movable if p.object != original.object]:
+            shape = shapes[rng.integers(len(shapes))]
+            changed = replace(original, object=shape.object, size=shape.size, scale=shape.scale)
+            negative = at_rest(changed, assets)
         if position and negative:
             pose = Pose.planar(*position, rng.uniform(0, 2 * math.pi), z=negative.pose.z)
             placements.append(replace(negative, id=placements[-1].id + 1, pose=pose))
     return replace(scene, placements=tuple(placements))
-
-
-def _change(
-    original: Placement,
-    kind: str,
-    others: Sequence[Placement],
-    shades: AbstractSet[str],
-    assets: Assets,
-    rng: np.random.Generator,
-) -> Placement | None:
-    """Return the object changed in one respect; None where that is impossible."""
-    if kind == "height":
-        x, y, z = original.scale
-        stretch = rng.uniform(*_STRETCH)
-        factor = stretch if rng.random() < 0.5 else 1 / stretch
-        return at_rest(replace(original, scale=(x, y, z * factor)), assets)
-    if kind == "shade":
-        shade = _other_shade(original.texture, shades)
-        return None if shade is None else replace(original, texture=shade)
-    if kind == "texture":
-        names = [p.texture for p in others if not p.fixed and p.texture != original.texture]
-        return replace(original, texture=names[rng.integers(len(names))]) if names else None
-    shapes = [p for p in others if not p.fixed and p.object != original.object]
-    if not shapes:
-        return None
-    shape = shapes[rng.integers(len(shapes))]
-    return at_rest(replace(original, object=shape.object, size=shape.size, scale=shape.scale), assets)
 
 
 def _other_shade(texture: str, shades: AbstractSet[str]) -> str | None:
