@@ -282,7 +282,14 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
             "object_store_memory": OBJECT_STORE_BYTES,
         }
     else:
-        _check_answers(address)
+        host, _, port = address.rpartition(":")
+        try:  # Ray itself waits for minutes, then ends the process without an exception
+            socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+        except (OSError, OverflowError, ValueError) as error:
+            raise ConfigError(
+                f"no Ray cluster answers at {address} ({error}); `ray status` on its head shows the address, "
+                "HOST:PORT."
+            ) from None
     try:
         ray.init(**options)
     except (ConnectionError, RuntimeError, ValueError) as error:
@@ -294,18 +301,6 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
         yield
     finally:
         ray.shutdown()
-
-
-def _check_answers(address: str) -> None:
-    """Probe a HOST:PORT: Ray itself waits for minutes, then ends the process without an exception."""
-    host, _, port = address.rpartition(":")
-    try:
-        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
-    except (OSError, OverflowError, ValueError) as error:
-        raise ConfigError(
-            f"no Ray cluster answers at {address} ({error}); `ray status` on its head shows the address, "
-            "HOST:PORT."
-        ) from None
 
 
 def _run_all(

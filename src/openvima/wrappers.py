@@ -93,12 +93,14 @@ class FlatAction(gymnasium.ActionWrapper):
 class _PromptedObservation(gymnasium.ObservationWrapper):
     """Encodes a prompt once an episode, and its words anew with the end effector and the tool."""
 
+    _words: np.ndarray  # of `_prompt`, as its images
+    _images: np.ndarray
+
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
         self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
         self._num_words = NUM_BUCKETS + 1 + TOOL_SIZE * (self._base.control == END_EFFECTOR)
-        self._prompt, self._words = None, np.zeros(0, np.float32)
-        self._images = np.zeros(0)
+        self._prompt = None
 
     def _encode_words(self, observation: Mapping[str, Any]) -> np.ndarray:
         """Return words, end effector and tool, and keep the images of the prompt of a new episode."""

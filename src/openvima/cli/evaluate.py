@@ -221,7 +221,7 @@ def main(
             names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)
             print(number, *names, shard.first_seed, shard.episodes, sep="\t")
         return
-    if (shards := parse_shard_range(jobs.shard_range)) is not None:
+    if shards := parse_shard_range(jobs.shard_range):
         with progress_bar("evaluation") as bar:
             is_last = evaluate_range(config, shards, bar)
         if not is_last:

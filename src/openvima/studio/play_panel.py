@@ -213,9 +213,8 @@ class UserPanel:
         if current is not self._episode:
             self._episode, self._recorded = current, ""
         self._forget()
-        if current is None:
-            return
-        self._record.content = self._recording(current)
+        if current is not None:
+            self._record.content = self._recording(current)
 
     def _recording(self, current: EpisodeSession) -> str:
         """Record a success that is all the user's own, and say what is recorded."""

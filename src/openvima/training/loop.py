@@ -329,7 +329,8 @@ class Trainer:
         self.learner.eval()
         metrics = stage.validate() if validates else {}
         self._write(stage, {f"validation_{name}": value for name, value in metrics.items()})
-        self._say_validation(stage, metrics)
+        if metrics and self.parallel.is_first:
+            self._say_validation(stage, metrics)
         name = f"{stage.name}-{self.progress.step:06d}"
         is_last_stage = self.progress.stage == len(self._stages) - 1
         score, error = metrics.get("score", 0.0), metrics.get("score_error", 0.0)
@@ -350,8 +351,6 @@ class Trainer:
         self.parallel.wait()
 
     def _say_validation(self, stage: Stage, metrics: Metrics) -> None:
-        if not (metrics and self.parallel.is_first):
-            return
         step, name = self.progress.step, self.learner.score
         score = metrics.get(name, math.nan)
         logger.info("%s, step %d, held out: %s", stage.name, step, _format(metrics))
