@@ -107,6 +107,13 @@ def test_tasks_without_a_text_form_are_named_where_all_tasks_leave_them_out(verb
     assert not capsys.readouterr().err
 
 
+def test_levels_that_hold_none_of_the_tasks_are_named(capsys) -> None:
+    words = "evaluate --policy oracle --list-shards --episodes 1 --levels L1,L3,L4 --tasks"
+    assert main([*words.split(), "sweep_without_exceeding"]) == main([*words.split(), "all"]) == 0
+    played, said = capsys.readouterr()
+    assert said == "Left out, since they hold none of the tasks: L3, L4.\n" and "rotate\tL3" in played
+
+
 @contextlib.contextmanager
 def ascii_stdout() -> Iterator[io.BytesIO]:
     """Replace stdout by a stream that takes ASCII only."""

@@ -83,6 +83,13 @@ def test_every_study_can_be_planned_at_every_scale(name: str, scale: str) -> Non
         resolve(training.config)
 
 
+def test_networks_of_the_papers_share_pretrained_crops_at_nano_unless_some_take_frames() -> None:
+    for name, crops in (("conditioning", "openvima-vima"), ("image-tokens", None)):
+        plan = plan_study(make_study(name, INPUTS), INPUTS, OUT, seeds=1)
+        assert {training.config.crops_from for training in plan.trainings} == {crops}
+        assert not any(training.config.pretraining.steps for training in plan.trainings)
+
+
 @pytest.mark.parametrize(
     ("runs", "message"),
     [

@@ -17,6 +17,7 @@ from openvima.evaluation import score
 from openvima.evaluation.sources import policy_sources
 from openvima.policies import load_policy, preset
 from openvima.policies.build import build_network
+from openvima.policies.checkpoint import load_network
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.naming import TOKENIZER_FOLDER
 from openvima.policies.pointer.config import AttributeConfig
@@ -24,6 +25,7 @@ from openvima.policies.presets import PRESETS
 from openvima.policies.sizes import VOCABULARY_SIZE
 from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benchmark_vocabulary
 from openvima.training import TrainingConfig, train
+from openvima.training.behaviour_cloning import freezes_crops
 from openvima.training.building import (
     build_learner,
     resolve,
@@ -119,6 +121,25 @@ def test_fine_tuning_compares_attributes_as_the_checkpoint_does(
     assert build_learner(again, ["put it there"]).network.config == first.network.config
     fresh = build_learner(replace(again, init_from=None), ["put it there"])
     assert fresh.network.config.attributes.exclusive
+
+
+def test_crops_come_from_weights_of_another_architecture_and_stay_frozen(settings) -> None:
+    of_vima = {**settings, "pretraining.steps": None, "crops_from": "openvima-vima"}
+    config = resolve(TrainingConfig.of({**of_vima, "preset": "midas-nano"}))
+    network, theirs = build_learner(config, ["put it there"]).network, load_network("openvima-vima")[0]
+    ours = network.object_encoder.crop_encoder.state_dict()
+    for name, tensor in theirs.object_encoder.crop_encoder.state_dict().items():
+        assert torch.equal(ours[name], tensor)
+    assert config.pretraining.steps == 0 and freezes_crops(network, config)
+    for name, message in (
+        ("gato-nano", "the preset takes whole frames"),
+        ("nano", "the preset matches objects by an embedding"),
+    ):
+        with pytest.raises(ConfigError, match=f"crops_from is 'openvima-vima', but {message}"):
+            build_learner(resolve(TrainingConfig.of({**of_vima, "preset": name})), ["put it there"])
+    wider = {**of_vima, "preset": "vima-2m", "model.text_encoder": "small"}
+    with pytest.raises(ConfigError, match=r"whose crop encoder is .*width=96.* Leave it out"):
+        build_learner(resolve(TrainingConfig.of(wider)), ["put it there"])
 
 
 def test_weights_of_another_architecture_are_refused_without_a_list_of_all_sizes(settings) -> None:

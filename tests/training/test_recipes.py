@@ -128,6 +128,7 @@ def test_init_from_disables_pretraining_unless_it_is_set(trained, tmp_path) -> N
         (["--config", str(of_its_own), *init], 0),
         (["--config", str(without)], 0),
         (["--preset", "small", "--init-from", "None"], 4000),
+        (["--preset", "vima-nano", "--crops-from", "other"], 0),
     ):
         assert main(["train", "--data", "demos", "--out", "run", *words]) == 0
         assert resolve(trained[-1]).pretraining.steps == expected, words

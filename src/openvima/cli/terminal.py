@@ -195,13 +195,16 @@ def rich_table(table: "report.Table") -> "Table":
 
 
 def print_left_out(tasks: Sequence[str], prompts: str, levels: Sequence[str]) -> None:
-    """Say on stderr which of all tasks at some levels a run leaves out: their prompts have no text form."""
-    from openvima.tasks.registry import tasks_of
+    """Say on stderr what a run leaves out: tasks whose prompts lack a text form, levels without its tasks."""
+    from openvima.tasks.registry import named_tasks, task_spec, tasks_of
     from openvima.tasks.sampling import takes_prompts
 
     present = sorted({task for level in levels for task in tasks_of(level)})
     if "all" in tasks and (left_out := [task for task in present if not takes_prompts(task, prompts)]):
         print(f"Left out, since their prompts have no text form: {', '.join(left_out)}.", file=sys.stderr)
+    named = [] if "all" in tasks else [task_spec(task).levels for task in named_tasks(tasks)]
+    if named and (empty := [level for level in levels if not any(level in held for held in named)]):
+        print(f"Left out, since they hold none of the tasks: {', '.join(empty)}.", file=sys.stderr)
 
 
 def print_table(table: "Table", *, num_heads: int = 1) -> None:

@@ -48,7 +48,6 @@ COMMON = (
     "out",
     "preset",
     "init_from",
-    "crops_from",
     "t5",
     "force",
     "seed",

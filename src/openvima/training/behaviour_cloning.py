@@ -147,9 +147,8 @@ def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
         return False
     if pretraining.finetune_crop_encoder is not None:
         return not pretraining.finetune_crop_encoder
-    return bool(
-        pretraining.steps or config.crops_from or (config.init_from and encoder.config.appearance_width)
-    )
+    pretrained = pretraining.steps or config.crops_from
+    return bool(pretrained or (config.init_from and encoder.config.appearance_width))
 
 
 def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache], parallel: Parallel) -> None:

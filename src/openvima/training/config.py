@@ -424,8 +424,8 @@ class TrainingConfig(RunConfig):
         preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
             "module:function" for a `Learner` of your own.
         init_from: Initial weights: another run, or other weights that `load_policy` takes.
-        crops_from: Take the crop encoder of other weights, such as "openvima-vima", instead of pretraining
-            one; it stays frozen as if this run had pretrained it.
+        crops_from: Weights whose crop encoder to take, such as "openvima-vima", instead of pretraining one;
+            it stays frozen as if this run had pretrained it.
         t5: Source of the T5 weights and tokenizer, for presets that use them: a folder, or an id on the
             Hugging Face Hub such as "t5-base".
         assets: Asset pack of pretraining: "procedural", the folder of the original one, or FILE.py:FUNCTION.
