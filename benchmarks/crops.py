@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -77,10 +78,9 @@ def all_pairs(num_scenes: int) -> Iterator[tuple[str, Pairs]]:
             name,
             render_pairs(
                 tasks,
-                num_scenes=num_scenes,
+                replace(augmentation, num_scenes=num_scenes),
                 seed=SEED,
                 assets="procedural",
-                augmentation=augmentation,
                 second_view=True,
             ),
         )

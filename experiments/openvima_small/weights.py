@@ -18,7 +18,7 @@ from openvima.policies.checkpoint import load_network, read_info, write_checkpoi
 from openvima.policies.naming import CONFIG_FILE, METRICS_FILE, WEIGHTS_FILE
 from openvima.policies.t5 import tokenizer_for
 from openvima.training.config import flatten
-from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, read_costs, whole_lines
+from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, read_costs, read_lines
 from training_data import appearance_record, appearance_text
 
 RECORD = "training"  # folder beside the weights
@@ -128,4 +128,4 @@ def settings(folder: Path) -> list[tuple[str, str]]:
 
 
 def _sessions(run: Path) -> list[dict[str, Any]]:
-    return [values for _, values in whole_lines(run / SESSIONS_FILE)]
+    return read_lines(run / SESSIONS_FILE)

@@ -22,7 +22,7 @@ from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.build import count_parameters, outline_network
 from openvima.policies.checkpoint import read_info
 from openvima.policies.naming import METRICS_FILE, find_checkpoint
-from openvima.training.run_folder import SESSIONS_FILE, read_costs, whole_lines
+from openvima.training.run_folder import SESSIONS_FILE, read_costs, read_lines
 
 LEVELS = ("L1", "L2", "L3", "L4")
 # Name of a run to what it is, and its options.
@@ -79,14 +79,14 @@ def main() -> None:
 def record_of(what: str, run: Path, scores: Path, *, options: list[str]) -> dict[str, Any]:
     """Return the record of one training and its evaluation, as plain JSON values."""
     results = json.loads((scores / "results.json").read_text("utf-8"))
-    curve = [values for _, values in whole_lines(run / METRICS_FILE) if "validation_loss" in values]
+    curve = [values for values in read_lines(run / METRICS_FILE) if "validation_loss" in values]
     shares = (f"validation_{part}_accuracy" for part in ("object", "pick", "place", "rotation"))
     keys = ("step", "validation_loss", *shares)
     costs = read_costs(run)
     return {
         "what": what,
         "options": options,
-        "commits": sorted({values["git"]["commit"] for _, values in whole_lines(run / SESSIONS_FILE)}),
+        "commits": sorted({values["git"]["commit"] for values in read_lines(run / SESSIONS_FILE)}),
         "parameters": count_parameters(outline_network(read_info(find_checkpoint(run)).config))[
             "total"
         ].total,

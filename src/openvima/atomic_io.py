@@ -249,7 +249,13 @@ def folder_lock(folder: Path, part: Part | None = None, *, timeout_s: float = 0.
         yield
     finally:
         if os.getpid() == process:  # and not a forked child
-            _release(path, descriptor)
+            with _GUARD:
+                _held.discard(path)
+                # Another may have a part, or the folder is gone.
+                with contextlib.suppress(FolderLockedError, OSError):
+                    _lock(descriptor, (0, _END))
+                    path.unlink()
+                os.close(descriptor)
             if is_new:
                 with contextlib.suppress(OSError):  # it is not empty
                     folder.rmdir()
@@ -304,12 +310,3 @@ def _lock(descriptor: int, part: Part) -> None:
             raise FolderLockedError(f"process {owner}" if owner > 0 else "another process") from None
         else:
             raise
-
-
-def _release(path: Path, descriptor: int) -> None:
-    with _GUARD:
-        _held.discard(path)
-        with contextlib.suppress(FolderLockedError, OSError):  # another has a part, or the folder is gone
-            _lock(descriptor, (0, _END))
-            path.unlink()
-        os.close(descriptor)

@@ -4,7 +4,7 @@ import difflib
 import re
 import reprlib
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
@@ -144,19 +144,19 @@ class UnknownWordWarning(UserWarning):
 
 
 @contextmanager
-def unknown_words() -> Iterator[list[UnknownWordWarning]]:
-    """Give the warnings of unknown words inside the block as a list, instead of showing them."""
-    shown, found = warnings.showwarning, []
+def handle_unknown_words(handle: Callable[[UnknownWordWarning], object]) -> Iterator[None]:
+    """Call a function with the warnings of unknown words inside the block, instead of showing them."""
+    shown = warnings.showwarning
 
-    def collect(message: Warning | str, category: type[Warning], *place: Any) -> None:
+    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
         if isinstance(message, UnknownWordWarning):
-            found.append(message)
+            handle(message)
         else:
             shown(message, category, *place)
 
-    warnings.showwarning = collect
+    warnings.showwarning = show
     try:
-        yield found
+        yield
     finally:
         warnings.showwarning = shown
 
@@ -166,7 +166,7 @@ def one_word_warning() -> Iterator[None]:
     """Warn of all unknown words inside the block once, at its end."""
     found: list[UnknownWordWarning] = []
     try:
-        with unknown_words() as found:
+        with handle_unknown_words(found.append):
             yield
     finally:
         if found:

@@ -21,9 +21,9 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
-from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, one_line, unknown_words
+from openvima.errors import ConfigError, UnknownWordWarning, WorkerError, handle_unknown_words, one_line
 from openvima.imports import import_extra
 
 POLL_S = 0.2
@@ -51,11 +51,8 @@ Report = Callable[[int, int, str], None]
 """Called with the number of things done, that of all, and a note."""
 
 
-class Job(Protocol):
-    """A function of one item that calls `count` with the number of things done so far."""
-
-    def __call__(self, item: Any, count: Callable[[int], None], /) -> Any:
-        """Run the job."""
+Job = Callable[[Any, Callable[[int], None]], Any]
+"""A function of one item that calls its second argument with the number of things done so far."""
 
 
 def imap_unordered(
@@ -80,7 +77,15 @@ def imap_unordered(
     check_workers(num_workers)
     report = report or (lambda done: None)
     if num_workers == 1 or len(items) <= 1:
-        yield from _run_serially(job, items, report)
+        counts = list[int]()
+
+        def count(number: int) -> None:
+            counts[-1] = number
+            report(sum(counts))
+
+        for item in items:
+            counts.append(0)
+            yield item, job(item, count)
         return
     context = multiprocessing.get_context("spawn")
     # One number per job, and whether a worker has started: no lock that a killed worker could hold.
@@ -126,18 +131,6 @@ def check_workers(num_workers: int) -> None:
     """
     if not 1 <= num_workers <= MAX_WORKERS:
         raise ConfigError(f"workers is {num_workers}; it must lie within 1 … {MAX_WORKERS}.")
-
-
-def _run_serially(job: Job, items: Sequence[Any], report: Callable[[int], None]) -> Iterator[tuple[Any, Any]]:
-    counts: list[int] = []
-
-    def count(number: int) -> None:
-        counts[-1] = number
-        report(sum(counts))
-
-    for item in items:
-        counts.append(0)
-        yield item, job(item, count)
 
 
 @contextlib.contextmanager
@@ -200,7 +193,8 @@ def _start_worker(counters: Any) -> None:
 
 def _run_one(job: Job, item: Any, slot: int) -> tuple[Any, list[UnknownWordWarning]]:
     """Run a job in a worker; return its result, and the unknown words to warn of where all come together."""
-    with unknown_words() as found:
+    found = list[UnknownWordWarning]()
+    with handle_unknown_words(found.append):
         return job(item, partial(_counters.__setitem__, slot)), found
 
 
@@ -288,7 +282,14 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
             "object_store_memory": OBJECT_STORE_BYTES,
         }
     else:
-        _check_answers(address)
+        host, _, port = address.rpartition(":")
+        try:  # Ray itself waits for minutes, then ends the process without an exception
+            socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+        except (OSError, OverflowError, ValueError) as error:
+            raise ConfigError(
+                f"no Ray cluster answers at {address} ({error}); `ray status` on its head shows the address, "
+                "HOST:PORT."
+            ) from None
     try:
         ray.init(**options)
     except (ConnectionError, RuntimeError, ValueError) as error:
@@ -300,18 +301,6 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
         yield
     finally:
         ray.shutdown()
-
-
-def _check_answers(address: str) -> None:
-    """Probe a HOST:PORT: Ray itself waits for minutes, then ends the process without an exception."""
-    host, _, port = address.rpartition(":")
-    try:
-        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
-    except (OSError, OverflowError, ValueError) as error:
-        raise ConfigError(
-            f"no Ray cluster answers at {address} ({error}); `ray status` on its head shows the address, "
-            "HOST:PORT."
-        ) from None
 
 
 def _run_all(
@@ -380,6 +369,6 @@ def _run_counted(job: Job, item: Any, folder: str) -> tuple[Any, int, list[Unkno
     """
     with contextlib.suppress(OSError):
         os.chdir(folder)
-    counts = [0]
-    with unknown_words() as found:
+    counts, found = [0], list[UnknownWordWarning]()
+    with handle_unknown_words(found.append):
         return job(item, counts.append), counts[-1], found

@@ -133,19 +133,6 @@ Weights: {licence.lower()}. openvima: MIT.
     return files
 
 
-def _of_weights(path: Path, sha256: str) -> Results:
-    """Read the results of the one policy that has these weights."""
-    results = Results.read(path)
-    named = [name for name, what in results.policies.items() if what.get("sha256") == sha256]
-    if not named:
-        raise ConfigError(
-            f"{path} has no scores of these weights, only of {', '.join(results.policy_names())}; evaluate "
-            "the checkpoint, or give the folder in which it was evaluated."
-        )
-    rows = tuple(row for row in results.rows if row.policy == named[0])
-    return replace(results, rows=rows, policies={named[0]: results.policies[named[0]]})
-
-
 def _network(folder: Path) -> str:
     from openvima.policies.build import count_parameters, outline_network
     from openvima.policies.checkpoint import read_info
@@ -181,8 +168,15 @@ def _training(folder: Path) -> str:
 def _scores(path: Path | None, folder: Path, name: HubName) -> str:
     if path is None:
         return "None were pushed with the checkpoint.\n"
-    scores = _of_weights(path, weights_hash(folder))
-    (policy,) = scores.policies
+    results, sha256 = Results.read(path), weights_hash(folder)
+    policy = next((name for name, what in results.policies.items() if what.get("sha256") == sha256), None)
+    if policy is None:
+        raise ConfigError(
+            f"{path} has no scores of these weights, only of {', '.join(results.policy_names())}; evaluate "
+            "the checkpoint, or give the folder in which it was evaluated."
+        )
+    rows = tuple(row for row in results.rows if row.policy == policy)
+    scores = replace(results, rows=rows, policies={policy: results.policies[policy]})
     versions = ", ".join(f"{name} {version}" for name, version in sorted(scores.versions.items()))
     tables = markdown(paper_tables(scores, published=False, confirmed=is_marked_verified(path)))
     command = _fenced(default_command(scores, [str(name)]), "sh")

@@ -93,12 +93,14 @@ class FlatAction(gymnasium.ActionWrapper):
 class _PromptedObservation(gymnasium.ObservationWrapper):
     """Encodes a prompt once an episode, and its words anew with the end effector and the tool."""
 
+    _words: np.ndarray  # of `_prompt`, as its images
+    _images: np.ndarray
+
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
         self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
         self._num_words = NUM_BUCKETS + 1 + TOOL_SIZE * (self._base.control == END_EFFECTOR)
-        self._prompt, self._words = None, np.zeros(0, np.float32)
-        self._images = np.zeros(0)
+        self._prompt = None
 
     def _encode_words(self, observation: Mapping[str, Any]) -> np.ndarray:
         """Return words, end effector and tool, and keep the images of the prompt of a new episode."""
@@ -107,7 +109,11 @@ class _PromptedObservation(gymnasium.ObservationWrapper):
             parts = prompt.sequence()
             self._images = self._encode_images([part for part in parts if not isinstance(part, str)])
             self._prompt, self._words = prompt, _words(parts)
-        tool = _tool(observation["tool"]) if "tool" in observation else ()
+        tool = ()
+        if "tool" in observation:
+            x, y, z, yaw_rad, holds = observation["tool"]
+            height, (x, y) = 2 * z / HIGHEST_TIP_Z_M - 1, _scaled(np.array([x, y]))
+            tool = np.clip([x, y, height, np.sin(yaw_rad), np.cos(yaw_rad), holds], -1, 1)
         return np.concatenate([self._words, [observation["ee"]], tool], dtype=np.float32)
 
     def _encode_images(self, images: list[PromptImage]) -> np.ndarray:
@@ -192,7 +198,10 @@ class FlatObservation(_PromptedObservation):
                 filled[:, 6:8] = np.clip(_scaled(objects.grasp_points()), -1, 1)
             filled[:, 3:5] = objects.boxes[TOP][:, 2:] / (CAMERAS["top"].height, CAMERAS["top"].width)
             filled[:, 5] = index / num_rows
-            filled[:, 8:] = _patches(objects.crops[TOP])
+            # Crops, (N, 3, 32, 32), averaged over patches.
+            crops, side = objects.crops[TOP], objects.crops.shape[-1] // PATCHES
+            tiles = crops.reshape(len(crops), 3, PATCHES, side, PATCHES, side)
+            filled[:, 8:] = tiles.mean(axis=(3, 5)).reshape(len(crops), -1) / 255
             start += len(objects)
         return rows
 
@@ -319,12 +328,6 @@ def _scaled(points: np.ndarray) -> np.ndarray:
     return (points - _LOW) / (_HIGH - _LOW) * 2 - 1
 
 
-def _tool(tool: np.ndarray) -> np.ndarray:
-    x, y, z, yaw_rad, holds = tool
-    height = 2 * z / HIGHEST_TIP_Z_M - 1
-    return np.clip([*_scaled(np.array([x, y])), height, np.sin(yaw_rad), np.cos(yaw_rad), holds], -1, 1)
-
-
 def _words(parts: Sequence[object]) -> np.ndarray:
     """Encode the words of a prompt, shape (64,), float32."""
     words = np.zeros(NUM_BUCKETS, np.float32)
@@ -338,10 +341,3 @@ def _shrunk(image: np.ndarray) -> np.ndarray:
     channels, height, width = image.shape
     tiles = image.reshape(channels, height // 2, 2, width // 2, 2)
     return tiles.mean(axis=(2, 4)).astype(np.uint8)
-
-
-def _patches(crops: np.ndarray) -> np.ndarray:
-    """Average crops, shape (N, 3, 32, 32), over patches: shape (N, 48), 0 … 1."""
-    side = crops.shape[-1] // PATCHES
-    tiles = crops.reshape(len(crops), 3, PATCHES, side, PATCHES, side)
-    return tiles.mean(axis=(3, 5)).reshape(len(crops), -1) / 255

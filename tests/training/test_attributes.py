@@ -1,6 +1,8 @@
 """Training of attributes: labels of rendered objects, captions, and the losses."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,9 +31,9 @@ from openvima.training.pretraining.losses import (
     attribute_loss,
 )
 from openvima.training.pretraining.pairs import (
-    AttributeLabeller,
     AttributeLabels,
     Pairs,
+    attributes_of_object,
     render_pairs,
 )
 from openvima.training.pretraining.stage import (
@@ -45,7 +47,7 @@ from openvima.training.recipes import recipe_settings
 from small_networks import narrow_small
 
 PROBS = {"appearance_randomization_prob": 0.4, "hard_negative_prob": 0.5, "grayscale_prob": 0.3}
-AUGMENTED = {"augmentation": PretrainingConfig(**PROBS), "second_view": True}
+AUGMENTED = PretrainingConfig(num_scenes=12, **PROBS)
 TOKENIZER = WordTokenizer(Vocabulary().extended(caption_texts()))
 
 
@@ -53,24 +55,23 @@ TOKENIZER = WordTokenizer(Vocabulary().extended(caption_texts()))
 def pairs() -> Pairs:
     return render_pairs(
         ("same_shape", "novel_adj"),
-        num_scenes=12,
+        replace(AUGMENTED, attribute_loss_weight=0.5),
         seed=0,
         assets="procedural",
-        **AUGMENTED,
-        with_attributes=True,
+        second_view=True,
     )
 
 
 @pytest.fixture(scope="module")
-def labeller() -> AttributeLabeller:
-    return AttributeLabeller(RandomAppearanceAssets(load_assets("procedural")))
+def labeller() -> Callable:
+    return partial(attributes_of_object, assets=RandomAppearanceAssets(load_assets("procedural")))
 
 
 def placement(name: str, texture: str = "red", height: float = 1.0) -> Placement:
     return Placement(5, name, texture, (0.07, 0.07, 0.07), Pose.planar(0.5, 0.0), scale=(1.0, 1.0, height))
 
 
-def labels_of(labeller: AttributeLabeller, *placements: Placement) -> AttributeLabels:
+def labels_of(labeller: Callable, *placements: Placement) -> AttributeLabels:
     """Labels of objects that look in their prompt image as in their scene."""
     columns = [torch.from_numpy(np.stack(column)) for column in zip(*map(labeller, placements), strict=True)]
     boxes = torch.zeros(len(placements), 3, 2, 4, dtype=torch.int64)
@@ -126,7 +127,13 @@ def test_pairs_are_labelled_as_rendered(pairs):
     assert torch.equal(is_same[:, 0], ~pairs.is_grayscale)
     assert torch.equal(labels.boxes.any(dim=-1), pairs.masks)
     np.testing.assert_allclose(labels.colours.sum(dim=-1), 1.0, rtol=1e-5)
-    plain = render_pairs(("same_shape", "novel_adj"), num_scenes=2, seed=0, assets="procedural", **AUGMENTED)
+    plain = render_pairs(
+        ("same_shape", "novel_adj"),
+        replace(AUGMENTED, num_scenes=2),
+        seed=0,
+        assets="procedural",
+        second_view=True,
+    )
     assert plain.attributes is None
     assert torch.equal(plain.crops[:, 1], pairs.crops[: len(plain.scenes), 1])
 
@@ -151,7 +158,7 @@ def test_the_loss_falls_as_what_is_alike_is_projected_together(labeller):
         projected = axes[None, :, None].expand(3, -1, len(ATTRIBUTES), -1).clone()
         projected[:, :, 1:] = torch.eye(4)[0]  # the others learn nothing here
         features = torch.zeros(3, 2, 4, 1)
-        return float(attribute_loss(Ideal(projected), features, masks, labels, temperature=0.1))
+        return float(attribute_loss(Ideal(projected), features, masks, labels))
 
     assert loss([0, 0, 1, 1]) < loss([0, 1, 2, 3]) < loss([0, 1, 0, 1])
     right = loss([0, 0, 1, 1])
@@ -170,7 +177,7 @@ def test_a_few_steps_fit_the_attributes(pairs):
     optimizer = torch.optim.Adam(attributes.projections.parameters(), 1e-3)
     for _ in range(15):
         optimizer.zero_grad()
-        attribute_loss(attributes, features, masks, pairs.attributes, temperature=0.1).backward()
+        attribute_loss(attributes, features, masks, pairs.attributes).backward()
         optimizer.step()
     after = attribute_accuracy(encoder, attributes, pairs)
     # Those without a prompt image that has both are left out; these scenes have few of a profile.

@@ -15,7 +15,7 @@ from openvima.tasks.novel_words import gray_image
 from openvima.training.augmentation.scenes import with_random_appearance
 from openvima.training.config import PretrainingConfig
 from openvima.training.pretraining import losses
-from openvima.training.pretraining.losses import find_matches, info_nce, retrieval_accuracy
+from openvima.training.pretraining.losses import TEMPERATURE, find_matches, info_nce, retrieval_accuracy
 from openvima.training.pretraining.pairs import (
     Pairs,
     pairs_of_scene,
@@ -75,12 +75,12 @@ def test_matches_are_no_negatives_of_the_loss_and_the_accuracy():
     own, other = torch.tensor([1.0, 0.0]), torch.tensor([0.8, 0.6])
     first, second = torch.stack([other, other]), torch.stack([own, other])  # both are more like the second
     is_match = torch.eye(2, dtype=torch.bool)
-    strict_loss, strict = info_nce(first, second, is_match, temperature=1.0)
+    strict_loss, strict = info_nce(first, second, is_match)
     is_match[0, 1] = True
-    loss, accuracy = info_nce(first, second, is_match, temperature=1.0)
+    loss, accuracy = info_nce(first, second, is_match)
     assert (strict, accuracy) == (0.5, 1.0)
     assert loss < strict_loss
-    scores = first @ second.T
+    scores = first @ second.T / TEMPERATURE
     # What is left: the second row against the first object, and that object against the second row.
     apart = torch.stack([scores[1, 0] - scores[1, 1], scores[1, 0] - scores[0, 0]])
     torch.testing.assert_close(loss, apart.exp().log1p().sum() / 4)

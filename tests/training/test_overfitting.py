@@ -69,7 +69,7 @@ def stage_of(model: PolicyNetwork, runs: Sequence[Demonstration], folder: Path) 
         augmentation=AugmentationConfig(false_positive_prob=0.0),
     )
     learner = PolicyLearner(model, processor, config.augmentation)
-    return BehaviourCloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
+    return BehaviourCloning(learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
 
 
 @pytest.mark.parametrize("architecture", ["vima", "midas"])

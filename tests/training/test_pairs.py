@@ -1,6 +1,7 @@
 """Pairs of contrastive pretraining: where they come from, augmentation, and rotations between their views."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,11 +15,6 @@ from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConf
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
 from openvima.tasks import sample_episode
-from openvima.training.augmentation.crops import (
-    draw_channel_mixing,
-    with_horizontal_flips,
-    with_occlusion,
-)
 from openvima.training.augmentation.scenes import (
     rearrange,
     with_hard_negatives,
@@ -27,8 +23,8 @@ from openvima.training.augmentation.scenes import (
 from openvima.training.config import PretrainingConfig
 from openvima.training.loop import step_generator
 from openvima.training.parallel import Parallel
-from openvima.training.pretraining import pairs as pairs_module
 from openvima.training.pretraining.losses import (
+    draw_channel_mixing,
     is_rotation_correct,
     rotation_loss,
 )
@@ -38,13 +34,17 @@ from openvima.training.pretraining.pairs import (
     render_pairs,
     stack_rows,
 )
+from openvima.training.pretraining.stage import with_horizontal_flips, with_occlusion
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
+PLAIN = PretrainingConfig()
+LABELLED = PretrainingConfig(attribute_loss_weight=0.5)
 HARD = PretrainingConfig(appearance_randomization_prob=0.5, hard_negative_prob=0.6)
 
 
-def rendered(num_scenes: int, *, seed: int = 0, tasks: tuple[str, ...] = TASKS, **options) -> Pairs:
-    return render_pairs(tasks, num_scenes=num_scenes, seed=seed, assets="procedural", **options)
+def rendered(num_scenes: int, *, seed=0, tasks=TASKS, augmentation=PLAIN, **options) -> Pairs:
+    config = replace(augmentation, num_scenes=num_scenes)
+    return render_pairs(tasks, config, seed=seed, assets="procedural", **options)
 
 
 def test_pairs_follow_from_the_seed():
@@ -57,7 +57,7 @@ def test_pairs_follow_from_the_seed():
 
 @pytest.mark.slow
 def test_workers_change_nothing(monkeypatch):
-    monkeypatch.setattr(pairs_module, "_CHUNK", 3)
+    monkeypatch.setattr("openvima.training.pretraining.pairs._CHUNK", 3)
     options = {"augmentation": HARD, "second_view": True}
     one, three = (rendered(7, **options, workers=workers) for workers in (1, 3))
     for name in ("crops", "appearances", "scenes", "is_grayscale"):
@@ -70,8 +70,8 @@ def test_processes_share_the_scenes(monkeypatch):
     one, *parts = (
         rendered(
             5,
+            augmentation=LABELLED,
             second_view=True,
-            with_attributes=True,
             parallel=Parallel(rank, count, torch.device("cpu")),
         )
         for rank, count in ((0, 1), (0, 2), (1, 2))
@@ -170,13 +170,13 @@ def encoder() -> ObjectEncoder:
 def test_nothing_comes_from_the_test_levels(augmentation, monkeypatch):
     """Pairs show training objects in textures of their role, and random ones where it is asked for."""
     shown = []
-    original = pairs_module._prompt_image
+    original = Rasteriser.prompt
 
-    def spy(placement, *rest):
-        shown.append(placement)
-        return original(placement, *rest)
+    def spy(self, prompt):
+        shown.append(prompt.images[0][1].placement)
+        return original(self, prompt)
 
-    monkeypatch.setattr(pairs_module, "_prompt_image", spy)
+    monkeypatch.setattr(Rasteriser, "prompt", spy)
     tasks = (*TASKS, "rotate", "sweep_without_exceeding")
     pairs = rendered(30, seed=3, tasks=tasks, augmentation=augmentation, second_view=augmentation is HARD)
     pools = [pool(task, "train") for task in tasks]

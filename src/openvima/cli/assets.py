@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 
 def gallery(*, out: Path, assets: str = "procedural") -> int:
@@ -33,7 +33,7 @@ def gallery(*, out: Path, assets: str = "procedural") -> int:
 
 
 def import_(
-    checkout: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKOUT")],
+    checkout: Annotated[Positional[Path], arg(metavar="CHECKOUT")],
 ) -> int:
     """Import the asset pack of the original benchmark; then "--assets original" uses it everywhere.
 
@@ -70,20 +70,20 @@ def info() -> None:
     from openvima.input_files import cache_dir
     from openvima.tasks import list_tasks
 
-    problems = None if not imported_folder().is_dir() else OriginalAssets(imported_folder()).problems()
+    problems: list[str] = []
     print(f"procedural  made by code: {len(OBJECTS)} objects, {len(TEXTURES)} textures")
     list_tasks()  # files of tasks may register objects and textures
     if own := [*REGISTERED_OBJECTS, *REGISTERED_TEXTURES]:
         num_objects = len(REGISTERED_OBJECTS)
         print(f"registered  {num_objects} objects, {len(own) - num_objects} textures: {', '.join(own)}")
-    if problems is None:
-        print("original    not imported; `openvima assets import CHECKOUT` reads it from a checkout")
+    if (folder := imported_folder()).is_dir():
+        problems, total = OriginalAssets(folder).problems(), len(known_hashes())
+        print(f"original    {total - len(problems)} of {total} files imported: {folder}")
     else:
-        total = len(known_hashes())
-        print(f"original    {total - len(problems)} of {total} files imported: {imported_folder()}")
+        print("original    not imported; `openvima assets import CHECKOUT` reads it from a checkout")
     size_mb = sum(file.stat().st_size for file in cache_dir().rglob("*") if file.is_file()) / 1e6
     print(f"cache       {size_mb:.0f} MB in {cache_dir()}; all but the import is made anew when needed")
-    _list_problems(problems or [])
+    _list_problems(problems)
 
 
 def _list_problems(problems: list[str]) -> None:

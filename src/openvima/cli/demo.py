@@ -2,13 +2,9 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment, Task
+from openvima.cli.terminal import DEFAULT_ENVIRONMENT, Environment, Task
 from openvima.data.chat_settings import DEFAULT_OPTIONS, ChatView, VlmOptions
-
-if TYPE_CHECKING:
-    from openvima.scene import Episode
 
 
 def main(
@@ -82,7 +78,6 @@ def main(
 
     env_config = EnvConfig(**asdict(environment))
     load_assets(env_config.assets)  # may register objects of the task that is sampled next
-    start: int | Episode = seed
     if episode is not None:
         start = load_episode(episode, assets=env_config.assets)
         env = env_config.make(HOST_TASK, "train", domain="user", realtime=True)
@@ -91,6 +86,7 @@ def main(
             require_goals(start.problem)
     else:
         assert task is not None  # as checked
+        start = seed
         check_task_options((task,), env_config.task_options)
         env = env_config.make(task, level, domain="user", realtime=True)
         what, title = f"{task}, seed {seed}", f"{task} · {level} · seed {seed}"

@@ -10,20 +10,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
-from openvima.cli.options import Json, Out
-from openvima.cli.terminal import Report, progress_bar, refuse_existing
+from openvima.cli.terminal import Json, Out, Report, progress_bar, refuse_existing
 from openvima.errors import ConfigError
 from openvima.policies.base import require_torch, torch_threads
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
 if TYPE_CHECKING:
-    from openvima.detector.evaluation import CocoEvaluation
     from openvima.detector.frames import Frame, FrameSampler
 
-Folder = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DETECTOR")]
-Training = Annotated[DetectorTrainingConfig, tyro.conf.arg(name="")]
+Folder = Annotated[Positional[Path | None], arg(metavar="DETECTOR")]
+Training = Annotated[DetectorTrainingConfig, arg(name="")]
 LEVEL = "L3"  # with objects and textures that are not in the training set
 FRAMES_PER_EPISODE = 2  # one time step in both views
 
@@ -86,7 +84,11 @@ def evaluate(
         name = str(detector or "bundled")
         print(json.dumps({"detector": name, **source, "seed": seed, **asdict(result)}))
     else:
-        _print_result(result)
+        print(f"{result.objects:,} objects in {result.frames:,} frames")
+        print(f"{'':<8}{'AP':>8}{'AP50':>8}{'AP75':>8}{'recall':>8}")
+        for name, metrics in (("boxes", result.boxes), ("masks", result.masks)):
+            cells = (metrics.ap, metrics.ap50, metrics.ap75, metrics.recall)
+            print(f"{name:<8}" + "".join(f"{cell:>8.3f}" for cell in cells))
 
 
 def show(
@@ -127,7 +129,7 @@ def show(
 
 
 def convert(
-    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")],
+    source: Annotated[Positional[Path], arg(metavar="IN")],
     out: Out,
     *,
     force: bool = False,
@@ -158,7 +160,7 @@ def _frames(
     seed: int,
 ) -> "Iterator[FrameSampler]":
     """Frames of a folder, or of temporary demonstrations."""
-    from openvima.data import Dataset
+    from openvima.data import Dataset, GenerateConfig, generate
     from openvima.detector.frames import FrameSampler
 
     problems = []
@@ -182,18 +184,11 @@ def _frames(
         yield FrameSampler(dataset, episodes)
         return
     with tempfile.TemporaryDirectory() as folder:
-        _generate(Path(folder, "demos"), level or LEVEL, frames, seed)
-        yield FrameSampler(Dataset(Path(folder, "demos")))
-
-
-def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
-    """Generate enough episodes for the frames."""
-    from openvima.data import GenerateConfig, generate
-
-    config = GenerateConfig(out=folder, level=level, start_seed=seed)
-    episodes = -(-frames // (FRAMES_PER_EPISODE * len(config.resolved_tasks())))
-    with progress_bar("demonstrations") as report:
-        generate(replace(config, episodes=episodes), report)
+        config = GenerateConfig(out=Path(folder, "demos"), level=level or LEVEL, start_seed=seed)
+        episodes = -(-frames // (FRAMES_PER_EPISODE * len(config.resolved_tasks())))
+        with progress_bar("demonstrations") as report:
+            generate(replace(config, episodes=episodes), report)
+        yield FrameSampler(Dataset(config.out))
 
 
 def _counted(frames: "Iterable[Frame]", total: int, report: Report) -> "Iterator[Frame]":
@@ -201,14 +196,6 @@ def _counted(frames: "Iterable[Frame]", total: int, report: Report) -> "Iterator
         report(number, total, "")
         yield frame
     report(total, total, "")
-
-
-def _print_result(result: "CocoEvaluation") -> None:
-    print(f"{result.objects:,} objects in {result.frames:,} frames")
-    print(f"{'':<8}{'AP':>8}{'AP50':>8}{'AP75':>8}{'recall':>8}")
-    for name, metrics in (("boxes", result.boxes), ("masks", result.masks)):
-        cells = (metrics.ap, metrics.ap50, metrics.ap75, metrics.recall)
-        print(f"{name:<8}" + "".join(f"{cell:>8.3f}" for cell in cells))
 
 
 COMMANDS = {"train": train, "evaluate": evaluate, "show": show, "convert": convert}

@@ -6,10 +6,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
+from tyro.conf import OmitArgPrefixes
 
-from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment, Json
 from openvima.cli.terminal import (
+    DEFAULT_ENVIRONMENT,
+    Environment,
+    Json,
     parse_list,
     parse_shard_range,
     print_left_out,
@@ -133,11 +135,11 @@ def main(
     force: bool = False,
     as_json: Json = False,
     environment: Environment = DEFAULT_ENVIRONMENT,
-    ablation: tyro.conf.OmitArgPrefixes[AblationOptions] = AblationOptions(),
-    recording: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions(),
-    network: tyro.conf.OmitArgPrefixes[NetworkOptions] = NetworkOptions(),
-    jobs: tyro.conf.OmitArgPrefixes[JobOptions] = JobOptions(),
-    chat: tyro.conf.OmitArgPrefixes[ChatOptions] = ChatOptions(),
+    ablation: OmitArgPrefixes[AblationOptions] = AblationOptions(),
+    recording: OmitArgPrefixes[RecordingOptions] = RecordingOptions(),
+    network: OmitArgPrefixes[NetworkOptions] = NetworkOptions(),
+    jobs: OmitArgPrefixes[JobOptions] = JobOptions(),
+    chat: OmitArgPrefixes[ChatOptions] = ChatOptions(),
     vlm: VlmOptions = DEFAULT_OPTIONS,
 ) -> None:
     """Score policies on tasks and levels, and write results.json and report.html.
@@ -219,7 +221,7 @@ def main(
             names = (" ".join(filter(None, (shard.policy, shard.ablation))), shard.task, shard.level)
             print(number, *names, shard.first_seed, shard.episodes, sep="\t")
         return
-    if (shards := parse_shard_range(jobs.shard_range)) is not None:
+    if shards := parse_shard_range(jobs.shard_range):
         with progress_bar("evaluation") as bar:
             is_last = evaluate_range(config, shards, bar)
         if not is_last:

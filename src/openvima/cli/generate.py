@@ -6,8 +6,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
-from openvima.cli.options import DEFAULT_ENVIRONMENT, Environment
-from openvima.cli.terminal import parse_list, parse_shard_range, print_left_out, progress_bar
+from openvima.cli.terminal import (
+    DEFAULT_ENVIRONMENT,
+    Environment,
+    parse_list,
+    parse_shard_range,
+    print_left_out,
+    progress_bar,
+)
 
 
 def main(

@@ -1,20 +1,18 @@
 """The `openvima` program: dispatches to the module of the verb and reports errors in one line."""
 
 import importlib
+import io
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from typing import Any
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE, NO_SPACE
-from openvima.cli.terminal import accept_any_text
 from openvima.errors import (
     OpenVimaError,
     Terminated,
-    UnknownWordWarning,
     echo,
+    handle_unknown_words,
     one_word_warning,
     unknown_name,
 )
@@ -68,7 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit status: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted, 143 ended by SIGTERM.
     """
-    accept_any_text()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # letters that their encoding lacks
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in (*_HELP, "help"):
         verbs = "\n".join(f"  {verb:<15} {summary}" for verb, summary in VERBS.items())
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] not in VERBS:
         return _fail(unknown_name("verb", words[0], VERBS), 2)
     one_warning = one_word_warning() if words[0] in _SCORING else nullcontext()
-    with _warnings_in_one_line(), one_warning:
+    with handle_unknown_words(lambda found: _fail(f"UnknownWordWarning: {found}", 0)), one_warning:
         return _run(words[0], words[1:])
 
 
@@ -111,8 +111,7 @@ def _run(verb: str, rest: list[str]) -> int:
         sys.stderr.close()
         return 1
     except Exception as error:
-        message, status = _explained(error)
-        return _fail(message, status)
+        return _fail(*_explained(error))
 
 
 def _explained(error: Exception) -> tuple[str, int]:
@@ -131,22 +130,6 @@ def _explained(error: Exception) -> tuple[str, int]:
     if error.filename is None:
         return f"{name}: {error}", 1
     return f"cannot use {error.filename}: {reason}. Give a path that can be read and written.", 2
-
-
-@contextmanager
-def _warnings_in_one_line() -> Iterator[None]:
-    """Print warnings of unknown words as errors are, without the line of code that gave them."""
-    shown = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
-        if issubclass(category, UnknownWordWarning):
-            _fail(f"{category.__name__}: {message}", 0)
-        else:
-            shown(message, category, *place)
-
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield
 
 
 def _fail(message: str, status: int) -> int:

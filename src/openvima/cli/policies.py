@@ -4,10 +4,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
-from openvima.cli.options import Out, Policy, Repository
-from openvima.cli.terminal import print_files, print_table, refuse_existing
+from openvima.cli.terminal import (
+    Out,
+    Policy,
+    Repository,
+    print_files,
+    print_table,
+    refuse_existing,
+)
 from openvima.errors import UnknownPolicyError
 from openvima.policies.base import require_torch
 from openvima.policies.naming import (
@@ -38,10 +44,23 @@ def list_() -> None:
     Example: openvima policies
     """
     require_torch("counting parameters")
-    from openvima.policies.build import count_parameters, outline_network
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from openvima.policies.build import PARTS, count_parameters, outline_network
     from openvima.policies.checkpoint import read_info
 
-    _print_table({name: preset(name) for name in PRESETS})
+    table = Table(title="parameters in millions", box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
+    for name in ("preset", "width", "layers", "heads", *PARTS, "total", "trained", "frozen"):
+        table.add_column(name, justify="left" if name == "preset" else "right", no_wrap=True)
+    for name in PRESETS:
+        config = preset(name)
+        counts, decoder = count_parameters(outline_network(config)), config.decoder
+        totals = [count.total for count in counts.values()]
+        millions = map(_millions, (*totals, counts["total"].trainable, counts["total"].frozen))
+        table.add_row(name, str(decoder.width), str(decoder.num_layers), str(decoder.num_heads), *millions)
+    print_table(table)
+    print(*_NOTES, sep="\n")
     for name, folder in BUNDLED.items():
         total = count_parameters(outline_network(read_info(folder).config))["total"]
         print(f"\n{name}, a bundled checkpoint, {_millions(total.total)} M parameters")
@@ -60,15 +79,22 @@ def show(policy: Policy) -> None:
             file, or OWNER/NAME[@REVISION] on the Hugging Face Hub.
     """
     require_torch("counting parameters")
-    from openvima.policies.build import config_to_dict, count_parameters, outline_network
-
-    config, bundled = _config(policy), BUNDLED.get(policy)
-    counts = count_parameters(outline_network(config))
     import yaml
 
+    from openvima.policies.build import config_to_dict, count_parameters, outline_network
+    from openvima.policies.checkpoint import load_network, read_info
+
+    if policy in PRESETS:
+        config = preset(policy)
+    elif not PolicyRef.parse(policy).has_weights:
+        raise UnknownPolicyError(unknown_policy(policy, ()))
+    else:
+        found = find_checkpoint(policy)
+        config = read_info(found).config if found.is_dir() else load_network(found)[0].config
+    counts = count_parameters(outline_network(config))
     print(f"{policy}: {_summary(config, counts['total'])}")
-    if bundled:
-        _print_facts(bundled)
+    if policy in BUNDLED:
+        _print_facts(BUNDLED[policy])
     print(f"\n{'part':<10}{'trained':>14}{'frozen':>14}{'total':>14}")
     for part, count in counts.items():
         print(f"{part:<10}{count.trainable:>14,}{count.frozen:>14,}{count.total:>14,}")
@@ -76,7 +102,7 @@ def show(policy: Policy) -> None:
 
 
 def convert(
-    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IN")],
+    source: Annotated[Positional[str], arg(metavar="IN")],
     out: Out,
     *,
     tokenizer: str | None = None,
@@ -122,7 +148,7 @@ def convert(
 
 
 def push_to_hub(
-    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")],
+    source: Annotated[Positional[str], arg(metavar="SOURCE")],
     name: Repository,
     *,
     results: Path | None = None,
@@ -154,17 +180,6 @@ def push_to_hub(
         print(push_policy(source, name, results=results, licence=licence, private=private))
 
 
-def _config(policy: str) -> "PolicyConfig":
-    if policy in PRESETS:
-        return preset(policy)
-    from openvima.policies.checkpoint import load_network, read_info
-
-    if not PolicyRef.parse(policy).has_weights:
-        raise UnknownPolicyError(unknown_policy(policy, ()))
-    found = find_checkpoint(policy)
-    return read_info(found).config if found.is_dir() else load_network(found)[0].config
-
-
 def _summary(config: "PolicyConfig", total: "Count") -> str:
     decoder = config.decoder
     layers = "1 layer" if decoder.num_layers == 1 else f"{decoder.num_layers} layers"
@@ -177,26 +192,6 @@ def _summary(config: "PolicyConfig", total: "Count") -> str:
 def _print_facts(bundled: Path) -> None:
     print(f"  weights:     {(bundled / WEIGHTS_FILE).stat().st_size / 1e6:.1f} MB")
     print(f"  model card:  {bundled / MODEL_CARD}")
-
-
-def _print_table(configs: dict[str, "PolicyConfig"]) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from openvima.policies.build import PARTS, count_parameters, outline_network
-
-    table = Table(title="parameters in millions", box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
-    for number, name in enumerate(
-        ("preset", "width", "layers", "heads", *PARTS, "total", "trained", "frozen")
-    ):
-        table.add_column(name, justify="right" if number else "left", no_wrap=True)
-    for name, config in configs.items():
-        counts, decoder = count_parameters(outline_network(config)), config.decoder
-        totals = [count.total for count in counts.values()]
-        millions = map(_millions, (*totals, counts["total"].trainable, counts["total"].frozen))
-        table.add_row(name, str(decoder.width), str(decoder.num_layers), str(decoder.num_heads), *millions)
-    print_table(table)
-    print(*_NOTES, sep="\n")
 
 
 def _millions(count: int) -> str:

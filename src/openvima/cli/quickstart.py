@@ -71,8 +71,8 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     with progress_bar("1/3 demonstrations") as report:
         data = generate(demonstrated, report)
-    words = ("--data", f"{data}", "--out", f"{run}", "--seed", f"{seed}")
-    words = (*words, *SHORT_TRAINING, "--runtime.processes", f"{min(2, num_cpus())}")
+    processes = f"--runtime.processes={min(2, num_cpus())}"
+    words = (f"--data={data}", f"--out={run}", f"--seed={seed}", processes, *SHORT_TRAINING)
     train_in_processes(parse(words), words, label="2/3 training")
     with progress_bar("3/3 evaluation") as report:
         path = evaluate_and_report(evaluated, progress=report)

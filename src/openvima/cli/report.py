@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
-from openvima.cli.options import Json
-from openvima.cli.terminal import parse_list
+from openvima.cli.terminal import Json, parse_list
 
 
 def main(
-    results: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RESULTS")],
+    results: Annotated[Positional[tuple[Path, ...]], arg(metavar="RESULTS")],
     *,
     out: Path | None = None,
     compare: str | None = None,

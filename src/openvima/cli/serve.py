@@ -5,7 +5,7 @@ import os
 import sys
 from dataclasses import asdict
 
-from openvima.cli.options import Policy
+from openvima.cli.terminal import Policy
 
 
 def main(
@@ -50,8 +50,8 @@ def main(
         idle_s: Seconds after which a client is dropped that sends nothing.
         trust_code: Run the code that a run folder names, as that of a learner of your own does.
     """
-    from openvima.evaluation.results import versions
     from openvima.evaluation.sources import policy_sources
+    from openvima.imports import versions_of
     from openvima.policies import load_policy
     from openvima.serving import serve
     from openvima.serving.protocol import TOKEN_VARIABLE, require_extra
@@ -72,12 +72,10 @@ def main(
     (source,) = policy_sources([f"{name}={policy}" if name else policy])
     source.check(trust_code=trust_code)
     loaded = load_policy(policy, device=device, trust_code=trust_code)
-    found = versions(with_torch=source.kind != "random")
+    packages = ("numpy",) if source.kind == "random" else ("numpy", "torch")
     about = {
         "policy": {"name": source.name, **source.record(), "device": device},
-        "versions": {
-            package: found[package] for package in ("openvima", "numpy", "torch") if package in found
-        },
+        "versions": dict(versions_of(*packages)),
     }
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
     serve(loaded, **asdict(settings), about=about, ready=lambda url: print(url, flush=True))

@@ -8,13 +8,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from openvima.cli.terminal import parse_list
 
 
 def main(
-    path: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PATH")] = None,
+    path: Annotated[Positional[Path | None], arg(metavar="PATH")] = None,
     *,
     port: int = 0,
     open: bool = False,

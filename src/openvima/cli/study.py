@@ -4,18 +4,15 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from openvima.cli.terminal import parse_list, print_table, progress_bar
 
-if TYPE_CHECKING:
-    from openvima.studies.plan import Plan
-
 
 def main(
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")],
+    name: Annotated[Positional[str], arg(metavar="NAME")],
     *,
     out: Path,
     scale: Literal["nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m"] = "nano",
@@ -59,6 +56,9 @@ def main(
             there is one, and act on a CPU.
         dry_run: Print the stages; write nothing.
     """
+    from rich.table import Table
+
+    from openvima.evaluation.config import plan as plan_evaluation
     from openvima.studies import StudyInputs, check_options, make_study, run_study, scale_named
     from openvima.studies.plan import plan_study
     from openvima.studies.runner import check_plan
@@ -84,25 +84,17 @@ def main(
     if dry_run:
         found = plan_study(study, inputs, out, seeds=seeds, **how)
         check_plan(found)
-        _print_plan(found)
+        table = Table("stage", "folder")
+        for config in found.data.values():
+            table.add_row(f"{config.episodes:,} demonstrations of {len(config.tasks)} tasks", f"{config.out}")
+        for training in found.all_trainings:
+            table.add_row(f"training of {training.config.preset}", f"{training.config.out}")
+        for evaluation in found.evaluations:
+            number = sum(batch.episodes for batch in plan_evaluation(evaluation.config))
+            table.add_row(f"evaluation in {number:,} episodes", f"{evaluation.config.out}")
+        print_table(table)
         return
     with progress_bar("stages") as bar:
         page = run_study(study, inputs, out, seeds=seeds, command=command, report=bar, **how)
     print(f"Report: {page}", file=sys.stderr)
     print(page)
-
-
-def _print_plan(plan: "Plan") -> None:
-    from rich.table import Table
-
-    from openvima.evaluation.config import plan as plan_evaluation
-
-    table = Table("stage", "folder")
-    for config in plan.data.values():
-        table.add_row(f"{config.episodes:,} demonstrations of {len(config.tasks)} tasks", f"{config.out}")
-    for training in plan.all_trainings:
-        table.add_row(f"training of {training.config.preset}", f"{training.config.out}")
-    for evaluation in plan.evaluations:
-        episodes = sum(batch.episodes for batch in plan_evaluation(evaluation.config))
-        table.add_row(f"evaluation in {episodes:,} episodes", f"{evaluation.config.out}")
-    print_table(table)

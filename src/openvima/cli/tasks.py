@@ -1,15 +1,8 @@
 """`openvima tasks`: list the tasks."""
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-from openvima.cli.options import Task
-from openvima.cli.terminal import print_table
+from openvima.cli.terminal import Task, print_table
 from openvima.tasks.options import option_descriptions
 from openvima.tasks.registry import oracle_record
-
-if TYPE_CHECKING:
-    from openvima.tasks import TaskSpec
 
 
 def main(
@@ -25,19 +18,31 @@ def main(
         name: Task to describe, with its options for --task-options.
         level: List the tasks of this level only: train, L1 to L8.
     """
+    from rich.table import Table
+    from rich.text import Text
+
     from openvima.tasks import task_spec
     from openvima.tasks.registry import tasks_of
 
     if name is not None:
-        _describe(task_spec(name))
+        spec = task_spec(name)
+        descriptions, families = option_descriptions(spec), ", ".join(spec.families).replace("_", " ")
+        print(f"{name}: {spec.summary}\nPrompt: {spec.template}")
+        print(f"Levels: {', '.join(spec.levels)}. At most {spec.max_steps} steps. Family: {families}.")
+        if descriptions:
+            table = Table("option", "default", "description", title=f"options of {name}")
+            for option, default in spec.options.items():
+                table.add_row(option, _shown(default), descriptions[option])
+            print_table(table)
+        if "difficulty" in descriptions:
+            print(f"Example: openvima demo {name} --task-options difficulty=hard")
         return
     specs = [task_spec(name) for name in tasks_of(level)]
-    from rich.table import Table
-    from rich.text import Text
-
     columns = ("task", "family", "prompt", "tool", "levels", "steps", "oracle")
     table = Table(*columns, title=f"{len(specs)} tasks", show_lines=True)
     for spec in specs:
+        record = oracle_record(spec.name).values()
+        episodes, solved = (sum(level[name] for level in record) for name in ("episodes", "successes"))
         table.add_row(
             spec.name,
             ", ".join(spec.families).replace("_", " "),
@@ -45,30 +50,12 @@ def main(
             spec.end_effector,
             " ".join(spec.levels),
             f"{spec.oracle_max_steps} + 2",
-            _percent(oracle_record(spec.name)),
+            f"{100 * solved / episodes:.2f}" if episodes else "-",
         )
     print_table(table)
     print("steps: the oracle's limit, and what a policy may add to it")
     print("oracle: success rate in %, over all levels")
     print("`openvima tasks TASK` lists the options of a task")
-
-
-def _describe(spec: "TaskSpec") -> None:
-    """Print one task with its options."""
-    from rich.table import Table
-
-    descriptions = option_descriptions(spec)
-    table = Table("option", "default", "description", title=f"options of {spec.name}")
-    for name, default in spec.options.items():
-        table.add_row(name, _shown(default), descriptions[name])
-    families = ", ".join(spec.families).replace("_", " ")
-    for line in (f"{spec.name}: {spec.summary}", f"Prompt: {spec.template}"):
-        print(line)
-    print(f"Levels: {', '.join(spec.levels)}. At most {spec.max_steps} steps. Family: {families}.")
-    if descriptions:
-        print_table(table)
-    if "difficulty" in descriptions:
-        print(f"Example: openvima demo {spec.name} --task-options difficulty=hard")
 
 
 def _shown(default: object) -> str:
@@ -78,9 +65,3 @@ def _shown(default: object) -> str:
     if isinstance(default, tuple | list):
         return "+".join(map(str, default))
     return "" if default is None else str(default)
-
-
-def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
-    episodes = sum(level["episodes"] for level in record.values())
-    solved = sum(level["successes"] for level in record.values())
-    return f"{100 * solved / episodes:.2f}" if episodes else "-"

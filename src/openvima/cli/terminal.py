@@ -1,22 +1,59 @@
-"""What commands read and print: options that hold several values, streams of any encoding, progress, tables.
+"""What commands read and print: options of several of them, streams of any encoding, progress, tables.
 
 Progress is shown on stderr: bars for `report(done, total, note)` callbacks. Where stderr is no terminal,
 these are lines: one at the start, one a minute and one at the end.
 """
 
-import io
 import os
 import re
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
+
+Folder = Annotated[Path, Positional, arg(metavar="FOLDER")]
+Out = Annotated[Path, Positional, arg(metavar="OUT")]
+Policy = Annotated[str, Positional, arg(metavar="POLICY")]
+Repository = Annotated[str, Positional, arg(metavar="OWNER/NAME")]
+Task = Annotated[str | None, Positional, arg(metavar="TASK")]
+Json = Annotated[bool, arg(name="json")]
+
+
+@dataclass(frozen=True, slots=True)
+class EnvironmentOptions:
+    """Tasks, prompts and control.
+
+    Args:
+        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
+            or FILE.py:FUNCTION, which registers assets of your own.
+        compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
+        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
+            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
+        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
+            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
+            all that have the option.
+        control: primitives; or end_effector, where an action moves the tool for 0.1 s (see
+            docs/end_effector.md), for policies of that control and the oracle.
+    """
+
+    assets: str = "procedural"
+    compat: bool = False
+    prompts: str = "multimodal"
+    task_options: str = ""
+    control: Literal["primitives", "end_effector"] = "primitives"
+
+
+Environment = OmitArgPrefixes[EnvironmentOptions]
+DEFAULT_ENVIRONMENT = EnvironmentOptions()
 
 
 def parse_list(text: str) -> tuple[str, ...]:
@@ -52,13 +89,6 @@ def refuse_existing(out: Path, *, force: bool) -> None:
     """
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
-
-
-def accept_any_text() -> None:
-    """Let stdout and stderr escape letters that their encoding lacks, instead of failing."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
 
 
 LINE_S = 60.0  # between two lines, where stderr is no terminal

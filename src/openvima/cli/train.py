@@ -104,10 +104,10 @@ def parse(words: Sequence[str]) -> "TrainingConfig":
     first.add_argument("--trust-code", action="store_true")
     first.add_argument("--help-all", action="store_true")
     chosen, rest = first.parse_known_args(list(words))
-    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in _DECIDING:
-        peek.add_argument(f"--{name.replace('_', '-')}", f"--{name}", dest=name)
-    known = vars(peek.parse_known_args(rest)[0])
+    for name in _DECIDING:  # these are parsed again, with the others
+        first.add_argument(f"--{name.replace('_', '-')}", f"--{name}", dest=name)
+    peeked = vars(first.parse_known_args(rest)[0])
+    known = {name: peeked[name] for name in _DECIDING}
     file = read_settings(chosen.config, trust_code=chosen.trust_code) if chosen.config else {}
     preset = known.pop("preset") or file.get("preset")
     settings = override(recipe_settings(chosen.recipe or default_recipe(preset or "nano")), file)
@@ -160,6 +160,8 @@ def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: st
     Returns:
         The run folder.
     """
+    import torch
+
     from openvima.training import train
     from openvima.training.parallel import start_peers
 
@@ -168,7 +170,9 @@ def train_in_processes(config: "TrainingConfig", words: Sequence[str], label: st
     if not log.handlers:
         log.addHandler(_Lines())
     is_first = os.environ.get("RANK", "0") == "0"
-    others = _num_processes(config) - 1 if "WORLD_SIZE" not in os.environ else 0
+    others = 0 if "WORLD_SIZE" in os.environ else config.runtime.processes - 1
+    if config.runtime.device in ("auto", "cuda") and (num_gpus := torch.cuda.device_count()):
+        others = min(others, num_gpus - 1)  # at most one on each
     with (
         start_peers(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
         progress_bar(label) if is_first else nullcontext() as report,
@@ -183,16 +187,6 @@ class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         prefix = "openvima: warning: " if record.levelno >= logging.WARNING else ""
         print(prefix + record.getMessage(), file=sys.stderr)
-
-
-def _num_processes(config: "TrainingConfig") -> int:
-    """Return how many processes to start: on GPUs at most one on each."""
-    import torch
-
-    runtime = config.runtime
-    if runtime.device in ("auto", "cuda") and (num_gpus := torch.cuda.device_count()):
-        return min(runtime.processes, num_gpus)
-    return runtime.processes
 
 
 def _rollout(config: "TrainingConfig") -> "OnlineEval":

@@ -1,7 +1,6 @@
 """`openvima verify-results`: confirm an evaluation from its recorded actions."""
 
-from openvima.cli.options import Folder
-from openvima.cli.terminal import progress_bar
+from openvima.cli.terminal import Folder, progress_bar
 
 
 def main(

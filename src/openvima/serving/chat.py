@@ -153,10 +153,15 @@ class ChatClient:
             ServerError: The server is away, or refuses the key, the model or the images.
             LimitReachedError: The limit of requests or tokens is reached.
         """
-        settings = self._settings(schema)
+        options, settings = self.config.options, dict[str, Any](model=self.model)
+        if options.temperature >= 0:
+            settings["temperature"] = options.temperature
+        if not options.free_text:
+            named = {"name": "action", "strict": True, "schema": schema}
+            settings["response_format"] = {"type": "json_schema", "json_schema": named}
         messages = f'"messages": [{", ".join(turn.message for turn in turns)}]}}'.encode()
-        named = json.dumps([self.config.server, settings]).encode()
-        request = hashlib.sha256(named + messages).hexdigest()[:32]
+        asked = json.dumps([self.config.server, settings]).encode() + messages
+        request = hashlib.sha256(asked).hexdigest()[:32]
         folder = self.config.answers
         path = None if folder is None else folder / request[:2] / f"{request}.json"
         if path is not None and path.is_file():
@@ -174,16 +179,6 @@ class ChatClient:
             if is_shared:
                 self.turn.acquire()
         return answer
-
-    def _settings(self, schema: Mapping[str, Any]) -> dict[str, Any]:
-        options = self.config.options
-        settings: dict[str, Any] = {"model": self.model}
-        if options.temperature >= 0:
-            settings["temperature"] = options.temperature
-        if not options.free_text:
-            named = {"name": "action", "strict": True, "schema": schema}
-            settings["response_format"] = {"type": "json_schema", "json_schema": named}
-        return settings
 
     def _reserve(self) -> None:
         """Count a request, if there may be one more."""

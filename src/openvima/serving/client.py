@@ -180,19 +180,16 @@ class RemotePolicy(Policy):
             self._socket.send(request)
             data = self._socket.recv(timeout=self._timeout_s)
         if isinstance(data, str):  # a refusal; the connection stays as it is
-            raise self._refusal(data)
+            # That of a policy names no address, since results keep it.
+            if data.startswith(POLICY_FAILED):
+                raise PolicyRaisedError(f"the policy on the server raised {echo(data[len(POLICY_FAILED) :])}")
+            if re.match(r"(Policy|Prompt|Shape|Action)Error: ", data):
+                raise PolicyError(f"the policy on the server refuses: {echo(data)}")
+            raise ServerError(f"{self.url} refuses: {echo(data)}")
         with self._closed_by_errors():
             answer = check_form(unpack(data), dict, "the answer")
             check_form(answer.get("type"), (message["type"],), "the type of the answer")
         return answer
-
-    def _refusal(self, text: str) -> ServerError | PolicyError:
-        """Return the error for a refusal; that of a policy names no address, since results keep it."""
-        if text.startswith(POLICY_FAILED):
-            return PolicyRaisedError(f"the policy on the server raised {echo(text[len(POLICY_FAILED) :])}")
-        if re.match(r"(Policy|Prompt|Shape|Action)Error: ", text):
-            return PolicyError(f"the policy on the server refuses: {echo(text)}")
-        return ServerError(f"{self.url} refuses: {echo(text)}")
 
     @contextmanager
     def _closed_by_errors(self) -> Iterator[None]:

@@ -5,7 +5,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 from openvima.errors import ConfigError, ServerError, echo
 from openvima.policies.naming import LEROBOT, SERVER_SCHEMES
@@ -64,8 +63,10 @@ def lerobot_server(source: str, python: str, *, device: str = "cpu") -> Iterator
             try:
                 url = next((line.strip() for line in process.stdout if line.startswith(SERVER_SCHEMES)), None)
                 if url is None:
+                    log.seek(0)
+                    lines = log.read().decode(errors="replace").strip().splitlines() or ["it wrote nothing"]
                     raise ServerError(
-                        f"{python} cannot serve {echo(source)}: {_last_line(log)}. "
+                        f"{python} cannot serve {echo(source)}: {echo(lines[-1].strip('. '))}. "
                         "plugins/lerobot/make_environment.sh makes an environment that can."
                     )
                 yield url
@@ -77,9 +78,3 @@ def lerobot_server(source: str, python: str, *, device: str = "cpu") -> Iterator
                     process.wait(_STOP_S)
                 except subprocess.TimeoutExpired:
                     process.kill()
-
-
-def _last_line(log: IO[bytes]) -> str:
-    log.seek(0)
-    lines = log.read().decode(errors="replace").strip().splitlines()
-    return echo(lines[-1].strip(". ")) if lines else "it wrote nothing"

@@ -38,12 +38,13 @@ from openvima.serving.protocol import (
 from openvima.tasks.prompts import check_prompts, describe
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 _MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
 HEALTH_PATH = "/healthz"
 CLOSE_S = 2.0  # for the other side to say goodbye
+_Started = Future[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]]  # URL, loop, and what stops it
 _LOG = logging.getLogger(__name__)
 _TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
 _TRANSPORT_LOG.setLevel(logging.CRITICAL)  # a traceback for every port scan; `serve_client` says what matters
@@ -264,15 +265,11 @@ def serve_in_thread(
     require_extra()
     server = _PolicyServer(policy, config := ServerConfig(port=port, **settings), about or {})
     check_can_listen(config.host, config.port)
-    started: Future[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
-
-    async def run() -> None:
-        loop, stop = asyncio.get_running_loop(), asyncio.Event()
-        await server.run(lambda url: started.set_result((url, loop, stop)), stop)
+    started: _Started = Future()
 
     def work() -> None:
         try:
-            asyncio.run(run())
+            asyncio.run(server.run(started))
         except BaseException as error:
             if started.done():
                 raise
@@ -306,11 +303,11 @@ class _PolicyServer:
         first = {"protocol": PROTOCOL, "versions": {"openvima": __version__}}
         self._metadata = pack({**first, **about, "modalities": modalities, "control": control})
 
-    async def run(self, ready: Callable[[str], None], stop: asyncio.Event) -> None:
-        """Serve until `stop` is set, or this is cancelled."""
+    async def run(self, started: _Started) -> None:
+        """Serve until the event is set that is given once clients can connect."""
         from websockets.asyncio.server import serve
 
-        config = self._config
+        config, stop = self._config, asyncio.Event()
         with ThreadPoolExecutor(1, "openvima-policy", _set_threads, (config.num_threads,)) as self._computing:
             async with serve(
                 self._serve_client,
@@ -325,7 +322,9 @@ class _PolicyServer:
                 close_timeout=CLOSE_S,
                 logger=_TRANSPORT_LOG,
             ) as server:
-                ready(_address(server))
+                host, port = next(iter(server.sockets)).getsockname()[:2]
+                url = f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
+                started.set_result((url, asyncio.get_running_loop(), stop))
                 await stop.wait()
 
     def _admit(self, connection: "ServerConnection", request: "Request") -> "Response | None":
@@ -353,8 +352,16 @@ class _PolicyServer:
             return
         self._num_connections += 1
         _LOG.info("%s: connected", _name(connection))
+        session, loop = Session(self._new_policy(), self._config), asyncio.get_running_loop()
+        reply: bytes | str = self._metadata
         try:
-            await self._converse(connection)
+            while True:
+                async with asyncio.timeout(self._config.idle_s):
+                    await connection.send(reply)
+                    data = await connection.recv()
+                reply = await loop.run_in_executor(self._computing, session.answer, data)
+                if isinstance(reply, str):
+                    _LOG.warning("%s: refused: %s", _name(connection), reply)
         except TimeoutError:
             reason = f"no whole message within {self._config.idle_s:g} s"
             _LOG.warning("%s: dropped, %s", _name(connection), reason)
@@ -364,28 +371,11 @@ class _PolicyServer:
         finally:
             self._num_connections -= 1
 
-    async def _converse(self, connection: "ServerConnection") -> None:
-        session = Session(self._new_policy(), self._config)
-        reply: bytes | str = self._metadata
-        loop = asyncio.get_running_loop()
-        while True:
-            async with asyncio.timeout(self._config.idle_s):
-                await connection.send(reply)
-                data = await connection.recv()
-            reply = await loop.run_in_executor(self._computing, session.answer, data)
-            if isinstance(reply, str):
-                _LOG.warning("%s: refused: %s", _name(connection), reply)
-
 
 def _set_threads(num_threads: int) -> None:
     """Runs in the thread that computes: torch keeps the number for each thread."""
     if (torch := sys.modules.get("torch")) is not None:  # else no policy can use it
         torch.set_num_threads(num_threads)
-
-
-def _address(server: "Server") -> str:
-    host, port = next(iter(server.sockets)).getsockname()[:2]
-    return f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
 
 
 def _name(connection: "ServerConnection") -> str:

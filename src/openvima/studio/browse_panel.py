@@ -28,12 +28,13 @@ _NOTHING = np.full((1, 1, 3), 255, np.uint8)
 class BrowsePanel:
     """The tab *Browse*."""
 
+    _results: tuple[Path, Results]  # as opened
+    _dataset: Dataset
+
     def __init__(self, session: BrowserSession) -> None:
         self.session = session
-        self._results: tuple[Path, Results] | None = None
         self._cell = ("", "")  # task and level
         self._rows: list[viser.GuiButtonGroupHandle] = []
-        self._dataset: Dataset | None = None
         self._found = np.zeros(0, np.int64)
         self._demo: Demonstration | None = None
         gui = session.gui
@@ -78,16 +79,15 @@ class BrowsePanel:
             DatasetError: It is neither a results folder nor a data folder.
         """
         folder = as_path(self._path.value)
-        if (folder / FILE_NAME).is_file() or folder.suffix == ".json":
+        if is_evaluation := (folder / FILE_NAME).is_file() or folder.suffix == ".json":
             results = Results.read(folder)
-            self._results, self._dataset = (folder, results), None
+            self._results = folder, results
             self._title.content = f"`{folder}`: {sum(row.episodes for row in results.rows):,} episodes"
             self._policy.options = results.policy_names()
             self._ablation.options = list(dict.fromkeys(row.ablation or _NONE for row in results.rows))
             self._show_matrix()
         elif (folder / MANIFEST_NAME).is_file():
-            dataset = Dataset(folder)
-            self._results, self._dataset = None, dataset
+            dataset = self._dataset = Dataset(folder)
             self._title.content = f"`{folder}`: {len(dataset):,} demonstrations"
             self._choices["task"].options = [_ALL, *dataset.manifest["tasks"]]
             self._find()
@@ -95,14 +95,13 @@ class BrowsePanel:
             raise DatasetError(
                 f"{folder} holds neither {FILE_NAME} nor {MANIFEST_NAME}; give another folder."
             )
-        self._results_folder.visible = self._results is not None
-        self._data_folder.visible = self._dataset is not None
+        self._results_folder.visible = is_evaluation
+        self._data_folder.visible = not is_evaluation
 
     def _show_matrix(self) -> None:
         """Show a row of buttons for each task, one for each level."""
         for group in self._rows:
             group.remove()
-        assert self._results is not None  # as opened
         rates: dict[str, dict[str, float]] = {}  # by task and level
         for row in self._results[1].rows:
             if (row.policy, row.ablation) == (self._policy.value, self._chosen_ablation):
@@ -121,7 +120,6 @@ class BrowsePanel:
 
     def _show_cell(self, task: str = "", level: str = "") -> None:
         """List the episodes of a cell; by default of that in view."""
-        assert self._results is not None  # as opened
         task, level = self._cell = (task, level) if task else self._cell
         row = self._results[1].row(self._policy.value, task, level, self._chosen_ablation)
         outcomes = () if row is None else row.outcomes
@@ -142,7 +140,7 @@ class BrowsePanel:
             DatasetError: None is chosen.
         """
         seed = self._outcome.value.partition(":")[0]
-        if self._results is None or not seed.isdigit():
+        if not seed.isdigit():
             raise DatasetError("no episode is chosen; choose a cell and an episode.")
         found = evaluated_episode(
             self._results[0],
@@ -165,7 +163,6 @@ class BrowsePanel:
 
     def _find(self) -> None:
         """Find the demonstrations that the fields ask for."""
-        assert self._dataset is not None  # as opened
         fields = {name: field.value for name, field in self._choices.items() if field.value != _ALL}
         fewest, most = (int(value) for value in self._steps.value)
         limit = None if most == _MOST_STEPS else most
@@ -178,7 +175,7 @@ class BrowsePanel:
     def _load(self) -> None:
         """Read the chosen demonstration."""
         number = int(self._number.value)
-        if self._dataset is None or number >= len(self._found):
+        if number >= len(self._found):
             self._demo, self._caption.content = None, ""
             self._views.image = _NOTHING
             return

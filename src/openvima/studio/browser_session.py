@@ -116,13 +116,13 @@ class Table:
         self,
         name: str,
         placement: Placement,
+        pose: Pose,
         *,
-        pose: Pose | None = None,
         colour: Colour = PLACE,
         opacity: float = 0.3,
         grow: float = 1.0,
     ) -> viser.MeshHandle:
-        """Add a translucent copy of an object, where it is or at a pose, below the table's root."""
+        """Add a translucent copy of an object at a pose, below the table's root."""
         mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
         centre = mesh.vertices.reshape(-1, 3).mean(axis=0)
         vertices = (mesh.vertices.reshape(-1, 3) - centre) * grow + centre
@@ -136,7 +136,7 @@ class Table:
             cast_shadow=False,
             receive_shadow=False,
         )
-        move(node, placement.pose if pose is None else pose)
+        move(node, pose)
         return node
 
     def _show_objects(self, scene: Scene) -> None:
@@ -145,7 +145,6 @@ class Table:
             placement = placements.get(object_id)
             if placement is None or self._shape(placement) != self._shapes[object_id]:
                 self.objects.pop(object_id).remove()
-                del self._shapes[object_id]
         for object_id, placement in placements.items():
             if object_id not in self.objects:
                 self._shapes[object_id] = self._shape(placement)
@@ -302,13 +301,6 @@ class BrowserSession:
             return None
         config = self.config
         return load_own_rollout_policy(name, device=config.device, trust_code=config.trust_code)
-
-    def choose_policy(self, name: str) -> None:
-        """Let a policy decide from here on."""
-        self.policy, self.policy_name = self.load_policy(name), name
-        if self.current is not None:
-            self.current.policy = self.policy
-            self.changed()
 
     def choose_assets(self, name: str) -> None:
         """Use an asset pack for what is opened from here on."""

@@ -15,7 +15,7 @@ from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
 from openvima.studio.browser_session import BrowserSession, move
-from openvima.studio.composition import Composition, shelf
+from openvima.studio.composition import Composition, parse_goals, shelf
 
 _FIRST = Composition((), "Put the {a} into the {b}.", goals=(("in", "a", "b"),))
 _FIRST_OBJECTS = (("block", "red"), ("bowl", "green"))
@@ -132,13 +132,23 @@ class ComposePanel:
         self._use(self._present().moved(self._selected.value, (x, y), yaw_deg))
 
     def _rewrite(self) -> None:
-        prompt, goals = self._prompt.value, self._goals.value
-        max_steps, tool = int(self._steps.value), self._tool.value
-        self._use(self._present().rewritten(prompt, goals, max_steps=max_steps, end_effector=tool))
+        """Apply the fields; images whose placeholder is gone are left out."""
+        scene, prompt = self._present(), self._prompt.value
+        new = replace(
+            scene,
+            prompt=prompt,
+            images={slot: image for slot, image in scene.images.items() if f"{{{slot}}}" in prompt},
+            goals=parse_goals(self._goals.value),
+            max_steps=int(self._steps.value),
+            end_effector=self._tool.value,
+        )
+        self._use(new)
 
     def _insert(self, image: object) -> None:
-        scene = replace(self._present(), prompt=self._prompt.value)
-        self._use(scene.with_image(self._slot.value.strip(), image))
+        """Show an image at a placeholder, which is added at the end of the prompt if it is not there."""
+        scene, slot, prompt = self._present(), self._slot.value.strip(), self._prompt.value
+        prompt += "" if f"{{{slot}}}" in prompt else f" {{{slot}}}"
+        self._use(replace(scene, prompt=prompt, images={**scene.images, slot: image}))
 
     def _play(self) -> None:
         self._present()

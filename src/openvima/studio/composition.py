@@ -219,26 +219,6 @@ class Composition:
         gone = self[handle]
         return replace(self, objects=tuple(each for each in self.objects if each is not gone))
 
-    def rewritten(
-        self, prompt: str, goals_text: str, *, max_steps: int | None, end_effector: EndEffector
-    ) -> "Composition":
-        """Change the prompt and what counts as solved; images whose placeholder is gone are left out.
-
-        Raises:
-            SceneError: The goals are not of the form of `goals_text`.
-        """
-        used = {slot: image for slot, image in self.images.items() if f"{{{slot}}}" in prompt}
-        goals = parse_goals(goals_text)
-        return replace(
-            self, prompt=prompt, images=used, goals=goals, max_steps=max_steps, end_effector=end_effector
-        )
-
-    def with_image(self, slot: str, image: Any) -> "Composition":
-        """Show an image at a placeholder, which is added at the end of the prompt if it is not there."""
-        shown = f"{{{slot}}}"
-        prompt = self.prompt if shown in self.prompt else f"{self.prompt} {shown}"
-        return replace(self, prompt=prompt, images={**self.images, slot: image})
-
     def scene_image(self) -> list[tuple[str, str, tuple[float, float], float]]:
         """Return the present arrangement in the form of a prompt image of a whole scene."""
         return [(each.object, each.texture, each.position, each.yaw_deg) for each in self.objects]

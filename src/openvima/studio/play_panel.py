@@ -67,9 +67,13 @@ class PlayPanel:
 
     def _choose_policy(self) -> None:
         self._source.visible = self._name.value == _OTHER
-        name = self._source.value.strip() if self._source.visible else self._name.value
-        if name and name != self.session.policy_name:
-            self.session.choose_policy(name)
+        session, name = self.session, self._name.value
+        name = self._source.value.strip() if name == _OTHER else name
+        if name and name != session.policy_name:
+            session.policy, session.policy_name = session.load_policy(name), name
+            if session.current is not None:
+                session.current.policy = session.policy
+                session.changed()
 
     def _open(self) -> None:
         """Show the episode before the policy, which takes longer to load."""
@@ -198,7 +202,7 @@ class UserPanel:
             action = clicked_action(current.scene, first, first, turn_rad=math.radians(self._turn.value))
             pose = pose_after(placement.pose, action)
             self._help.content = f"Picked {current.scene.describe(placement.id)}. Now click its **place**."
-            self._nodes.append(self.session.table.add_ghost(_GHOST, placement, pose=pose, grow=1.05))
+            self._nodes.append(self.session.table.add_ghost(_GHOST, placement, pose, grow=1.05))
 
     def _forget(self) -> None:
         self._first = None
@@ -209,9 +213,8 @@ class UserPanel:
         if current is not self._episode:
             self._episode, self._recorded = current, ""
         self._forget()
-        if current is None:
-            return
-        self._record.content = self._recording(current)
+        if current is not None:
+            self._record.content = self._recording(current)
 
     def _recording(self, current: EpisodeSession) -> str:
         """Record a success that is all the user's own, and say what is recorded."""
@@ -224,13 +227,12 @@ class UserPanel:
             return f"Nothing is recorded: {error}"
         actions = [step.action for step in current.steps]
         solved = current.outcome is not None and current.outcome.success
-        if solved and self._recorded:
-            return self._recorded
-        if solved and all(step.action is not step.proposal.action for step in current.steps):
+        is_own = all(step.action is not step.proposal.action for step in current.steps)
+        if solved and is_own and not self._recorded:
             count = record_demonstration(folder, current.episode, actions, env_config=config)
             self._recorded = f"**Recorded**: {count} demonstration{'s' * (count > 1)} in `{folder}`."
-            return self._recorded
-        return f"What you solve without a policy is recorded in `{folder}`."
+        hint = f"What you solve without a policy is recorded in `{folder}`."
+        return self._recorded if solved and self._recorded else hint
 
 
 _NOBODY = "nobody"
@@ -271,26 +273,27 @@ class WhyPanel:
         lines, panels = [], []
         runs = self.session.runs()
         for (table, run), name in zip(runs, (self.session.policy_name, self._other.value), strict=False):
-            proposal = run.propose() if self._shown.value else None
             if len(runs) > 1:
                 lines.append(f"**{name}**: {run.summary()}")
                 self._add_label(table, "name", name, (0.82, 0.0))
-            if proposal is None:
+            if not self._shown.value:
                 continue
+            proposal = run.propose()
             if proposal.error is not None:
                 lines.append(f"**{name}**: {proposal.error}")
             if proposal.action is not None:
                 self._add_arrow(table, "action", proposal.action)
-            if proposal.explanation is not None:
-                if proposal.explanation.words:
-                    lines.append(f"{name} said:\n\n> {_quoted(proposal.explanation.words)}")
-                elif proposal.explanation.bins and not proposal.explanation.objects:
-                    self._add_heat_maps(table, proposal.explanation)
+            if (why := proposal.explanation) is not None:
+                if why.words:
+                    # As it is, without letting it write Markdown.
+                    said = re.sub(r"([\\`*_{}\[\]<>()#+!|])", r"\\\1", echo(why.words, 2000))
+                    lines.append(f"{name} said:\n\n> {said}")
+                elif why.bins and not why.objects:
+                    self._add_heat_maps(table, why)
                 else:
-                    self._explain(table, run, proposal.explanation)
-                panels.append(draw_panel(run.scene, self.session.assets, proposal.explanation))
-                rows = attention_rows(proposal.explanation)
-                self.session.prompt_weights = self.session.prompt_weights or rows
+                    self._explain(table, run, why)
+                panels.append(draw_panel(run.scene, self.session.assets, why))
+                self.session.prompt_weights = self.session.prompt_weights or attention_rows(why)
             elif proposal.action is not None:
                 lines.append(f"{name} explains nothing; the arrow is its action.")
         if len(runs) > 1:
@@ -321,7 +324,7 @@ class WhyPanel:
             if placement is not None and each.probability >= LEAST_SHOWN:
                 style = {"colour": PICK, "opacity": 0.15 + 0.6 * each.probability, "grow": 1.04}
                 name = f"objects/{placement.id}/why"  # moves with the object
-                self._nodes.append(table.add_ghost(name, placement, pose=Pose((0.0, 0.0, 0.0)), **style))
+                self._nodes.append(table.add_ghost(name, placement, Pose((0.0, 0.0, 0.0)), **style))
                 xy = placement.pose.x, placement.pose.y
                 self._add_label(table, f"pick{placement.id}", percent(each.probability), xy)
         picked = max(explanation.objects, key=lambda each: each.probability, default=None)
@@ -334,7 +337,7 @@ class WhyPanel:
             if placement is not None and run.scene.end_effector == "suction":
                 moved = replace(action, pose1_position=place.position)
                 pose, opacity = pose_after(placement.pose, moved), 0.12 + 0.4 * place.probability
-                ghost = table.add_ghost(f"why/{number}", placement, pose=pose, opacity=opacity)
+                ghost = table.add_ghost(f"why/{number}", placement, pose, opacity=opacity)
                 self._nodes.append(ghost)
 
     def _add_label(self, table: Table, name: str, text: str, position: tuple[float, float]) -> None:
@@ -362,8 +365,3 @@ class WhyPanel:
         for table, run in self.session.runs():
             self._add_arrow(table, "difference", run.steps[index].action, PICK)
         return f"The **first difference** is step {index + 1}: the orange arrows."
-
-
-def _quoted(words: str) -> str:
-    """Show what a model said as it is, without letting it write Markdown."""
-    return re.sub(r"([\\`*_{}\[\]<>()#+!|])", r"\\\1", echo(words, 2000))

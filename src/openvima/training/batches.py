@@ -115,7 +115,8 @@ class BatchMaker:
     def __call__(self, indices: np.ndarray, number: int) -> list[tuple[Any, int]]:
         """Return the parts of one batch, each with its number of demonstration steps."""
         parts = []
-        for part in self._divide(indices):
+        groups = self.source.by_length(indices)
+        for part in (g[i : i + self.largest] for g in groups for i in range(0, len(g), self.largest)):
             rows = self.source.rows[part].tolist()
             rngs = [np.random.default_rng([self.seed, number, row]) for row in rows]
             examples = [self._draw(row, rng) for row, rng in zip(rows, rngs, strict=True)]
@@ -139,13 +140,6 @@ class BatchMaker:
             definer = self.definers[int(rng.integers(len(self.definers)))]
             example = replace(example, definer=self.source.example(definer))
         return example
-
-    def _divide(self, indices: np.ndarray) -> list[np.ndarray]:
-        return [
-            group[start : start + self.largest]
-            for group in self.source.by_length(indices)
-            for start in range(0, len(group), self.largest)
-        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

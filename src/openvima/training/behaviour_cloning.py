@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,6 @@ class BehaviourCloning:
 
     Args:
         learner: The trained module.
-        module: The learner, wrapped for distributed training if needed.
         config: All settings.
         training: Demonstrations to train on.
         validation: Held-out demonstrations.
@@ -43,7 +43,6 @@ class BehaviourCloning:
     def __init__(
         self,
         learner: Learner,
-        module: nn.Module,
         config: TrainingConfig,
         training: ExampleSource,
         validation: ExampleSource,
@@ -52,7 +51,8 @@ class BehaviourCloning:
     ) -> None:
         self.learning_rate = config.optimizer.learning_rate
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
-        self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
+        self._learner, self._module = learner, parallel.wrap(learner)
+        self._config, self._parallel = config, parallel
         self._training, self._validation, self._alternatives = training, validation, alternatives
         self._order = make_order(training, config.loader, config.seed, parallel)
         self._batches: Iterator[list[tuple[Any, int]]] = iter(())
@@ -69,9 +69,15 @@ class BehaviourCloning:
         for number, (batch, num_steps) in enumerate(parts):
             # Gradients are averaged over processes: each counts by its fraction of all steps.
             weight = num_steps * self._parallel.num_ranks / total
-            with self._parallel.synchronized(self._module, last=number == len(parts) - 1):
+            is_alone, is_last = self._parallel.num_ranks == 1, number == len(parts) - 1
+            # Gradients are synchronized in the last backward pass of a step only.
+            with nullcontext() if is_alone or is_last else self._module.no_sync():  # type: ignore[operator]
                 loss, metrics = self._call(batch, self._module)
-                self._parallel.with_all_gradients(loss * weight, self.parameters).backward()
+                weighted = loss * weight
+                # DDP waits for a gradient of every parameter; prompts without images leave some out.
+                if not is_alone:
+                    weighted = weighted + 0.0 * torch.stack([each.sum() for each in self.parameters]).sum()
+                weighted.backward()
             _add(sums, {"loss": loss, **metrics}, weight)
         return sums
 
@@ -91,9 +97,7 @@ class BehaviourCloning:
         sums: Metrics = {}
         # Sorted by length, to reduce padding; processes take parts in turn.
         rows = np.lexsort(source.lengths.T[::-1])
-        for number, start in enumerate(range(0, len(rows), size)):
-            if number % ranks != self._parallel.rank:
-                continue
+        for start in range(self._parallel.rank * size, len(rows), ranks * size):
             for group in source.by_length(rows[start : start + size]):
                 batch = collate([source[index] for index in group.tolist()], None)
                 loss, metrics = self._call(batch, self._learner)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -15,12 +14,11 @@ from openvima.policies.build import PolicyConfig, appearance_width, build_networ
 from openvima.policies.checkpoint import load_network
 from openvima.policies.naming import find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.presets import PRESETS, own_policies, preset
 from openvima.policies.processor import Processor
 from openvima.policies.sizes import t5_name
 from openvima.policies.t5 import load_t5, tokenizer_for
-from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import image_tokens, with_variant
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
@@ -132,11 +130,11 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
 
 
 def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
-    augmentation = {f"augmentation.{n}": v for n, v in flatten(config.identity()["augmentation"]).items()}
+    augmentation = flatten(asdict(config.augmentation), "augmentation")
     augmentation.pop("augmentation.false_positive_prob")  # ignored unless its collator uses it
     given = {
         "pretraining.steps": config.pretraining.steps,
-        **{f"model.{name}": value for name, value in asdict(config.model).items()},
+        **flatten(asdict(config.model), "model"),
         "t5": config.t5,
         **augmentation,
     }
@@ -180,7 +178,13 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
         _check_sizes(sizes, initial.config, config.init_from)
         sizes = replace(sizes, prompt=initial.config.prompt)
     if sizes.prompt.tokenizer == "t5":
-        tokenizer = _t5_tokenizer(config, sizes, stored)
+        where = config.t5 or stored
+        if where is None:
+            raise ConfigError(
+                f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to "
+                "the folder that holds it, or to 't5-base'. Its weights are then not read."
+            )
+        tokenizer = tokenizer_for(sizes.prompt, where)
         for text in texts:  # a word that T5 lacks is named before the first step
             tokenizer.encode(text)
     else:
@@ -198,23 +202,10 @@ def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
     return PolicyLearner(network, Processor(*sizes.inputs, tokenizer), config.augmentation)
 
 
-def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | None) -> Tokenizer:
-    where = config.t5 or stored
-    if where is None:
-        raise ConfigError(
-            f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to the "
-            "folder that holds it, or to 't5-base'. Its weights are then not read."
-        )
-    return tokenizer_for(sizes.prompt, where)
-
-
 def _compare_like(ours: PolicyConfig, theirs: PolicyConfig) -> PolicyConfig:
     """Compare attributes as the weights to begin with have learned to, which is no matter of size."""
-    if not (isinstance(ours, PointerConfig) and isinstance(theirs, PointerConfig)):
-        return ours
-    if ours.attributes is None or theirs.attributes is None:
-        return ours
-    return replace(ours, attributes=replace(ours.attributes, exclusive=theirs.attributes.exclusive))
+    here, there = (getattr(sizes, "attributes", None) for sizes in (ours, theirs))
+    return replace(ours, attributes=replace(here, exclusive=there.exclusive)) if here and there else ours
 
 
 def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
@@ -314,10 +305,6 @@ def _descriptions(dataset: Dataset) -> set[str]:
         images = pa.Table.from_struct_array(table.column("prompt_images").combine_chunks().flatten())
         shown = images.filter(pc.field("kind") == "object").column("objects").combine_chunks().flatten()
         records = pa.Table.from_struct_array(shown).select(["object", "texture"])
-        names.update((record["object"], record["texture"]) for record in _different(records))
+        different = records.group_by(["object", "texture"]).aggregate([]).to_pylist()
+        names.update((record["object"], record["texture"]) for record in different)
     return {description_of(ObjectRecord(0, *each)) for each in names} - {""}
-
-
-def _different(table: pa.Table) -> list[dict[str, str]]:
-    """Return the different rows of a table."""
-    return table.group_by(table.column_names).aggregate([]).to_pylist()

@@ -48,11 +48,6 @@ def setting_types(kind: type, prefix: str = "") -> dict[str, Any]:
     return types
 
 
-def path_settings(kind: type) -> list[str]:
-    """Return the settings of a dataclass itself that are paths."""
-    return [name for name, hint in get_type_hints(kind).items() if Path in options_of(hint)]
-
-
 @dataclass(frozen=True, slots=True)
 class LoaderConfig:
     """Batches and held-out demonstrations.
@@ -384,7 +379,9 @@ class RunConfig:
     runtime: RuntimeConfig = RuntimeConfig()
 
     def __post_init__(self) -> None:
-        settle(self, paths=path_settings(type(self)), texts=self._texts())
+        kinds = {name: options_of(hint) for name, hint in get_type_hints(type(self)).items()}
+        paths, texts = ([name for name, kind in kinds.items() if each in kind] for each in (Path, str))
+        settle(self, paths=paths, texts=texts)
         if problems := [*self._unknown(), *problems_of(self)]:
             raise ConfigError(" ".join(problems))
 
@@ -413,10 +410,6 @@ class RunConfig:
             for name in names:
                 values.get(section, {}).pop(name, None)
         return {name: str(v) if isinstance(v, Path) else v for name, v in values[""].items()}
-
-    def _texts(self) -> tuple[str, ...]:
-        """Return the settings that are a name or a path."""
-        return ()
 
     def _unknown(self) -> Iterator[str]:
         """Yield further problems."""
@@ -455,9 +448,6 @@ class TrainingConfig(RunConfig):
     rollout: RolloutConfig = RolloutConfig()
     pretraining: PretrainingConfig = PretrainingConfig()
     augmentation: AugmentationConfig = AugmentationConfig()
-
-    def _texts(self) -> tuple[str, ...]:
-        return ("preset", "init_from", "crops_from", "t5", "assets")
 
     def _unknown(self) -> Iterator[str]:
         if not isinstance(self.preset, str) or self.preset in PRESETS or ":" in self.preset:

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,6 +20,7 @@ import torch
 from torch import nn
 
 from openvima.atomic_io import folder_lock
+from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, Terminated
 from openvima.multiprocess import Report
@@ -28,7 +29,7 @@ from openvima.policies.naming import METRICS_FILE
 from openvima.training.config import RunConfig, ScheduleConfig
 from openvima.training.learner import Learner
 from openvima.training.parallel import Parallel, join_processes, load_named_state, named_state
-from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, RunFolder, index_hash, provenance
+from openvima.training.run_folder import SESSIONS_FILE, TIMINGS_FILE, RunFolder, provenance
 from openvima.training.trackers import Tracker, open_trackers
 from openvima.video.encoder import Animation
 
@@ -148,17 +149,8 @@ class Stage(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedStage:
-    """A stage that is built when it starts.
-
-    Args:
-        num_steps: Its length.
-        make: Builds it.
-    """
-
-    num_steps: int
-    make: Callable[[], Stage]
+PlannedStage = tuple[int, Callable[[], Stage]]
+"""The number of steps of a stage, and the function that builds it when it starts."""
 
 
 def num_steps(schedule: ScheduleConfig, num_examples: Callable[[], int], batch_size: int) -> int:
@@ -204,12 +196,15 @@ class Trainer:
         self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel
         self._on_report, self._rollout, self._rollout_every = report, rollout, rollout_every
         self._animate, self._trackers = animate, list[Tracker]()
-        data = {"episodes": len(dataset), "index": index_hash(dataset.path), **(demonstrations or {})}
+        index = (dataset.path / INDEX_NAME).read_bytes()
+        data = {
+            "episodes": len(dataset),
+            "index": hashlib.blake2b(index, digest_size=16).hexdigest(),
+            **(demonstrations or {}),
+        }
         self.run = RunFolder(
-            config.out,
+            config,
             {"training": config.identity(), "demonstrations": data, "network": learner.description()},
-            force=config.force,
-            keep_every=config.schedule.keep_every,
             is_first=parallel.is_first,
         )
         parallel.wait()
@@ -237,8 +232,9 @@ class Trainer:
             for number in range(self.progress.stage, len(stages)):
                 if number > self.progress.stage:
                     self.progress = replace(self.progress, stage=number, step=0)
-                if self.progress.step < stages[number].num_steps:
-                    self._run_stage(stages[number].make(), stages[number].num_steps)
+                num_steps, make = stages[number]
+                if self.progress.step < num_steps:
+                    self._run_stage(make(), num_steps)
         finally:
             for tracker in self._trackers:
                 tracker.close()
@@ -247,7 +243,7 @@ class Trainer:
     def report(self, note: str) -> None:
         """Report the progress with a note."""
         if self._on_report and self.parallel.is_first:
-            self._on_report(self._done(), sum(stage.num_steps for stage in self._stages), note)
+            self._on_report(self._done(), sum(num_steps for num_steps, _ in self._stages), note)
 
     def _run_stage(self, stage: Stage, num_steps: int) -> None:
         """Take the remaining steps of a stage; after a SIGTERM write a checkpoint and stop."""
@@ -255,13 +251,16 @@ class Trainer:
         if self.progress.step:
             load_named_state(self.learner, optimizer, self.run.optimizer_state())
         self._last = (self.progress.step, time.monotonic())
+        schedule = self.config.schedule
+        # Checkpoints are due at multiples of these, and at the end.
+        periods = [*filter(None, (schedule.checkpoint_every, schedule.keep_every, self._rollout_every))]
         sigterms: list[int] = []
         with exchange_sigterm(_raise_terminated, lambda number, frame: sigterms.append(number)):
             window: list[Metrics] = []
             for step in range(self.progress.step, num_steps):
                 window.append(self._step(stage, optimizer, step, num_steps))
                 self.progress = replace(self.progress, step=step + 1)
-                saves = self._saves_at(step + 1) or step + 1 == num_steps
+                saves = step + 1 == num_steps or any((step + 1) % every == 0 for every in periods)
                 logs = saves or (step + 1) % LOG_EVERY == 0
                 # Several processes stop after the same step, and so ask each other, when they log anyway.
                 may_end = logs or self.parallel.num_ranks == 1
@@ -273,14 +272,6 @@ class Trainer:
                     self._save(stage, optimizer, validates=saves)
                 if ends:
                     raise Terminated
-
-    def _saves_at(self, step: int) -> bool:
-        """Whether a checkpoint is due."""
-        schedule = self.config.schedule
-        return any(
-            every and step % every == 0
-            for every in (schedule.checkpoint_every, schedule.keep_every, self._rollout_every)
-        )
 
     def _step(self, stage: Stage, optimizer: torch.optim.Optimizer, step: int, num_steps: int) -> Metrics:
         config = self.config
@@ -338,7 +329,8 @@ class Trainer:
         self.learner.eval()
         metrics = stage.validate() if validates else {}
         self._write(stage, {f"validation_{name}": value for name, value in metrics.items()})
-        self._say_validation(stage, metrics)
+        if metrics and self.parallel.is_first:
+            self._say_validation(stage, metrics)
         name = f"{stage.name}-{self.progress.step:06d}"
         is_last_stage = self.progress.stage == len(self._stages) - 1
         score, error = metrics.get("score", 0.0), metrics.get("score_error", 0.0)
@@ -359,8 +351,6 @@ class Trainer:
         self.parallel.wait()
 
     def _say_validation(self, stage: Stage, metrics: Metrics) -> None:
-        if not (metrics and self.parallel.is_first):
-            return
         step, name = self.progress.step, self.learner.score
         score = metrics.get(name, math.nan)
         logger.info("%s, step %d, held out: %s", stage.name, step, _format(metrics))
@@ -390,8 +380,8 @@ class Trainer:
 
     def _done(self) -> int:
         """Return the steps done, counted through all stages."""
-        done = [stage.num_steps for stage in self._stages[: self.progress.stage]]
-        return sum(done) + self.progress.step
+        done = sum(num_steps for num_steps, _ in self._stages[: self.progress.stage])
+        return done + self.progress.step
 
 
 def _optimizer(learner: Learner, stage: Stage, weight_decay: float) -> torch.optim.Optimizer:

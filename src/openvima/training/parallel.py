@@ -3,7 +3,6 @@
 `start_peers` starts the processes of one machine, with the environment in which `torchrun` starts them.
 """
 
-import contextlib
 import datetime
 import os
 import socket
@@ -12,7 +11,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,34 +112,9 @@ class Parallel:
             warnings.filterwarnings("ignore", "`broadcast_buffers` is deprecated", FutureWarning)
             return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
 
-    @contextlib.contextmanager
-    def synchronized(self, module: nn.Module, *, last: bool) -> Iterator[None]:
-        """Synchronize gradients in the last backward pass of a step only.
-
-        Args:
-            module: The wrapped module.
-            last: Whether the block is the last pass of the step.
-        """
-        if self.num_ranks == 1 or last:
-            yield
-        else:
-            with module.no_sync():  # type: ignore[operator]
-                yield
-
-    def with_all_gradients(self, loss: torch.Tensor, parameters: Iterable[nn.Parameter]) -> torch.Tensor:
-        """Let every parameter have a gradient, if only of zero: DDP waits for all of them.
-
-        Prompts without images, as text prompts are, leave some out.
-        """
-        if self.num_ranks == 1:
-            return loss
-        return loss + 0.0 * torch.stack([parameter.sum() for parameter in parameters]).sum()
-
-    def autocast(self, precision: str) -> contextlib.AbstractContextManager[Any]:
+    def autocast(self, precision: str) -> AbstractContextManager[Any]:
         """Return a context for mixed precision, "float32" or "bfloat16"."""
-        if precision == "float32":
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, torch.bfloat16)
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=precision == "bfloat16")
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
         """Average metrics over all processes; a missing metric counts as 0."""
@@ -159,9 +133,8 @@ class Parallel:
         """Concatenate the rows of all processes, on their device."""
         if self.num_ranks == 1:
             return rows_N
-        counts = [torch.tensor(0, device=self.device) for _ in range(self.num_ranks)]
-        dist.all_gather(counts, torch.tensor(len(rows_N), device=self.device))
-        lengths = [int(count) for count in counts]
+        lengths = [0] * self.num_ranks
+        dist.all_gather_object(lengths, len(rows_N))
         longest = rows_N.new_zeros(max(lengths), *rows_N.shape[1:])
         longest[: len(rows_N)] = rows_N
         parts = [torch.empty_like(longest) for _ in lengths]
@@ -212,7 +185,7 @@ class _Gathered(torch.autograd.Function):
 ONE_PROCESS = Parallel(0, 1, torch.device("cpu"))
 
 
-@contextlib.contextmanager
+@contextmanager
 def join_processes(device: str) -> Iterator[Parallel]:
     """Join the process group of `torchrun`, if there is one.
 
@@ -260,15 +233,10 @@ def load_named_state(module: nn.Module, optimizer: torch.optim.Optimizer, state:
     """
     names = {id(parameter): name for name, parameter in module.named_parameters()}
     ordered = [p for group in optimizer.param_groups for p in group["params"]]
-    values = {
-        number: {key: _copy_layout(parameter, value) for key, value in state[names[id(parameter)]].items()}
-        for number, parameter in enumerate(ordered)
-        if names[id(parameter)] in state
-    }
+    values = dict[int, dict[str, torch.Tensor]]()
+    for number, parameter in enumerate(ordered):
+        for key, value in state.get(names[id(parameter)], {}).items():
+            if value.shape == parameter.shape:  # not the step count
+                value = torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)
+            values.setdefault(number, {})[key] = value
     optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
-
-
-def _copy_layout(parameter: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-    if value.shape != parameter.shape:
-        return value  # the step count
-    return torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)

@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from openvima.catalog.packs import load_assets
 from openvima.data.object_cache import (
@@ -15,9 +16,10 @@ from openvima.data.object_cache import (
     open_object_cache,
 )
 from openvima.data.reader import Dataset
-from openvima.detector.plugins import detected_object_cache, plugged_boxes
+from openvima.detector.plugins import plugged_boxes
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
+from openvima.policies.base import torch_threads
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.batches import ExampleSource
@@ -36,7 +38,7 @@ from openvima.training.loop import (
 )
 from openvima.training.parallel import Parallel
 from openvima.training.pretraining.pairs import render_pairs
-from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
+from openvima.training.pretraining.stage import ContrastivePretraining
 from openvima.training.run_folder import held_out_demonstrations
 from openvima.training.source import (
     alternative_source,
@@ -91,6 +93,10 @@ def train(
     boxes = None
     if config.loader.boxes is not None:
         boxes = plugged_boxes(config.loader.boxes, fraction=config.loader.detected_fraction)
+    weights = filter(None, (config.init_from, config.crops_from))
+    held_out = set(held_out_demonstrations(dataset)).union(*map(held_out_data, weights))
+    # What identifies the demonstrations besides their index.
+    origin = {"boxes": boxes and boxes.name, "held_out": sorted(held_out)}
     with open_run(config) as parallel:
         with_captions = config.pretraining.attribute_loss_weight > 0
         texts = training_texts(dataset, config.augmentation, with_captions=with_captions)
@@ -112,7 +118,7 @@ def train(
             rollout=rollout,
             rollout_every=config.rollout.every,
             animate=animate,
-            demonstrations=_origin(config, dataset, boxes),
+            demonstrations={name: what for name, what in origin.items() if what},
         )
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
 
@@ -130,14 +136,6 @@ def _variants(config: TrainingConfig, boxes: Boxes | None) -> list[tuple[Variant
     return [*stored, *detected, *rerendered]
 
 
-def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:
-    """Return what identifies the demonstrations besides their index."""
-    seen = set(held_out_demonstrations(dataset))
-    for source in filter(None, (config.init_from, config.crops_from)):
-        seen.update(held_out_data(source))
-    return {**({"boxes": boxes.name} if boxes else {}), **({"held_out": sorted(seen)} if seen else {})}
-
-
 @dataclass(eq=False)
 class _Stages:
     """Builds the stages of a run."""
@@ -153,23 +151,21 @@ class _Stages:
         """Return the stages in order."""
         config = self.config
         steps = num_steps(config.schedule, lambda: len(self._examples[0]), config.loader.batch_size)
-        cloning = PlannedStage(steps, self._behaviour_cloning)
-        if not config.pretraining.steps:
-            return [cloning]
-        return [PlannedStage(config.pretraining.steps, self._pretraining), cloning]
+        stages: list[PlannedStage] = [(steps, self._behaviour_cloning)]
+        if config.pretraining.steps:
+            stages.insert(0, (config.pretraining.steps, self._pretraining))
+        return stages
 
     def _pretraining(self) -> Stage:
         assert isinstance(self.learner, PolicyLearner)  # `resolve` has checked it
         network, config = self.learner.network, self.config.pretraining
-        with_attributes = config.attribute_loss_weight > 0
+        rotation_bins = network.object_encoder.config.rotation_bins if network.object_encoder else 0
         pairs = render_pairs(
             scene_tasks(self.dataset),
-            num_scenes=config.num_scenes,
+            config,
             seed=self.config.seed,
             assets=self.config.assets,
-            augmentation=config,
-            second_view=compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes,
-            with_attributes=with_attributes,
+            second_view=max(rotation_bins, config.hard_negative_prob, config.attribute_loss_weight) > 0,
             report=self._say,
             parallel=self.parallel,
             workers=self._workers(config.num_scenes // _SCENES_PER_WORKER),
@@ -186,18 +182,13 @@ class _Stages:
             if freezes_crops(learner.network, config):
                 self.trainer.report("encoding the images of all demonstrations")
                 freeze_crops(learner, caches, self.parallel)
-        module = self.parallel.wrap(learner)
         training, validation = self._examples
-        alternatives = self._alternatives(training)
-        return BehaviourCloning(learner, module, config, training, validation, self.parallel, alternatives)
-
-    def _alternatives(self, training: ExampleSource) -> tuple[tuple[ExampleSource, float], ...]:
-        """Return the training demonstrations as the other caches have them, with their probabilities."""
-        alternatives, num_images = [], int(self._caches[0][0].image_counts().sum())
-        for cache, prob in self._caches[1:]:
-            alternatives.append((alternative_source(cache, training, num_images), prob))
-            num_images += int(cache.image_counts().sum())
-        return tuple(alternatives)
+        num_images = np.cumsum([cache.image_counts().sum() for cache in caches])
+        alternatives = tuple(  # the training demonstrations as the other caches have them
+            (alternative_source(cache, training, first), prob)
+            for (cache, prob), first in zip(self._caches[1:], num_images.tolist(), strict=False)
+        )
+        return BehaviourCloning(learner, config, training, validation, self.parallel, alternatives)
 
     @cached_property
     def _examples(self) -> tuple[ExampleSource, ExampleSource]:
@@ -209,23 +200,21 @@ class _Stages:
     @cached_property
     def _caches(self) -> list[tuple[ObjectCache, float]]:
         """Object caches of `_variants`, with their probabilities; the first process builds missing ones."""
-        # Another training may write the cache now.
-        common: dict[str, Any] = {"folder": self.config.object_cache, "timeout_s": math.inf}
         workers = self._workers(len(self.dataset) // _DEMONSTRATIONS_PER_WORKER)
         caches = []
         if not self.parallel.is_first:
             self.parallel.wait()
         for variant, prob in _variants(self.config, self.boxes):
-            if variant.boxes is not None:
-                cache = detected_object_cache(self.dataset, variant.boxes, report=self._say, **common)
-            else:
+            with torch_threads(1):  # so that detections are those of any other run
                 cache = open_object_cache(
                     self.dataset,
                     self.learner.input_kind,
+                    folder=self.config.object_cache,
+                    boxes=variant.boxes,
                     appearance=variant.appearance,
-                    workers=workers,
+                    workers=1 if variant.boxes else workers,
                     report=self._say,
-                    **common,
+                    timeout_s=math.inf,  # another training may write the cache now
                 )
             caches.append((cache, prob))
         if self.parallel.is_first:

@@ -213,7 +213,9 @@ def read_settings(file: Path, *, trust_code: bool = False) -> dict[str, Any]:
     values, known = flatten(values), setting_types(TrainingConfig)
     if problems := [unknown_name(f"setting in {file} called", n, known) for n in values if n not in known]:
         raise ConfigError(" ".join(problems))
-    code = [f"{name} {short(value)}" for name in _CODE if _is_code(value := values.get(name))]
+    named = {name: str(values.get(name)) for name in _CODE}
+    # "detector=FOLDER" names a detector.
+    code = [f"{n} {short(v)}" for n, v in named.items() if ":" in v and not v.startswith("detector=")]
     if code and not trust_code:
         raise ConfigError(
             f"{file} names code to run: {', '.join(code)}. Nothing was executed. If you trust the file, add "
@@ -229,11 +231,6 @@ def _number(value: Any, hint: Any) -> Any:
         return float(value) if isinstance(value, str) and float in kinds else value
     except ValueError:  # reported by `problems_of`
         return value
-
-
-def _is_code(value: object) -> bool:
-    """Whether a setting names a function; `detector=FOLDER` names a detector."""
-    return ":" in str(value) and not str(value).startswith("detector=")
 
 
 def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,8 @@ import json
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from openvima.atomic_io import (
     sync_file,
     sync_files,
 )
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
+from openvima.data.manifest import MANIFEST_NAME
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, InputFileError, differences
 from openvima.imports import versions_of
@@ -46,7 +47,7 @@ from openvima.policies.naming import (
     checkpoint_order,
 )
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
-from openvima.training.config import flatten
+from openvima.training.config import RunConfig, flatten
 from openvima.training.learner import Learner
 from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER
 
@@ -78,38 +79,31 @@ class RunFolder:
     """Reads and writes one run.
 
     Args:
-        path: The folder; created if missing.
+        config: Its `out`, the folder, is created if missing; `force` deletes a run with other settings.
         settings: Plain values that identify the run.
-        force: Delete a run with other settings.
-        keep_every: Steps between permanent checkpoints; None keeps the latest and the best only.
         is_first: Whether this process writes the folder; others only read.
 
     Raises:
         ConfigError: The folder belongs to a run with other settings.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        settings: dict[str, Any],
-        *,
-        force: bool = False,
-        keep_every: int | None = None,
-        is_first: bool = True,
-    ) -> None:
-        self.path, self._keep_every = path, keep_every
-        self.checkpoints = path / CHECKPOINTS_FOLDER
+    def __init__(self, config: RunConfig, settings: dict[str, Any], *, is_first: bool) -> None:
+        self.path, self._keep_every = config.out, config.schedule.keep_every
+        path, self.checkpoints = self.path, self.path / CHECKPOINTS_FOLDER
         if not is_first:
             return
         differing = self._differences(settings)
-        if differing and not force:
+        if differing and not config.force:
             raise ConfigError(
                 f"{path} holds a run with other settings: {'; '.join(differing)}. Give the same settings to "
                 f"continue it, --init-from {path} and another --out to begin with its weights, or --force to "
                 "delete it."
             )
         if differing:
-            self._clear()
+            for folder in (self.checkpoints, path / BOARD_FOLDER, path / WANDB_FOLDER):
+                shutil.rmtree(folder, ignore_errors=True)
+            for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
+                (path / name).unlink(missing_ok=True)
         # First, since a folder without it, perhaps of a run that was killed at once, is refused.
         atomic_write_file(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
         self.checkpoints.mkdir(parents=True, exist_ok=True)
@@ -151,8 +145,7 @@ class RunFolder:
             write_safetensors(tensors, partial / OPTIMIZER_FILE)
             atomic_write_file(partial / STATE_FILE, json.dumps(asdict(progress)))
             sync_files(partial)  # as well as the metrics of the steps before it
-            if (self.path / METRICS_FILE).exists():
-                sync_file(self.path / METRICS_FILE)
+            sync_file(self.path / METRICS_FILE)
             shutil.rmtree(final, ignore_errors=True)
             partial.rename(final)
             sync_file(self.checkpoints)
@@ -203,15 +196,10 @@ class RunFolder:
         What a kill just after that checkpoint was written left undone is done.
         """
         self._settle(progress)
-        file = self.path / METRICS_FILE
-        if not file.is_file():
-            return
-        kept = [
-            line + "\n"
-            for line, values in whole_lines(file)
-            if (values["stage"], values["step"]) <= (progress.stage, progress.step)
-        ]
-        atomic_write_file(file, "".join(kept))
+        file, reached = self.path / METRICS_FILE, (progress.stage, progress.step)
+        kept = [each for each in read_lines(file) if (each["stage"], each["step"]) <= reached]
+        if file.is_file():
+            atomic_write_file(file, "".join(json.dumps(each) + "\n" for each in kept))
 
     def _settle(self, progress: Progress) -> None:
         """Name the best checkpoint, and delete those that are neither it, the last nor permanent."""
@@ -236,23 +224,17 @@ class RunFolder:
             return [str(error).rstrip(".")]
         return differences(flatten(old), flatten(settings))
 
-    def _clear(self) -> None:
-        for folder in (self.checkpoints, self.path / BOARD_FOLDER, self.path / WANDB_FOLDER):
-            shutil.rmtree(folder, ignore_errors=True)
-        for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
-            (self.path / name).unlink(missing_ok=True)
 
-
-def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the lines of `METRICS_FILE` or `TIMINGS_FILE`, each as text and as values.
+def read_lines(file: Path) -> list[dict[str, Any]]:
+    """Read `METRICS_FILE`, `TIMINGS_FILE` or `SESSIONS_FILE`; empty without a file.
 
     An interruption may have cut the last line, also of an earlier session; such lines are left out.
     """
-    for line in file.read_text(encoding="utf-8").splitlines():
-        try:
-            yield line, json.loads(line)
-        except json.JSONDecodeError:
-            continue
+    found = []
+    for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
+        with suppress(json.JSONDecodeError):
+            found.append(json.loads(line))
+    return found
 
 
 def provenance(dataset: Dataset) -> dict[str, Any]:
@@ -275,17 +257,12 @@ def held_out_demonstrations(dataset: Dataset) -> list[str]:
 
     Each episode says its own level and domain, so merging or sampling folders hides nothing.
     """
-    found = dataset.index.select(["task", "level", "domain"]).group_by(["task", "level", "domain"])
+    found = dataset.index.group_by(["task", "level", "domain"]).aggregate([])
     return sorted(
         f"{row['task']} {row['level']}" + (" eval" if row["domain"] == "eval" else "")
-        for row in found.aggregate([]).to_pylist()
+        for row in found.to_pylist()
         if row["level"] != "train" or row["domain"] == "eval"
     )
-
-
-def index_hash(folder: Path) -> str:
-    """Return a hash of the index of a folder of demonstrations."""
-    return hashlib.blake2b((folder / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
@@ -295,23 +272,16 @@ def git_state(folder: Path) -> dict[str, Any] | None:
         `commit` and `changed`; None without checkout or git.
     """
 
-    def ask(*words: str) -> str | None:
-        try:
-            result = subprocess.run(
-                ["git", "-C", str(folder), *words],
-                capture_output=True,
-                encoding="utf-8",
-                check=True,
-                timeout=10,
-            )
-        except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
-            return None
-        return result.stdout.strip()
+    def ask(*words: str) -> str:
+        command, silent = ["git", "-C", str(folder), *words], subprocess.DEVNULL
+        return subprocess.check_output(command, stderr=silent, encoding="utf-8", timeout=10).strip()
 
-    commit = ask("rev-parse", "HEAD")
-    if commit is None or ask("ls-files", "--error-unmatch", ".") is None:  # installed inside a checkout
+    try:
+        ask("ls-files", "--error-unmatch", ".")  # fails for a package that is installed inside a checkout
+        changes = ask("status", "--porcelain", "--untracked-files=no")
+        return {"commit": ask("rev-parse", "HEAD"), "changed": bool(changes)}
+    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
         return None
-    return {"commit": commit, "changed": bool(ask("status", "--porcelain", "--untracked-files=no"))}
 
 
 def read_costs(run: Path) -> dict[str, Any]:
@@ -327,10 +297,10 @@ def read_costs(run: Path) -> dict[str, Any]:
         "steps" of each stage by name, "seconds" and "cpu_seconds" of all sessions together.
     """
     steps: dict[str, int] = {}
-    for record in _records(run / METRICS_FILE):
+    for record in read_lines(run / METRICS_FILE):
         steps[record["name"]] = max(record["step"], steps.get(record["name"], 0))
     seconds, cpu_seconds, last = 0.0, 0.0, (0.0, 0.0)
-    for record in _records(run / TIMINGS_FILE):
+    for record in read_lines(run / TIMINGS_FILE):
         now = (record["seconds_since_start"], record["cpu_seconds_since_start"])
         if now[0] < last[0]:  # a session begins at 0
             last = (0.0, 0.0)
@@ -338,8 +308,3 @@ def read_costs(run: Path) -> dict[str, Any]:
         cpu_seconds += now[1] - last[1]
         last = now
     return {"steps": steps, "seconds": round(seconds, 1), "cpu_seconds": round(cpu_seconds, 1)}
-
-
-def _records(file: Path) -> list[dict[str, Any]]:
-    """Read a log; empty without one."""
-    return [values for _, values in whole_lines(file)] if file.is_file() else []

@@ -35,19 +35,9 @@ def open_demonstrations(
         ConfigError: There is no such task, or none is left.
         DatasetError: The folder is no finished data set, or holds demonstrations that are held out.
     """
-    dataset = _open_tasks(folder, loader or LoaderConfig())
-    if (found := held_out_demonstrations(dataset)) and not allow_heldout:
-        raise DatasetError(
-            f"{folder} holds demonstrations for evaluation only: {', '.join(found)}. Train on level train, "
-            "leave these tasks out, or give --allow-heldout, which is recorded with the policy."
-        )
-    return dataset
-
-
-def _open_tasks(folder: Path, loader: LoaderConfig) -> Dataset:
-    dataset, excluded = Dataset(folder), loader.excluded_tasks
+    loader, dataset = loader or LoaderConfig(), Dataset(folder)
     present = sorted(dataset.manifest["tasks"])
-    known = {*present, *list_tasks()}
+    known, excluded = {*present, *list_tasks()}, loader.excluded_tasks
     named = {"exclude_tasks": excluded, "first_tasks": loader.early_tasks, "repeat_tasks": loader.repeats}
     for setting, tasks in named.items():
         if problems := [
@@ -56,13 +46,19 @@ def _open_tasks(folder: Path, loader: LoaderConfig) -> Dataset:
             if name not in known
         ]:
             raise ConfigError(f"loader.{setting}: {' '.join(problems)}")
-    kept = [task for task in present if task not in excluded]
-    if not kept:
-        raise ConfigError(
-            f"loader.exclude_tasks is {', '.join(excluded)}; {dataset.path} has no other task, only "
-            f"{', '.join(present)}."
+    if excluded:
+        if not (kept := [task for task in present if task not in excluded]):
+            raise ConfigError(
+                f"loader.exclude_tasks is {', '.join(excluded)}; {dataset.path} has no other task, only "
+                f"{', '.join(present)}."
+            )
+        dataset = Dataset(folder, tasks=kept)
+    if (found := held_out_demonstrations(dataset)) and not allow_heldout:
+        raise DatasetError(
+            f"{folder} holds demonstrations for evaluation only: {', '.join(found)}. Train on level train, "
+            "leave these tasks out, or give --allow-heldout, which is recorded with the policy."
         )
-    return Dataset(folder, tasks=kept) if excluded else dataset
+    return dataset
 
 
 def check_scenes(dataset: Dataset) -> None:
@@ -89,9 +85,6 @@ def split_examples(cache: ObjectCache, loader: LoaderConfig) -> tuple[ExampleSou
         DatasetError: There is none to train on.
     """
     hashes = split_hashes(cache.dataset.index)
-    counts = cache.image_counts()
-    bases = np.cumsum(counts) - counts
-    lengths = cache.lengths()
     training = np.flatnonzero(hashes >= loader.validation_fraction)
     kept = np.flatnonzero(hashes < loader.validation_fraction)
     if not len(training):
@@ -99,8 +92,12 @@ def split_examples(cache: ObjectCache, loader: LoaderConfig) -> tuple[ExampleSou
             "there is no demonstration to train on; generate some, or lower loader.validation_fraction."
         )
     kept = np.sort(kept[np.argsort(hashes[kept], kind="stable")[: loader.validation_episodes]])
-    first, second = (ExampleSource(cache, rows, bases, lengths[rows]) for rows in (training, kept))
-    return first, second
+    return _source(cache, training), _source(cache, kept)
+
+
+def _source(cache: ObjectCache, rows: np.ndarray, first_image: int = 0) -> ExampleSource:
+    counts = cache.image_counts()
+    return ExampleSource(cache, rows, np.cumsum(counts) - counts + first_image, cache.lengths()[rows])
 
 
 def repeat_tasks(source: ExampleSource, repeats: Mapping[str, int]) -> ExampleSource:
@@ -128,11 +125,7 @@ def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: i
         source: The demonstrations.
         first_image: Number of its first image: its images follow those of other caches.
     """
-    counts = cache.image_counts()
-    bases = np.cumsum(counts) - counts + first_image
-    lengths = cache.lengths()
-    rows = source.rows[lengths[source.rows, 0] > 0]
-    return ExampleSource(cache, rows, bases, lengths[rows])
+    return _source(cache, source.rows[cache.lengths()[source.rows, 0] > 0], first_image)
 
 
 def read_actions(source: ExampleSource) -> torch.Tensor:
@@ -163,15 +156,10 @@ def make_order(source: ExampleSource, loader: LoaderConfig, seed: int, parallel:
         rank=parallel.rank,
         num_ranks=num_ranks,
     )
-    return _show_first(order, source, loader) if loader.first_steps else order
-
-
-def _show_first(order: BatchOrder, source: ExampleSource, loader: LoaderConfig) -> BatchOrder:
-    """Let the first batches show the demonstrations of some tasks alone, if there are these and others."""
     is_first = np.isin(_tasks_of(source), loader.early_tasks)
-    if is_first.all() or not is_first.any():
+    if not loader.first_steps or is_first.all() or not is_first.any():
         return order
-    # Those that are repeated are taken once.
+    # The first batches show these tasks alone; demonstrations that are repeated are taken once.
     places = np.flatnonzero(is_first)
     places = places[np.unique(source.rows[places], return_index=True)[1]]
     return replace(order, first_batches=loader.first_steps, first_episodes=places)

@@ -1,1 +1,1 @@
-"""Augmentation: of prompts and demonstrations in training, of scenes and crops in contrastive pretraining."""
+"""Augmentation: of prompts and demonstrations in training, of scenes in contrastive pretraining."""

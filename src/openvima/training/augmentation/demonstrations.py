@@ -212,26 +212,22 @@ def add_false_positives(
     """
     if layout == "frames":
         return batch
-    drawn = _draw_numbers(batch.history, rngs)
+    # Numbers from 0 to 1 for all views and slots of each step, (B, T, 2 V + N).
+    num_steps, num_slots = batch.history.steps_BT.shape[1], batch.history.positions_BTN2.shape[2]
+    numbers = np.zeros((len(rngs), num_steps, 2 * NUM_VIEWS + num_slots), np.float32)
+    for b, (rng, count) in enumerate(zip(rngs, batch.history.steps_BT.sum(dim=1).tolist(), strict=True)):
+        numbers[b, :count] = rng.random((count, MOST_SLOTS), np.float32)[:, : numbers.shape[2]]
+    drawn = torch.from_numpy(numbers)
     shows_BTV = drawn[..., :NUM_VIEWS] < probability
     shows_BTV &= batch.history.steps_BT[..., None]
     if layout == "views":
         return _with_spurious_in_views(batch, shows_BTV, drawn[..., NUM_VIEWS : 2 * NUM_VIEWS])
     history = batch.history
-    is_slot = torch.arange(history.positions_BTN2.shape[2]) < history.num_slots_BT[..., None]
+    is_slot = torch.arange(num_slots) < history.num_slots_BT[..., None]
     keys_BTN = torch.cat(  # padding of the batch stays at the end
         [torch.where(is_slot, drawn[..., 2 * NUM_VIEWS :], _LAST), drawn[..., NUM_VIEWS : 2 * NUM_VIEWS]], -1
     )
     return _shuffle_slots(replace(batch, history=_with_spurious_objects(batch, shows_BTV)), keys_BTN)
-
-
-def _draw_numbers(history: HistoryBatch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
-    """Numbers from 0 to 1 for all views and slots of each step, shape (B, T, 2 V + N), float32."""
-    num_steps, num_slots = history.steps_BT.shape[1], history.positions_BTN2.shape[2]
-    drawn = np.zeros((len(rngs), num_steps, 2 * NUM_VIEWS + num_slots), np.float32)
-    for b, (rng, count) in enumerate(zip(rngs, history.steps_BT.sum(dim=1).tolist(), strict=True)):
-        drawn[b, :count] = rng.random((count, MOST_SLOTS), np.float32)[:, : drawn.shape[2]]
-    return torch.from_numpy(drawn)
 
 
 def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatch:

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from openvima.data.preprocessed import PreprocessedEpisode
-from openvima.errors import UnknownTaskError
 from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, image_names
 from openvima.policies.tokenizer import UNKNOWN
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
@@ -75,34 +74,20 @@ def rename_objects(episode: PreprocessedEpisode, rng: np.random.Generator) -> Pr
     for name, noun in zip(chosen, nouns, strict=False):
         text = re.sub(rf"(\w+) \{{{name}\}}", lambda found, noun=noun: _noun_phrase(found[1], noun), text)
     if rng.random() < 0.5:
-        others = _unused_in_view(episode, images[chosen[0]][0], rng)[: len(NOUNS) - count]
-        images |= {f"other_{number}": (objects, False) for number, objects in enumerate(others)}
-        chosen += [f"other_{number}" for number in range(len(others))]
+        # Objects that the first step does not use, in random order, as prompt images: with the crops of the
+        # scene, and the boxes of a single object in a prompt image; a hidden object has no box.
+        first = episode.objects.select(slice(0, int(episode.objects_per_step[0])))
+        first = first.select(~np.isin(first.ids, [episode.pick_ids[0], episode.place_ids[0]]))
+        rows = images[chosen[0]][0].select(np.zeros(len(first), np.int64))
+        rows = replace(rows, crop_index=first.crop_index, boxes=rows.boxes * first.masks[..., None])
+        for number, row in enumerate(rng.permutation(len(rows))[: len(NOUNS) - count]):
+            images[f"other_{number}"] = rows.select(np.array([row])), False
+            chosen.append(f"other_{number}")
     defined = [
         DEFINITION.format(noun=noun, image=f"{{{name}}}") for name, noun in zip(chosen, nouns, strict=False)
     ]
     text = " ".join([*(defined[number] for number in rng.permutation(len(defined))), text])
     return with_prompt(episode, text, images)
-
-
-def _unused_in_view(
-    episode: PreprocessedEpisode, single: ObjectTable, rng: np.random.Generator
-) -> list[ObjectTable]:
-    """Make prompt images of objects that the first step does not use, in random order.
-
-    They have the crops of the scene and the boxes of a single object in a prompt image.
-
-    Args:
-        episode: The demonstration.
-        single: The row of such a single object.
-        rng: Draws the order.
-    """
-    first = episode.objects.select(slice(0, int(episode.objects_per_step[0])))
-    first = first.select(~np.isin(first.ids, [episode.pick_ids[0], episode.place_ids[0]]))
-    rows = single.select(np.zeros(len(first), np.int64))
-    # A hidden object has no box.
-    rows = replace(rows, crop_index=first.crop_index, boxes=rows.boxes * first.masks[..., None])
-    return [rows.select(np.array([number])) for number in rng.permutation(len(rows))]
 
 
 def _noun_phrase(before: str, noun: str) -> str:
@@ -203,11 +188,8 @@ def paraphrase(episode: PreprocessedEpisode, rng: np.random.Generator) -> Prepro
     phrasings = training_paraphrases().get(episode.task)
     if not phrasings:
         return episode
-    try:
-        template = task_spec(episode.task).template
-    except UnknownTaskError:  # demonstrations of a task that is not installed here
-        return episode
-    text = rephrase(episode.prompt.text, template, phrasings[rng.integers(len(phrasings))])
+    template, phrasing = task_spec(episode.task).template, phrasings[rng.integers(len(phrasings))]
+    text = rephrase(episode.prompt.text, template, phrasing)
     return episode if text is None else with_prompt(episode, text)
 
 

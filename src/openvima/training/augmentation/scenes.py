@@ -15,9 +15,8 @@ import numpy as np
 from openvima.catalog.geometry import Assets
 from openvima.catalog.partitions import OBJECT_SETS
 from openvima.catalog.random_pack import is_random, random_name
-from openvima.catalog.textures import NEUTRAL_TEXTURE, texture_spec
+from openvima.catalog.textures import texture_spec
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Placement, Pose, Scene
-from openvima.tasks.table import NO_SCALE
 from openvima.training.config import PretrainingConfig
 
 _MOVABLE, _CONTAINERS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
@@ -44,8 +43,20 @@ def with_random_appearance(
         if rng.random() < prob:
             dark = "dark " if rng.random() < 0.25 else ""
             placement = replace(placement, texture=dark + palette[rng.integers(_PALETTE_SIZE)])
-        if rng.random() < prob:
-            placement = _with_random_shape(placement, assets, rng, common, settings)
+        if rng.random() < prob and placement.object in (*_MOVABLE, *_CONTAINERS):
+            is_container = placement.object in _CONTAINERS
+            if is_container and _draw(settings.grating_prob, rng):
+                kind = "grating"
+            elif is_container:
+                kind = "eared container" if _draw(settings.eared_prob, rng) else "container"
+            elif _draw(settings.ring_and_block_prob, rng):
+                kind = "ring" if rng.random() < 0.5 else "block"
+            else:
+                kind = "shape"
+            name = random_name(kind, rng)
+            if common is not None and is_container:
+                name = common.setdefault(placement.object, name)
+            placement = at_rest(replace(placement, object=name), assets)
         placements.append(placement)
     return replace(scene, placements=tuple(placements))
 
@@ -56,37 +67,12 @@ def at_rest(placement: Placement, assets: Assets) -> Placement:
     return placement.at(Pose((placement.pose.x, placement.pose.y, height), placement.pose.quaternion))
 
 
-def _with_random_shape(
-    placement: Placement,
-    assets: Assets,
-    rng: np.random.Generator,
-    common: dict[str, str] | None,
-    settings: PretrainingConfig,
-) -> Placement:
-    is_container = placement.object in _CONTAINERS
-    if not is_container and placement.object not in _MOVABLE:
-        return placement
-    name = random_name(_random_kind(is_container=is_container, settings=settings, rng=rng), rng)
-    if common is not None and is_container:
-        name = common.setdefault(placement.object, name)
-    return at_rest(replace(placement, object=name), assets)
-
-
-def _random_kind(*, is_container: bool, settings: PretrainingConfig, rng: np.random.Generator) -> str:
-    if is_container:
-        if _draw(settings.grating_prob, rng):
-            return "grating"
-        return "eared container" if _draw(settings.eared_prob, rng) else "container"
-    if not _draw(settings.ring_and_block_prob, rng):
-        return "shape"
-    return "ring" if rng.random() < 0.5 else "block"
-
-
 def _draw(prob: float, rng: np.random.Generator) -> bool:
     return bool(prob) and bool(rng.random() < prob)  # draws nothing at 0, so that other draws stay
 
 
-EDGE_M = 0.06  # from the edge of the workspace to the middle of an object
+_EDGE_M = 0.06  # from the edge of the workspace to the middle of an object
+_LOW, _HIGH = np.array(WORKSPACE_LOW) + _EDGE_M, np.array(WORKSPACE_HIGH) - _EDGE_M
 _JITTER_M = 0.02
 
 
@@ -99,22 +85,18 @@ def rearrange(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int, 
     rotations = {p.id: rng.uniform(0, 2 * math.pi) for p in scene.placements}
     movable = [p for p in scene.placements if not p.fixed]
     positions = {p.id: (p.pose.x, p.pose.y) for p in scene.placements}
+    swapped = dict[int, tuple[float, float]]()
     if rng.random() < 0.5:
-        others = [movable[index].pose for index in rng.permutation(len(movable))]
-        positions |= {p.id: _near(other, rng) for p, other in zip(movable, others, strict=True)}
+        for placement, index in zip(movable, rng.permutation(len(movable)), strict=True):
+            near = np.array(positions[movable[index].id]) + rng.uniform(-_JITTER_M, _JITTER_M, 2)
+            x, y = np.clip(near, _LOW, _HIGH).tolist()  # inside the workspace
+            swapped[placement.id] = x, y
+    positions |= swapped
     poses = {
         p.id: Pose((*positions[p.id], p.pose.z), p.pose.rotated(rotations[p.id]).quaternion)
         for p in scene.placements
     }
     return scene.with_poses(poses), rotations
-
-
-def _near(pose: Pose, rng: np.random.Generator) -> tuple[float, float]:
-    """Return a position near another one, inside the workspace."""
-    x, y = np.array((pose.x, pose.y)) + rng.uniform(-_JITTER_M, _JITTER_M, 2)
-    low, high = np.array(WORKSPACE_LOW) + EDGE_M, np.array(WORKSPACE_HIGH) - EDGE_M
-    x, y = np.clip((x, y), low, high).tolist()
-    return x, y
 
 
 _KINDS = ("height", "shade", "texture", "shape")
@@ -135,45 +117,32 @@ def with_hard_negatives(
         assets: Source of shapes.
         rng: Source of all draws.
     """
-    placements = list(scene.placements)
-    for original in scene.placements:
+    placements, movable = list(scene.placements), [p for p in scene.placements if not p.fixed]
+    for original in movable:
         is_eligible = original.object in _MOVABLE or is_random(original.object)
-        if original.fixed or not is_eligible or rng.random() >= prob:
+        if not is_eligible or rng.random() >= prob:
             continue
         position = _free_position(placements, rng)
-        kind = _KINDS[rng.integers(len(_KINDS))]
-        negative = _change(original, kind, scene.placements, shades, assets, rng)
+        kind, negative = _KINDS[rng.integers(len(_KINDS))], None
+        if kind == "height":
+            x, y, z = original.scale
+            stretch = rng.uniform(*_STRETCH)
+            factor = stretch if rng.random() < 0.5 else 1 / stretch
+            negative = at_rest(replace(original, scale=(x, y, z * factor)), assets)
+        elif kind == "shade":
+            if shade := _other_shade(original.texture, shades):
+                negative = replace(original, texture=shade)
+        elif kind == "texture":
+            if names := [p.texture for p in movable if p.texture != original.texture]:
+                negative = replace(original, texture=names[rng.integers(len(names))])
+        elif shapes := [p for p in movable if p.object != original.object]:
+            shape = shapes[rng.integers(len(shapes))]
+            changed = replace(original, object=shape.object, size=shape.size, scale=shape.scale)
+            negative = at_rest(changed, assets)
         if position and negative:
             pose = Pose.planar(*position, rng.uniform(0, 2 * math.pi), z=negative.pose.z)
             placements.append(replace(negative, id=placements[-1].id + 1, pose=pose))
     return replace(scene, placements=tuple(placements))
-
-
-def _change(
-    original: Placement,
-    kind: str,
-    others: Sequence[Placement],
-    shades: AbstractSet[str],
-    assets: Assets,
-    rng: np.random.Generator,
-) -> Placement | None:
-    """Return the object changed in one respect; None where that is impossible."""
-    if kind == "height":
-        x, y, z = original.scale
-        stretch = rng.uniform(*_STRETCH)
-        factor = stretch if rng.random() < 0.5 else 1 / stretch
-        return at_rest(replace(original, scale=(x, y, z * factor)), assets)
-    if kind == "shade":
-        shade = _other_shade(original.texture, shades)
-        return None if shade is None else replace(original, texture=shade)
-    if kind == "texture":
-        names = [p.texture for p in others if not p.fixed and p.texture != original.texture]
-        return replace(original, texture=names[rng.integers(len(names))]) if names else None
-    shapes = [p for p in others if not p.fixed and p.object != original.object]
-    if not shapes:
-        return None
-    shape = shapes[rng.integers(len(shapes))]
-    return at_rest(replace(original, object=shape.object, size=shape.size, scale=shape.scale), assets)
 
 
 def _other_shade(texture: str, shades: AbstractSet[str]) -> str | None:
@@ -186,15 +155,9 @@ def _other_shade(texture: str, shades: AbstractSet[str]) -> str | None:
 
 def _free_position(placements: Sequence[Placement], rng: np.random.Generator) -> tuple[float, float] | None:
     """Return a position clear of other objects, or None where none was found."""
-    low, high = np.array(WORKSPACE_LOW) + EDGE_M, np.array(WORKSPACE_HIGH) - EDGE_M
     for _ in range(_TRIES):
-        x, y = rng.uniform(low, high).tolist()
+        x, y = rng.uniform(_LOW, _HIGH).tolist()
         distances = [math.hypot(x - p.pose.x, y - p.pose.y) for p in placements]
         if all(d >= _CLEARANCE_M[p.fixed] for d, p in zip(distances, placements, strict=True)):
             return x, y
     return None
-
-
-def to_grayscale(placement: Placement) -> Placement:
-    """Return an object as a grayscale prompt image shows it: neutral texture, no scale."""
-    return replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE)

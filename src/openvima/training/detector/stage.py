@@ -20,7 +20,6 @@ from openvima.training.detector.config import DetectorTrainingConfig
 from openvima.training.learner import Learner, LossAndMetrics
 from openvima.training.loop import (
     Metrics,
-    PlannedStage,
     Trainer,
     num_steps,
     open_run,
@@ -139,7 +138,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
             return DetectorStage(learner, config, source, frames, parallel)
 
         steps = num_steps(config.schedule, lambda: len(training), loader.batch_size // 2)
-        return trainer.train([PlannedStage(steps, make)])
+        return trainer.train([(steps, make)])
 
 
 class DetectorStage:

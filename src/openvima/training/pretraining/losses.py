@@ -13,11 +13,11 @@ from torch.nn import functional as F
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.pointer.words import Attributes
-from openvima.training.augmentation.crops import draw_channel_mixing
 from openvima.training.learner import LossAndMetrics
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.pairs import PROMPT, SCENE, SECOND_VIEW, AttributeLabels, Pairs
 
+TEMPERATURE = 0.07  # of every softmax
 _CHUNK = 256  # pairs that are encoded at a time in validation
 
 
@@ -25,7 +25,6 @@ def contrastive_loss(
     encoder: ObjectEncoder,
     pairs: Pairs,
     *,
-    temperature: float,
     generator: torch.Generator,
     attributes: Attributes | None = None,
     attribute_weight: float = 1.0,
@@ -39,7 +38,6 @@ def contrastive_loss(
     Args:
         encoder: Gets the gradient. Without rotation bins only appearances count.
         pairs: A batch.
-        temperature: Softmax temperature.
         generator: Draws the mixing of channels.
         attributes: Also gets the gradient of its own loss, on labelled pairs; None for none.
         attribute_weight: Weight of that loss.
@@ -51,37 +49,43 @@ def contrastive_loss(
     Source: InfoNCE (van den Oord et al. 2018), symmetric as in CLIP.
     """
     mixing = draw_channel_mixing(generator).to(pairs.crops.device)
-    features = _encode(encoder, pairs.crops, mixing, parallel)
+    crops_SKVCYX = pairs.crops.transpose(0, 1).contiguous()
+    mixed = torch.einsum("cd,skvdyx->skvcyx", mixing, crops_SKVCYX.to(mixing.dtype))
+    features_NF = parallel.in_parts(encoder.encode_images, mixed.flatten(0, 2))
+    features = features_NF.unflatten(0, crops_SKVCYX.shape[:3]).transpose(1, 2)  # (S, V, K, F)
     masks = pairs.masks.permute(1, 2, 0)
     prompt, scene, *second = encoder.embed_appearance(features, masks)
-    loss, accuracy = info_nce(prompt, scene, find_matches(pairs), temperature=temperature)
-    metrics = {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
+    loss, accuracy = info_nce(prompt, scene, find_matches(pairs))
+    metrics = {"loss/contrastive": loss, "contrastive_accuracy": accuracy}
     if pairs.rotations is None:
         return loss, metrics
     rows = pairs.masks[:, SECOND_VIEW].any(dim=1)
     is_same = pairs.appearances[rows, None] == pairs.appearances[None, rows]
-    view_loss, accuracy = info_nce(second[0][rows], scene[rows], is_same, temperature=temperature)
+    view_loss, accuracy = info_nce(second[0][rows], scene[rows], is_same)
     loss = (loss + view_loss) / 2
-    metrics |= {"loss/second_view": view_loss.detach(), "second_view_accuracy": accuracy}
+    metrics |= {"loss/second_view": view_loss, "second_view_accuracy": accuracy}
     if encoder.config.rotation_bins:
         of_rotations = rotation_loss(encoder, features, masks, pairs.rotations)
         is_correct = is_rotation_correct(encoder, features, masks, pairs.rotations)
-        loss, metrics["loss/rotation"] = loss + of_rotations, of_rotations.detach()
+        loss, metrics["loss/rotation"] = loss + of_rotations, of_rotations
         metrics["rotation_accuracy"] = is_correct.float().mean()
     if attributes and pairs.attributes:
-        of_attributes = attribute_loss(attributes, features, masks, pairs.attributes, temperature=temperature)
-        loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes.detach()
+        of_attributes = attribute_loss(attributes, features, masks, pairs.attributes)
+        loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes
     return loss, metrics
 
 
-def _encode(
-    encoder: ObjectEncoder, crops_KSVCYX: torch.Tensor, mixing: torch.Tensor, parallel: Parallel
-) -> torch.Tensor:
-    """Encode crops of S images of K objects, with mixed channels, to features (S, V, K, F)."""
-    crops_SKVCYX = crops_KSVCYX.transpose(0, 1).contiguous()
-    mixed = torch.einsum("cd,skvdyx->skvcyx", mixing, crops_SKVCYX.to(mixing.dtype))
-    features_NF = parallel.in_parts(encoder.encode_images, mixed.flatten(0, 2))
-    return features_NF.unflatten(0, crops_SKVCYX.shape[:3]).transpose(1, 2)
+def draw_channel_mixing(generator: torch.Generator) -> torch.Tensor:
+    """Draw a (3, 3) matrix that mixes R, G and B: half of the time the identity, else a blended permutation.
+
+    Rows sum to 1, so that white, grey and black stay what they are.
+    """
+    if torch.rand((), generator=generator) < 0.5:
+        return torch.eye(3)
+    permutation = torch.eye(3)[torch.randperm(3, generator=generator)]
+    blending = torch.rand(3, 3, generator=generator)
+    weight = 0.5 * torch.rand((), generator=generator)
+    return (1 - weight) * permutation + weight * blending / blending.sum(1, keepdim=True)
 
 
 def find_matches(pairs: Pairs) -> torch.Tensor:
@@ -94,7 +98,7 @@ def find_matches(pairs: Pairs) -> torch.Tensor:
 
 
 def info_nce(
-    first: torch.Tensor, second: torch.Tensor, is_match: torch.Tensor, *, temperature: float
+    first: torch.Tensor, second: torch.Tensor, is_match: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Symmetric InfoNCE loss of K objects, and the accuracy from first to second.
 
@@ -102,18 +106,15 @@ def info_nce(
         first: Embeddings, shape (K, A).
         second: Those of other images of the same objects, shape (K, A).
         is_match: Pairs that are no negatives, shape (K, K), bool.
-        temperature: Softmax temperature.
     """
-    scores = first @ second.T / temperature
+    scores = first @ second.T / TEMPERATURE
     count = len(scores)
     diagonal = torch.eye(count, dtype=torch.bool, device=scores.device)
     # Others of the same appearance are no negatives: they are masked, and the diagonal stays the target.
     scores = scores.masked_fill(is_match & ~diagonal, torch.finfo(scores.dtype).min)
     target = torch.arange(count, device=scores.device)
     loss = (F.cross_entropy(scores, target) + F.cross_entropy(scores.T, target)) / 2
-    with torch.no_grad():
-        accuracy = (scores.argmax(1) == target).to(scores.dtype).mean()
-    return loss, accuracy
+    return loss, (scores.argmax(1) == target).to(scores.dtype).mean()
 
 
 def _chunks(pairs: Pairs) -> list[Pairs]:
@@ -223,8 +224,6 @@ def attribute_loss(
     features_3VKF: torch.Tensor,
     masks_3VK: torch.Tensor,
     labels: AttributeLabels,
-    *,
-    temperature: float,
 ) -> torch.Tensor:
     """Supervised contrastive loss, mean over attributes.
 
@@ -236,7 +235,6 @@ def attribute_loss(
         features_3VKF: Crop features in the prompt image, the scene, and the second view.
         masks_3VK: Whether the object is visible there, shape (3, 2, K).
         labels: Of the objects.
-        temperature: Softmax temperature.
 
     Source: SupCon (Khosla et al. 2020), its loss "out", with one positive at a time in the denominator.
     """
@@ -248,7 +246,7 @@ def attribute_loss(
     is_pair_MM = is_seen_M & is_seen_M[:, None]
     different_PMM = different_PMM & is_pair_MM
     same_PMM = same_PMM & is_pair_MM & ~torch.eye(len(is_seen_M), dtype=torch.bool, device=is_seen_M.device)
-    scores_PMM = projected_PMW @ projected_PMW.mT / temperature
+    scores_PMM = projected_PMW @ projected_PMW.mT / TEMPERATURE
     lowest = torch.finfo(scores_PMM.dtype).min
     # Each pair that is alike is one softmax against all that differ, summed as softplus; pairs that are
     # neither alike nor different take no part. Rows (M) are the objects of all three images, one matrix per
@@ -271,10 +269,9 @@ def attribute_accuracy(encoder: ObjectEncoder, attributes: Attributes, pairs: Pa
     labels = pairs.attributes
     assert labels is not None
     projected = []
-    for part in _chunks(pairs):
-        assert part.attributes is not None
+    for part, boxes in zip(_chunks(pairs), labels.boxes.split(_CHUNK), strict=True):
         features, masks = _features(encoder, part, [PROMPT, SCENE])
-        boxes = part.attributes.boxes[:, : len(masks)].permute(1, 2, 0, 3)
+        boxes = boxes[:, : len(masks)].permute(1, 2, 0, 3)
         projected.append(attributes(features, boxes, masks).transpose(1, 2))  # (2, P, K, W)
     prompt_PKW, scene_PKW = torch.cat(projected, dim=2)  # of (2, P, K, W)
     same_PKK, different_PKK = _compare_attributes(_images(labels, [PROMPT]), _images(labels, [SCENE]))

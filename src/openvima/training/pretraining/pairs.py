@@ -9,7 +9,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -19,15 +19,16 @@ from openvima.catalog.objects import object_spec
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random
+from openvima.catalog.textures import NEUTRAL_TEXTURE
 from openvima.multiprocess import Report, imap_unordered
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.policies.nn.layers import TensorRecord, map_tensors
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
-from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
+from openvima.scene import ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
+from openvima.tasks.table import NO_SCALE
 from openvima.training.augmentation.scenes import (
     rearrange,
-    to_grayscale,
     with_hard_negatives,
     with_random_appearance,
 )
@@ -61,35 +62,21 @@ class AttributeLabels(TensorRecord):
     boxes: torch.Tensor
 
 
-class AttributeLabeller:
-    """Labels placements.
-
-    Args:
-        assets: Source of shapes and textures.
-    """
-
-    def __init__(self, assets: Assets) -> None:
-        self._assets = assets
-        self._colours: dict[str, np.ndarray] = {}
-
-    def __call__(
-        self, placement: Placement, *, is_magnified: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return categories (3,), colours (64,) and lengths (2,) of an object."""
-        vertices = self._vertices(placement)
-        # Ears are drawn after the container of the same seed; they change its outline, and not its profile.
-        body = replace(placement, object=placement.object.replace("random eared", "random"))
-        names = (placement.texture, placement.object, profile(body.object, self._vertices(body)))
-        if placement.texture not in self._colours:
-            self._colours[placement.texture] = _histogram(self._assets.texture(placement.texture))
-        # The mean width of a footprint is twice its mean reach, whatever the middle.
-        lengths = [np.ptp(vertices[:, 2]), 2 * _reach(vertices[:, :2]).mean()]
-        known = np.array(lengths, np.float32) if not is_magnified else np.full(2, np.nan, np.float32)
-        return np.array([name_id(name) for name in names]), self._colours[placement.texture], known
-
-    def _vertices(self, placement: Placement) -> np.ndarray:
-        mesh = self._assets.geometry(placement.object, placement.size, placement.scale).visual
-        return mesh.vertices.reshape(-1, 3)
+def attributes_of_object(
+    placement: Placement, assets: Assets, *, is_magnified: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return categories (3,), colours (64,) and lengths (2,) of an object."""
+    # Ears are drawn after the container of the same seed; they change its outline, and not its profile.
+    body = placement.object.replace("random eared", "random")
+    vertices, of_body = (
+        assets.geometry(name, placement.size, placement.scale).visual.vertices.reshape(-1, 3)
+        for name in (placement.object, body)
+    )
+    names = (placement.texture, placement.object, profile(body, of_body))
+    # The mean width of a footprint is twice its mean reach, whatever the middle.
+    lengths = [np.ptp(vertices[:, 2]), 2 * _reach(vertices[:, :2]).mean()]
+    known = np.array([math.nan, math.nan] if is_magnified else lengths, np.float32)
+    return np.array([name_id(name) for name in names]), _histogram(assets, placement.texture), known
 
 
 def name_id(*names: str) -> np.int64:
@@ -136,8 +123,10 @@ def _rotation(angle_rad: float) -> np.ndarray:
     return np.array([(cos, sin), (-sin, cos)])
 
 
-def _histogram(texture: np.ndarray) -> np.ndarray:
+@lru_cache(4096)
+def _histogram(assets: Assets, name: str) -> np.ndarray:
     """Soft histogram of the colours of a texture, shape (64,), float32; its sum is 1."""
+    texture = assets.texture(name)
     pixels = texture.reshape(-1, 3)[:: max(1, texture.shape[0] * texture.shape[1] // 4096)]
     position = pixels / 255 * (_NUM_LEVELS - 1)
     weights = np.maximum(0, 1 - np.abs(position[..., None] - np.arange(_NUM_LEVELS)))  # (N, 3, levels)
@@ -192,18 +181,13 @@ class Pairs(TensorRecord):
         return pairs.select(torch.nonzero(self.masks[:, SECOND_VIEW].any(dim=1))[:, 0])
 
 
-NO_AUGMENTATION = PretrainingConfig()
-
-
 def render_pairs(
     tasks: Sequence[str],
+    config: PretrainingConfig,
     *,
-    num_scenes: int,
     seed: int,
     assets: str,
-    augmentation: PretrainingConfig = NO_AUGMENTATION,
     second_view: bool = False,
-    with_attributes: bool = False,
     report: Report | None = None,
     parallel: Parallel = ONE_PROCESS,
     workers: int = 1,
@@ -214,41 +198,37 @@ def render_pairs(
 
     Args:
         tasks: Tasks whose training partition and layouts are used, in turn.
-        num_scenes: Number of scenes.
+        config: How many scenes, and how they are augmented. With a weight of attributes the pairs are
+            labelled; this needs a second view.
         seed: Seed of the run.
         assets: Asset pack, as `load_assets` takes it.
-        augmentation: Settings that say how the scenes are augmented.
         second_view: Add a rearranged view of each scene.
-        with_attributes: Label what objects are like; needs a second view.
         report: Called with scenes done, scenes in all, and a note.
         parallel: Processes of the run that share the scenes; each returns all pairs, on its device.
         workers: Processes that render for them.
     """
-    numbers = parallel.part_of(num_scenes)
+    numbers = parallel.part_of(config.num_scenes)
     workers = max(1, workers // parallel.num_ranks)
     chunks = [numbers[start : start + _CHUNK] for start in range(0, len(numbers), _CHUNK)]
-    job = partial(_columns_of_scenes, tuple(tasks), seed, assets, augmentation, second_view, with_attributes)
+    job = partial(_pairs_of_scenes, tuple(tasks), config, seed, assets, second_view)
     say = report and (lambda done: report(done, len(numbers), "rendering scenes"))
-    found = {chunk.start: columns for chunk, columns in imap_unordered(job, chunks, workers, report=say)}
-    columns = zip(*(found[chunk.start] for chunk in chunks), strict=True)
-    pairs = _record([np.concatenate(column) for column in columns])
+    found = {chunk.start: rows for chunk, rows in imap_unordered(job, chunks, workers, report=say)}
+    pairs = stack_rows([row for chunk in chunks for row in found[chunk.start]])
     return map_tensors(pairs.to(parallel.device), parallel.rows_of_all)
 
 
-def _columns_of_scenes(
+def _pairs_of_scenes(
     tasks: Sequence[str],
+    config: PretrainingConfig,
     seed: int,
     assets: str,
-    augmentation: PretrainingConfig,
     second_view: bool,
-    with_attributes: bool,
     numbers: range,
     count: Callable[..., None],
-) -> list[np.ndarray]:
-    """Render some scenes; return the fields of their pairs, see `pairs_of_scene`, each as one array."""
+) -> list[tuple]:
+    """Render some scenes; return their pairs, see `pairs_of_scene`."""
     pack = load_assets(assets)
     rasteriser = Rasteriser(RandomAppearanceAssets(pack))
-    labeller = AttributeLabeller(rasteriser.assets) if with_attributes else None
     pools = {task: task_spec(task).pool("train") for task in tasks}
     shades = {name for names in pools.values() for name in names.dragged_textures}
     rows: list[tuple] = []
@@ -259,32 +239,30 @@ def _columns_of_scenes(
         scene = _retexture(episode.problem.scene, pools[task], np.random.default_rng(episode_seed))
         # A generator of its own, so that the scenes below are the same with any augmentation.
         rng = np.random.default_rng([episode_seed, 1])
-        if prob := augmentation.appearance_randomization_prob:
-            scene = with_random_appearance(scene, prob, rasteriser.assets, rng, augmentation)
-        if prob := augmentation.hard_negative_prob:
+        if prob := config.appearance_randomization_prob:
+            scene = with_random_appearance(scene, prob, rasteriser.assets, rng, config)
+        if prob := config.hard_negative_prob:
             scene = with_hard_negatives(scene, prob, shades, rasteriser.assets, rng)
         view = rearrange(scene, rng) if second_view else None
-        gray_slots = np.flatnonzero(rng.random(len(scene.placements)) < augmentation.grayscale_prob)
+        gray_slots = np.flatnonzero(rng.random(len(scene.placements)) < config.grayscale_prob)
+        fills = [fill for _, fill in episode.problem.prompt.images]
+        shown = [fill for fill in fills if isinstance(fill, ObjectImage)]
         rows += pairs_of_scene(
             scene,
-            _magnifications(episode),
+            {image.placement.object: image.magnification for image in shown},
             rasteriser,
             number,
             view,
             gray_slots=gray_slots,
-            labeller=labeller,
+            with_attributes=config.attribute_loss_weight > 0,
         )
         count(number - numbers.start + 1)
-    return [np.stack(column) for column in zip(*rows, strict=True)]
+    return rows
 
 
 def stack_rows(rows: Sequence[tuple]) -> Pairs:
     """Stack the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
-    return _record([np.stack(column) for column in zip(*rows, strict=True)])
-
-
-def _record(columns: Sequence[np.ndarray]) -> Pairs:
-    tensors = list(map(torch.from_numpy, columns))
+    tensors = [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
     labels = tensors[_NUM_COLUMNS:]
     return Pairs(*tensors[:_NUM_COLUMNS], attributes=AttributeLabels(*labels) if labels else None)
 
@@ -297,7 +275,7 @@ def pairs_of_scene(
     second_view: tuple[Scene, dict[int, float]] | None = None,
     *,
     gray_slots: Sequence[int] | np.ndarray = (),
-    labeller: AttributeLabeller | None = None,
+    with_attributes: bool = False,
 ) -> list[tuple]:
     """Render a scene and prompt images of its visible objects.
 
@@ -308,7 +286,7 @@ def pairs_of_scene(
         number: Index of the scene.
         second_view: The rearranged scene, and rotations by object id.
         gray_slots: Which objects of the scene have a grayscale prompt image.
-        labeller: Labels what the objects are like; only with a second view.
+        with_attributes: Label what the objects are like; only with a second view.
 
     Returns:
         For each visible object the fields of `Pairs`, without rotations if there is no second view, and
@@ -322,9 +300,11 @@ def pairs_of_scene(
         if not views[0].masks[:, slot].any():
             continue
         is_gray = slot in gray_slots
-        shown = to_grayscale(placement) if is_gray else placement
+        shown = replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE) if is_gray else placement
         magnification = magnifications.get(placement.object, 1.0)
-        images = [(_prompt_image(shown, magnification, rasteriser), 0), *((view, slot) for view in views)]
+        prompt = rasteriser.prompt(Prompt("{object}", (("object", ObjectImage(shown, magnification)),)))
+        in_prompt = observe_prompt_image(prompt.images["object"])
+        images = [(in_prompt, 0), *((view, slot) for view in views)]
         # Hard negatives, which come with a second view, may be stretched.
         scale = placement.scale if second_view else ()
         pair = (
@@ -336,19 +316,21 @@ def pairs_of_scene(
             np.bool_(is_gray),
         )
         if second_view:
-            pair = (*pair, _rotations(placement, second_view[1][placement.id]))
-            if labeller:
-                labels = (labeller(shown, is_magnified=magnification != 1), labeller(placement))
+            from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad
+            rotations = np.array([from_prompt, second_view[1][placement.id]], dtype=np.float32)
+            if not has_visible_heading(placement.object):
+                rotations[:] = np.nan
+            pair = (*pair, rotations)
+            if with_attributes:
+                assets = rasteriser.assets
+                labels = (
+                    attributes_of_object(shown, assets, is_magnified=magnification != 1),
+                    attributes_of_object(placement, assets),
+                )
                 boxes = np.stack([image.boxes[:, place] for image, place in images])
                 pair = (*pair, *map(np.stack, zip(*labels, strict=True)), boxes)
         pairs.append(pair)
     return pairs
-
-
-def _rotations(placement: Placement, to_second_view: float) -> np.ndarray:
-    from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad
-    rotations = np.array([from_prompt, to_second_view], dtype=np.float32)
-    return rotations if has_visible_heading(placement.object) else np.full_like(rotations, np.nan)
 
 
 def _retexture(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
@@ -369,20 +351,8 @@ def _retexture(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
     return replace(scene, placements=tuple(placements))
 
 
-def _magnifications(episode: Episode) -> dict[str, float]:
-    """Return the magnification of each object in prompts of this task."""
-    images = [fill for _, fill in episode.problem.prompt.images if isinstance(fill, ObjectImage)]
-    return {image.placement.object: image.magnification for image in images}
-
-
 def _observe(scene: Scene, rasteriser: Rasteriser) -> ObjectViews:
     views = rasteriser.scene(scene)
     rgb = {name: image.rgb for name, image in views.items()}
     segm = {name: image.segm for name, image in views.items()}
     return extract_objects(rgb, segm, [placement.id for placement in scene.placements])
-
-
-def _prompt_image(placement: Placement, magnification: float, rasteriser: Rasteriser) -> ObjectViews:
-    image = ObjectImage(placement, magnification)
-    prompt = rasteriser.prompt(Prompt("{object}", (("object", image),)))
-    return observe_prompt_image(prompt.images["object"])
