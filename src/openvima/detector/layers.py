@@ -140,7 +140,7 @@ BACKGROUND_IOU = 0.3  # anchors below it are background
 ANCHORS_PER_IMAGE, POSITIVE_FRACTION = 256, 0.5  # of the loss
 
 
-# Of each level: K anchors, (K, 4), the logits of their objectness, (B, K), and the deltas of boxes, (B, K, 4).
+# Of each level: K anchors, (K, 4), logits of their objectness, (B, K), and deltas of their boxes, (B, K, 4).
 AnchorPredictions = Sequence[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 
 
