@@ -141,29 +141,33 @@ class ActionHead(nn.Module):
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
     ) -> ActionLoss:
         """Return the loss of whole histories; see `action_loss`. `query_spread` is one of the metrics."""
-        previous = self._segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
+        previous = self.segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
         (_, outputs_BTQD), _ = decoder.decode_segments(cache, [previous, observations.segment()])
         query_BTD = observations.query(outputs_BTQD)
         found = self.action_loss(query_BTD, targets)
         return self.add_pointing(found, query_BTD, query_BTD, observations, targets)
 
-    def decode_step(
+    def decode(
         self,
         decoder: CausalDecoder,
         cache: KVCache,
+        query_BTD: torch.Tensor,
         observations: ObservationTokens,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        strategy: DecodingStrategy = greedy,
-    ) -> tuple[torch.Tensor, KVCache]:
-        """Decode the next action."""
-        previous = self._segment(previous_BTC, has_previous_BT, observations.tokens_BTQD.dtype)
-        (_, outputs_BTQD), cache = decoder.decode_segments(cache, [previous, observations.segment()])
-        query_BTD = observations.query(outputs_BTQD)
+        strategy: DecodingStrategy,
+    ) -> torch.Tensor:
+        """Decode the next action from its query, the output at the end of the observation.
+
+        Args:
+            decoder: Decodes further tokens, where a head has some.
+            cache: Ends with the observation; the action joins it with the next one, as it was sent.
+            query_BTD: The query.
+            observations: Tokens of the observation.
+            strategy: How a class is decoded from logits.
+        """
         actions_BTC = self.action(query_BTD, strategy)
         if self.points:
             actions_BTC = point_at_objects(actions_BTC, query_BTD, query_BTD, observations, strategy)
-        return actions_BTC, cache
+        return actions_BTC
 
     def add_pointing(
         self,
@@ -185,9 +189,8 @@ class ActionHead(nn.Module):
             loss, metrics["loss/pointing"] = loss + pointing, pointing.detach()
         return loss, metrics, actions_BTC
 
-    def _segment(
-        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
-    ) -> TokenSegment:
+    def segment(self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype) -> TokenSegment:
+        """Return past actions as a segment of the sequence, whose tokens have this precision."""
         return action_segment(self.actions(self.past_actions(actions_BTC).to(dtype))[:, :, None], exists_BT)
 
 

@@ -194,9 +194,11 @@ class PolicyNetwork(nn.Module):
             PolicyError: Prompt or history is longer than the decoder takes.
         """
         observations, state = self._observe(step.prompt, step.state, step.history, step.features_KF)
-        return self.head.decode_step(
-            self.decoder, state, observations, step.previous_BTC, step.has_previous_BT, strategy
-        )
+        dtype = observations.tokens_BTQD.dtype
+        previous = self.head.segment(step.previous_BTC, step.has_previous_BT, dtype)
+        (_, outputs_BTQD), state = self.decoder.decode_segments(state, [previous, observations.segment()])
+        query_BTD = observations.query(outputs_BTQD)
+        return self.head.decode(self.decoder, state, query_BTD, observations, strategy), state
 
     def _observe(
         self, prompt: Any, cache: KVCache, history: HistoryBatch, features_KF: torch.Tensor
