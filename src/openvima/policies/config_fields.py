@@ -133,19 +133,13 @@ def build_config(kind: type, values: Any, where: str) -> Any:
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
-    if isinstance(hint, UnionType):
-        if value is None and NoneType in get_args(hint):
-            return None
-        options = [option for option in get_args(hint) if option is not NoneType]
-        hint = max(options, key=lambda option: _num_shared_fields(option, value))
-    if is_dataclass(hint) and isinstance(hint, type):
-        return build_config(hint, value, where)
+    options = options_of(hint)
+    names: dict[Any, set[str]] = {
+        kind: {field.name for field in fields(kind)} for kind in options if is_dataclass(kind)
+    }
+    if names and not (value is None and NoneType in options):
+        given = {*value} if isinstance(value, Mapping) else set()
+        # Of several dataclasses the one that shares most fields.
+        best = max(names, key=lambda kind: len(names[kind] & given) - len(names[kind] ^ given))
+        return build_config(best, value, where)
     return tuple(value) if isinstance(value, list) else value
-
-
-def _num_shared_fields(kind: Any, value: Any) -> int:
-    """Score how well a mapping matches the fields of a dataclass, to resolve unions."""
-    if not is_dataclass(kind) or not isinstance(value, Mapping):
-        return 0
-    names = {field.name for field in fields(kind)}
-    return len(names & set(value)) - len(names ^ set(value))

@@ -231,7 +231,9 @@ class Processor:
         """Pad the objects of all steps to slots; counts and end effectors are those of steps."""
         step, slot = _rows_and_slots(counts)
         if self.layout == "views":
-            objects = _visible_first(objects, step)
+            # In each view separately.
+            orders = [order_in_view(objects.ids, objects.masks[:, v], step) for v in (FRONT, TOP)]
+            objects = _select_views(objects, np.stack(orders, axis=1))
         (count, length), num_slots = steps.shape, max(1, int(slots_BT.max(initial=0)))
         place = steps.place[step]
         crop_index, masks = np.zeros((2, count * length, len(VIEWS), num_slots), np.int64)
@@ -305,7 +307,8 @@ class Processor:
             rows = [[own[masks[own, v]] for v, own in enumerate(image)] for image in rows]
             slots = [max(map(len, view)) for view in zip(*rows, strict=True)]
             rows = [
-                [np.concatenate([own, np.full(max(slots) - len(own), -1)]) for own in image] for image in rows
+                [np.pad(own, (0, max(slots) - len(own)), constant_values=-1) for own in image]
+                for image in rows
             ]
         shown = [np.stack(image, axis=1) for image in rows]
         tokens: list[tuple[int, int, int, bool]] = []  # word, row, part, whether it is valid
@@ -389,12 +392,6 @@ def _table_points(objects: ObjectTable, pixels: np.ndarray) -> np.ndarray:
     """Points on the table under pixels (N, 2 views, 2): those of the top view, or else the front view."""
     front, top = (unproject(pixels[:, v], CAMERAS[view]) for v, view in enumerate(VIEWS))
     return np.where(objects.masks[:, TOP, None], top, front)
-
-
-def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
-    """Sort the objects of each step separately in each view: visible ones first, then by id."""
-    views = (order_in_view(objects.ids, objects.masks[:, v], step) for v in (FRONT, TOP))
-    return _select_views(objects, np.stack([*views], axis=1))
 
 
 def order_in_view(ids: np.ndarray, is_visible: np.ndarray, step: np.ndarray) -> np.ndarray:

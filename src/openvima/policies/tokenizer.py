@@ -200,7 +200,9 @@ class WordTokenizer:
             [32, 363, 364]
         """
         pieces = split_words(text)
-        found = [self._id(piece) for piece in pieces]
+        found = [
+            _FIRST_NUMBER_ID + int(piece) if _is_number(piece) else self._ids.get(piece) for piece in pieces
+        ]
         if None in found:
             self._warn([piece for piece, token in zip(pieces, found, strict=True) if token is None])
         unknown = self._ids.get(UNKNOWN)
@@ -210,9 +212,6 @@ class WordTokenizer:
         """Write the vocabulary to a folder, which is created."""
         folder.mkdir(parents=True, exist_ok=True)
         self.vocabulary.write(folder)
-
-    def _id(self, piece: str) -> int | None:
-        return _FIRST_NUMBER_ID + int(piece) if _is_number(piece) else self._ids.get(piece)
 
     def _warn(self, unknown: list[str]) -> None:
         """Name unknown words once each; a bounded number of them, of bounded length."""
@@ -228,8 +227,7 @@ class WordTokenizer:
 
 def _is_number(piece: str) -> bool:
     """Whether it has an id in every vocabulary."""
-    has_digits = piece[0] in "0123456789" and len(piece) <= len(str(LARGEST_NUMBER))
-    return has_digits and int(piece) <= LARGEST_NUMBER
+    return re.fullmatch("[0-9]{1,3}", piece) is not None and int(piece) <= LARGEST_NUMBER
 
 
 def _is_word(word: str) -> bool:

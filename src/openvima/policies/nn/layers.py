@@ -10,6 +10,7 @@ Shape suffixes: B batch, L positions, N positions of all rows that are computed,
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
+from itertools import pairwise
 from typing import Any, Self
 
 import torch
@@ -90,8 +91,8 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
         The MLP, with orthogonal weights of gain √2 and zero biases.
     """
     layers: list[nn.Module] = []
-    for i in range(len(widths) - 1):
-        linear = nn.Linear(widths[i], widths[i + 1])
+    for inputs, outputs in pairwise(widths):
+        linear = nn.Linear(inputs, outputs)
         nn.init.orthogonal_(linear.weight, gain=2**0.5)
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.ReLU()]
@@ -114,12 +115,9 @@ def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:
     return stack
 
 
-def layer_of(stack: nn.Module, index: int) -> nn.Linear:
+def layer_of(stack: Any, index: int) -> nn.Linear:  # lists of modules do not say that theirs are MLPs
     """Return a linear layer of an MLP: 0 is the first one, -1 the last."""
-    assert isinstance(stack, nn.Sequential)
-    layer = stack[index]
-    assert isinstance(layer, nn.Linear)
-    return layer
+    return stack[index]
 
 
 def valid_first(mask_BL: torch.Tensor, min_count: int = 0) -> torch.Tensor:
