@@ -31,7 +31,7 @@ from openvima.policies.base import PromptLimits
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
-from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
+from openvima.policies.tokenizer import END_ID, PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import RenderedPrompt
 
@@ -326,7 +326,7 @@ class Processor:
                 places = [(k, 0, True) for k in range(len(own))]
             tokens += [(PADDING_ID, count + k, part, is_valid) for k, part, is_valid in places]
             count += len(own)
-        tokens.append((self.tokenizer.end_id, WORD, 0, True))
+        tokens.append((END_ID, WORD, 0, True))
         # Before the encoder, whose cost is quadratic.
         check_length(len(tokens), MAX_PROMPT_POSITIONS, "the prompt")
         sizes = [len(own) for own in shown]

@@ -150,12 +150,7 @@ def benchmark_vocabulary() -> Vocabulary:
 
 
 class Tokenizer(Protocol):
-    """Encodes prompt text as word ids."""
-
-    @property
-    def end_id(self) -> int:
-        """Id that ends every prompt."""
-        ...
+    """Encodes prompt text as word ids; `END_ID` ends every prompt."""
 
     @property
     def texture_ids(self) -> np.ndarray:
@@ -176,8 +171,6 @@ class WordTokenizer:
     Args:
         vocabulary: The words; by default those of the benchmark.
     """
-
-    end_id = END_ID
 
     def __init__(self, vocabulary: Vocabulary | None = None) -> None:
         self.vocabulary = benchmark_vocabulary() if vocabulary is None else vocabulary
