@@ -1,5 +1,6 @@
 """Types and limits of the fields of configs and settings, which may come from a file."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
@@ -13,10 +14,10 @@ from openvima.errors import ConfigError, unknown_name
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Smallest and largest allowed value of a number; None means no upper bound."""
+    """Smallest and largest allowed value of a number."""
 
     low: float
-    high: float | None = None
+    high: float = math.inf
 
 
 # Allowed type of values, and its name in messages.
@@ -93,11 +94,10 @@ def _problem(name: str, value: Any, hint: Any, *, of_network: bool) -> str | Non
         limits = Range(0, _LIMITS.get(name.rpartition(".")[2], MAX_WIDTH))
     elif of_network and kind is float:
         limits = Range(-_MAX_FLOAT, _MAX_FLOAT)
-    if limits is None or (limits.low <= value and (limits.high is None or value <= limits.high)):
+    if limits is None or limits.low <= value <= limits.high:
         return None
-    allowed = f"at least {limits.low}"
-    if limits.high is not None:
-        allowed = f"between {limits.low} and {limits.high}"
+    has_end = limits.high < math.inf
+    allowed = f"between {limits.low} and {limits.high}" if has_end else f"at least {limits.low}"
     return f"{name} is {short(value)}; it must be {allowed}."
 
 

@@ -334,8 +334,7 @@ class BinsHead(ActionHead):
 
     def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
         """Return the loss, its parts and the decoded actions; see `bins_loss`."""
-        loss, metrics, bins_BTC = bins_loss(self.logits(query_BTD), targets)
-        return loss, metrics, actions_from_bins(bins_BTC, query_BTD.dtype)
+        return bins_loss(self.logits(query_BTD), targets)
 
     def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
         """Decode the bin of each component."""
@@ -365,9 +364,7 @@ class BinsHead(ActionHead):
         return [classifier(query_BTD) for classifier in self.classifiers]
 
 
-def bins_loss(
-    logits: Sequence[torch.Tensor], targets: ActionTargets
-) -> tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
+def bins_loss(logits: Sequence[torch.Tensor], targets: ActionTargets) -> ActionLoss:
     """Cross-entropy of every component: mean over a part's components, then sum of the four parts.
 
     So each position and each rotation has the same weight, whatever the number of its components.
@@ -377,7 +374,7 @@ def bins_loss(
         targets: The demonstrated actions.
 
     Returns:
-        The loss; its parts as `loss/<part>`; and the bins with the highest logits, (B, T, C).
+        The loss; its parts as `loss/<part>`; and the actions of the bins with the highest logits, (B, T, C).
 
     Source: the published policies were trained with this loss (VIMA, Jiang et al. 2023).
     """
@@ -388,7 +385,8 @@ def bins_loss(
     metrics = {
         f"loss/{name}": masked_mean(loss_BT.detach(), targets.steps_BT) for name, loss_BT in losses_BT.items()
     }
-    return loss, metrics, torch.stack([scores.argmax(-1) for scores in logits], dim=-1)
+    best_BTC = torch.stack([scores.argmax(-1) for scores in logits], dim=-1)
+    return loss, metrics, actions_from_bins(best_BTC, logits[0].dtype)
 
 
 def encode_bins(unit_actions: torch.Tensor) -> torch.Tensor:

@@ -87,8 +87,7 @@ class AutoregressiveHead(BinsHead):
         outputs_BTCD = torch.cat([query_BT1D, actions_BTCD[:, :, :-1]], dim=2)
         pairs = zip(self.classifiers, outputs_BTCD.unbind(2), strict=True)
         logits = [classifier(output) for classifier, output in pairs]
-        loss, metrics, bins_BTC = bins_loss(logits, targets)
-        found = loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        found = bins_loss(logits, targets)
         pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
         return self.add_pointing(found, pick_BTD, place_BTD, observations, targets)
 
