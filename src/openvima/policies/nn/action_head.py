@@ -33,7 +33,7 @@ from openvima.policies.nn.actions import (
     to_unit_range,
 )
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
-from openvima.policies.nn.layers import layer_of, mlp, scale_last
+from openvima.policies.nn.layers import layer_of, mlp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -330,7 +330,7 @@ class BinsHead(ActionHead):
     def __init__(self, hidden_width: int, width: int, actions: nn.Module) -> None:
         super().__init__(actions)
         hidden = (width, hidden_width, hidden_width)
-        self.classifiers = nn.ModuleList(scale_last(mlp((*hidden, count)), gain=0.01) for count in NUM_BINS)
+        self.classifiers = nn.ModuleList(mlp((*hidden, count), last_gain=0.01) for count in NUM_BINS)
 
     def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
         """Return the loss, its parts and the decoded actions; see `bins_loss`."""

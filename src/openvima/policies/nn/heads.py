@@ -45,7 +45,7 @@ from openvima.policies.nn.actions import (
     yaw_between,
 )
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
-from openvima.policies.nn.layers import layer_of, mlp, scale_last
+from openvima.policies.nn.layers import layer_of, mlp
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,10 +229,10 @@ class MixtureHead(ActionHead):
         self.num_components, self.min_std = config.num_components, config.min_std
         hidden = (width, config.hidden_width, config.hidden_width)
         # Weights have layers of their own: gradients of narrow components would drown theirs.
-        self.gate = scale_last(mlp((*hidden, config.num_components)), gain=0.01)
+        self.gate = mlp((*hidden, config.num_components), last_gain=0.01)
         # Of each component: means, cosine and sine, logarithms of the five standard deviations.
         count = config.num_components * (_POSITIONS + 2 + _POSITIONS + 1)
-        self.out = scale_last(mlp((*hidden, count)), gain=0.01)
+        self.out = mlp((*hidden, count), last_gain=0.01)
         bias = layer_of(self.out, -1).bias.view(config.num_components, -1)
         with torch.no_grad():
             nn.init.uniform_(bias[:, :_POSITIONS])  # equal components would stay equal
@@ -296,7 +296,7 @@ class RegressionHead(ActionHead):
         super().__init__(actions)
         self.huber_delta = config.huber_delta
         hidden = config.hidden_width
-        self.out = scale_last(mlp((width, hidden, hidden, _POSITIONS + 2)), gain=0.01)
+        self.out = mlp((width, hidden, hidden, _POSITIONS + 2), last_gain=0.01)
         bias = layer_of(self.out, -1).bias
         with torch.no_grad():
             bias[:_POSITIONS] = 0.5

@@ -81,11 +81,12 @@ def round_rows(count: int) -> int:
     return -(-count // step) * step
 
 
-def mlp(widths: Sequence[int]) -> nn.Sequential:
+def mlp(widths: Sequence[int], *, last_gain: float | None = None) -> nn.Sequential:
     """Build linear layers of the given widths with ReLU between them.
 
     Args:
         widths: Width of the input, of each hidden layer and of the output.
+        last_gain: Gain of the last layer, which is drawn once more, so that heads start near zero.
 
     Returns:
         The MLP, with orthogonal weights of gain √2 and zero biases.
@@ -96,7 +97,10 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
         nn.init.orthogonal_(linear.weight, gain=2**0.5)
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    stack = nn.Sequential(*layers[:-1])
+    if last_gain is not None:
+        nn.init.orthogonal_(layer_of(stack, -1).weight, gain=last_gain)
+    return stack
 
 
 def normal_weights(module: nn.Module, std: float) -> None:
@@ -106,13 +110,6 @@ def normal_weights(module: nn.Module, std: float) -> None:
             nn.init.normal_(part.weight, std=std)
         if isinstance(part, nn.Linear) and part.bias is not None:
             nn.init.zeros_(part.bias)
-
-
-def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:
-    """Reinitialise the last layer orthogonally with another gain, so that heads start near zero."""
-    with torch.no_grad():
-        nn.init.orthogonal_(layer_of(stack, -1).weight, gain=gain)
-    return stack
 
 
 def layer_of(stack: Any, index: int) -> nn.Linear:  # lists of modules do not say that theirs are MLPs
