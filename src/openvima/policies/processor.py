@@ -17,7 +17,6 @@ import torch
 from openvima.errors import DatasetError, PolicyError, PromptError
 from openvima.perception.objects import FRONT, TOP, ObjectExtractor, ObjectViews, end_effector_of
 from openvima.perception.preprocessing import (
-    IMAGE_SIZES,
     ImageStack,
     InputKind,
     ObjectTable,
@@ -86,7 +85,7 @@ class Processor:
             PROMPT_LIMITS.check(prompt)
         if not all(prompt.sequence() for prompt in prompts):
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
-        stack = ImageStack(IMAGE_SIZES[self.input_kind])
+        stack = ImageStack(self.input_kind)
         extract_ahead(self.input_kind, self.extractor, prompts=prompts)
         preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
         return self.batch_prompts(preprocessed), stack
@@ -116,7 +115,7 @@ class Processor:
                 objects or none. With layout "views" there may be none after the first step.
             ShapeError: An image has another shape or dtype.
         """
-        stack = stack or ImageStack(IMAGE_SIZES[self.input_kind])
+        stack = stack or ImageStack(self.input_kind)
         observations = [each for history in histories for each in history]
         end_effectors = np.array([end_effector_of(each) for each in observations])
         extract_ahead(self.input_kind, self.extractor, observations=observations)
