@@ -24,7 +24,7 @@ from openvima.perception.objects import (
     whole_frames,
 )
 from openvima.policies.batch import WORD, HistoryBatch, InputLayout, PromptBatch
-from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
+from openvima.policies.tokenizer import END_ID, PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
 
@@ -145,7 +145,7 @@ class NaiveProcessor:
                 (PADDING_ID, count + entry, part, valid) for entry, part, valid in self._places(image, slots)
             ]
             count += len(image)
-        places.append((self.tokenizer.end_id, WORD, 0, True))
+        places.append((END_ID, WORD, 0, True))
         words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
         numbers = np.repeat(np.arange(len(images)), [len(image) for image in images])
         kinds = [piece.kind == "scene" for piece in sequence if isinstance(piece, PromptImage)]

@@ -38,7 +38,7 @@ def draw_anchors(axes: Any, annotated: Frame) -> None:
     sizes = SMALL
     strides = [FIRST_STRIDE * 2**k for k in range(len(sizes.anchor_sizes))]
     shapes = tuple((FRONT.height // stride, FRONT.width // stride) for stride in strides)
-    levels = pyramid_anchors(sizes.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
+    levels = pyramid_anchors(sizes.anchor_sizes, shapes)
     _, labels = match(
         torch.cat(levels),
         torch.from_numpy(annotated.boxes),

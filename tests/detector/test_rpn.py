@@ -35,10 +35,10 @@ def scored(tiny, seed: int) -> AnchorPredictions:
     levels = [torch.randn(2, 16, HEIGHT // stride, WIDTH // stride) for stride in (4, 8)]
     with torch.no_grad():
         predictions = RegionProposalNetwork(tiny)(levels)
-        scores = [(part * 40).round() for part in predictions.objectness]
-        return AnchorPredictions(
-            predictions.anchors, scores, [torch.randn_like(part) for part in predictions.deltas]
-        )
+        return [
+            (anchors, (scores * 40).round(), torch.randn_like(deltas))
+            for anchors, scores, deltas in predictions
+        ]
 
 
 def propose(config, given: AnchorPredictions) -> list[torch.Tensor]:
@@ -50,11 +50,10 @@ def test_proposals_agree_with_sequential_nms_per_level(tiny, seed):
     config, given = replace(tiny, rpn_pre_nms_top_n=40, rpn_post_nms_top_n=50), scored(tiny, seed)
     for image, proposed in enumerate(propose(config, given)):
         boxes, scores, levels = [], [], []
-        for level, anchors in enumerate(given.anchors):
-            best, rows = given.objectness[level][image].topk(40)
-            deltas = given.deltas[level][image, rows]
+        for level, (anchors, objectness, deltas) in enumerate(given):
+            best, rows = objectness[image].topk(40)
             boxes += decode_boxes(
-                deltas, anchors[rows], PROPOSAL_WEIGHTS, height=HEIGHT, width=WIDTH
+                deltas[image, rows], anchors[rows], PROPOSAL_WEIGHTS, height=HEIGHT, width=WIDTH
             ).tolist()
             scores += best.tolist()
             levels += [level] * 40
@@ -114,7 +113,7 @@ def test_nms_acts_in_each_group_alone_and_drops_boxes_without_area():
 
 
 def test_the_anchors_of_a_level_agree_with_the_naive_twin():
-    _, made = pyramid_anchors((10.0, 20.0), ((6, 10), (3, 5)), first_stride=4)
+    _, made = pyramid_anchors((10.0, 20.0), ((6, 10), (3, 5)))
     assert np.allclose(made, naive.anchors(20.0, stride=8, height=3, width=5), atol=1e-5)
 
 

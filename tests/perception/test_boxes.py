@@ -5,7 +5,6 @@ import pytest
 
 from openvima.env import TabletopEnv
 from openvima.perception.boxes import BoxJitter, match_ids_to_slots, object_iou
-from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import ObjectViews, crop_box, make_hidden_objects, observe
 from openvima.perception.preprocessing import FOUND, ImageStack, extract_observation, preprocess_prompt
 from openvima.render.camera import VIEWS
@@ -119,9 +118,8 @@ def test_networks_on_objects_get_the_moved_boxes_and_those_on_frames_see_no_diff
     assert np.array_equal(whole[0].crops, whole[1].crops)
     names = list(env.prompt.images)
     prompt = type(env.prompt)(env.prompt.text, {n: jitter.prompt_image(env.prompt.images[n]) for n in names})
-    size = (CROP_SIZE, CROP_SIZE)
     plain, noisy = (
-        preprocess_prompt(each, "objects", None, ImageStack(size)) for each in (env.prompt, prompt)
+        preprocess_prompt(each, "objects", None, ImageStack("objects")) for each in (env.prompt, prompt)
     )
     assert np.array_equal(plain.objects.ids, noisy.objects.ids)
     assert (plain.objects.boxes != noisy.objects.boxes).any()

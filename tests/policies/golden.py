@@ -30,7 +30,7 @@ from naive_inputs import (
     batch_prompts,
 )
 from openvima.perception.objects import ObjectViews, make_hidden_objects
-from openvima.perception.preprocessing import IMAGE_SIZES, ImageStack
+from openvima.perception.preprocessing import ImageStack
 from openvima.policies.build import outline_network
 from openvima.policies.nn.action_head import BinsHead, decode_bins, shift_actions
 from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
@@ -286,7 +286,7 @@ def _file(name: str) -> Path:
 
 
 def _stack(network: PolicyNetwork) -> ImageStack:
-    return ImageStack(IMAGE_SIZES[Processor(*network.config.inputs).input_kind])
+    return ImageStack(Processor(*network.config.inputs).input_kind)
 
 
 def _features(network: PolicyNetwork, stack: ImageStack) -> torch.Tensor:

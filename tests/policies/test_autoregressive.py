@@ -22,14 +22,14 @@ from openvima.policies.nn.heads import (
 )
 from openvima.policies.nn.policy_network import PolicyNetwork, StepInputs
 from openvima.policies.processor import Processor
-from openvima.policies.variants import with_head, with_variant, with_visual_residual
+from openvima.policies.variants import with_variant
 from small_networks import collate_examples, examples_of, perturbed
 
 # One decoder; and cross-attention, with the last slot or with a query token as the action query.
 CONFIGS = {
     "midas": preset("midas-nano"),
-    "vima": with_head(with_visual_residual(preset("vima-nano")), "autoregressive"),
-    "query": with_head(preset("nano-bins"), "autoregressive"),
+    "vima": with_variant(preset("vima-nano"), {"visual_residual": True, "head": "autoregressive"}),
+    "query": with_variant(preset("nano-bins"), {"head": "autoregressive"}),
 }
 
 
@@ -176,7 +176,7 @@ def test_actions_as_they_are_sent_come_back_as_the_same_tokens(component: int) -
 
 @torch.no_grad()
 def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonstrations) -> None:
-    on = perturbed(with_visual_residual(preset("vima-nano"))).double()
+    on = perturbed(with_variant(preset("vima-nano"), {"visual_residual": True})).double()
     off = build_network(preset("vima-nano"), seed=0).double().eval()
     off.load_state_dict(on.state_dict())
     batch, features = read(on, demonstrations)

@@ -125,13 +125,13 @@ def test_a_learner_of_ones_own_has_a_name(tmp_path, monkeypatch) -> None:
     file.write_text("\n".join(lines))
     monkeypatch.setattr(presets, "_own", {})
     monkeypatch.setenv(presets.POLICY_FILES_VARIABLE, str(file))
-    presets._load_own_files.cache_clear()
+    presets.own_policies.cache_clear()
     try:
         assert presets.own_policies() == {"mine": f"{file}:make"}
         config = TrainingConfig(data=tmp_path, out=tmp_path / "run", preset="mine")
         assert resolve(config).preset == f"{file}:make"
     finally:
-        presets._load_own_files.cache_clear()
+        presets.own_policies.cache_clear()
 
 
 @pytest.mark.parametrize("name", ["nano", "a:b", ""])

@@ -19,6 +19,7 @@ from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ActionEncoder,
     ActionTargets,
+    greedy,
     to_unit_range,
 )
 from openvima.scene import Action
@@ -82,9 +83,7 @@ def test_bin_k_of_n_decodes_to_k_over_n():
 def test_greedy_decoding_takes_the_highest_logit_and_stays_within_bounds():
     network = head()
     query = 50 * torch.randn(3, 4, 6, generator=torch.Generator().manual_seed(1))
-    no_action = torch.zeros(3, 4, 12), torch.zeros(3, 4, dtype=torch.bool)
-    decided, _ = network.decode_step(Identity(), None, observations(query), *no_action)
-    decided = decided.detach()
+    decided = network.action(query, greedy).detach()
     assert decided.shape == (3, 4, 12)
     for component, scores in enumerate(network.logits(query)):
         value = to_unit_range(decided)[..., component] * NUM_BINS[component]

@@ -58,7 +58,6 @@ def ids(*pieces: str) -> list[int]:
 )
 def test_words_begin_with_the_marker_and_no_piece_ends_with_special_ids(tokenizer, text, pieces) -> None:
     assert tokenizer.encode(text) == ids(*pieces.split())
-    assert tokenizer.end_id == 1
 
 
 def test_a_prompt_is_read_with_placeholders_between_words_and_the_end_mark(tokenizer) -> None:

@@ -12,7 +12,7 @@ from openvima.detector.detection import DetectedObjects, Detections
 from openvima.detector.plugins import PluggedExtractor
 from openvima.errors import DatasetError
 from openvima.perception.objects import GROUND_TRUTH, ObjectViews, crop_box
-from openvima.perception.preprocessing import IMAGE_SIZES, ImageStack
+from openvima.perception.preprocessing import ImageStack
 from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.processor import Processor
 from openvima.training.augmentation.prompts import motion_prompt
@@ -46,7 +46,7 @@ EXTRACTORS = {
 
 def assert_as_when_acting(batch, demos, naive: NaiveProcessor, processor: Processor, prompts) -> None:
     """Compare a batch with what a policy encodes, and with what the naive twin reads step by step."""
-    stack = ImageStack(IMAGE_SIZES[processor.input_kind])
+    stack = ImageStack(processor.input_kind)
 
     def add(objects: ObjectViews) -> np.ndarray:
         numbers = np.zeros(objects.masks.shape, np.int64)

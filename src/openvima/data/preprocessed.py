@@ -10,7 +10,6 @@ from openvima.data.schema import VIEWS
 from openvima.perception.boxes import match_ids_to_slots
 from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, observe
 from openvima.perception.preprocessing import (
-    IMAGE_SIZES,
     ImageStack,
     InputKind,
     ObjectTable,
@@ -110,7 +109,7 @@ def preprocess(
     Raises:
         PolicyError: A view is missing, or objects have impossible ids.
     """
-    stack = ImageStack(IMAGE_SIZES[kind])
+    stack = ImageStack(kind)
     observations = [demo.observation(t) for t in range(demo.num_steps)]
     extract_ahead(kind, extractor, observations=observations, prompts=[demo.prompt])
     prompt = preprocess_prompt(demo.prompt, kind, extractor, stack)

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
+from openvima.detector.config import FIRST_STRIDE
 from openvima.detector.kernels import decode, suppress
 
 MAX_LOG_SCALE = math.log(1000 / 16)  # of one regression step, as in Detectron2; keeps exp from overflowing
@@ -103,21 +104,20 @@ ASPECT_RATIOS = (0.5, 1.0, 2.0)  # height over width
 
 @lru_cache(maxsize=64)
 def pyramid_anchors(
-    sizes: tuple[float, ...], shapes: tuple[tuple[int, int], ...], *, first_stride: int
+    sizes: tuple[float, ...], shapes: tuple[tuple[int, int], ...]
 ) -> tuple[torch.Tensor, ...]:
     """Return the anchors of each level; the tensors are shared between calls.
 
     Args:
         sizes: Anchor size of each level: the square root of the area of all its anchors, in pixels.
-        shapes: Rows and columns of each level.
-        first_stride: Stride of the finest level, in pixels; strides double from level to level. The first
-            cell of each is centred on the image's upper left corner.
+        shapes: Rows and columns of each level. The first has `FIRST_STRIDE`, and strides double from level
+            to level. The first cell of each is centred on the image's upper left corner.
 
     Returns:
         Of each level, shape (rows · columns · 3, 4), float32, ordered by row, column and `ASPECT_RATIOS`.
 
     Example:
-        >>> pyramid_anchors((8.0,), ((1, 1),), first_stride=4)[0][1]
+        >>> pyramid_anchors((8.0,), ((1, 1),))[0][1]
         tensor([-4., -4.,  4.,  4.])
     """
     ratios, levels = torch.tensor(ASPECT_RATIOS), []
@@ -125,7 +125,7 @@ def pyramid_anchors(
         widths = size / ratios.sqrt()
         halves = torch.stack([widths, widths * ratios], dim=1) / 2
         rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        centres = torch.stack([columns, rows], dim=-1).view(-1, 1, 2) * first_stride * 2**level
+        centres = torch.stack([columns, rows], dim=-1).view(-1, 1, 2) * FIRST_STRIDE * 2**level
         levels.append(torch.cat([centres - halves, centres + halves], dim=-1).view(-1, 4))
     return tuple(levels)
 

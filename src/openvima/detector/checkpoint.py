@@ -114,32 +114,27 @@ def _tensors(network: MaskRCNN) -> dict[str, torch.Tensor]:
 
 
 _CLASS_WEIGHTS = "roi_heads.box_predictor.cls_score.weight"
-# Patterns of module names in Detectron2, and ours. Detectron2 counts these indices from other numbers.
-_FIRST = {"stage": 2, "block": 0, "layer": 1}
-_BOTTOM_UP = (
-    (r"backbone\.bottom_up\.stem\.conv1", "backbone.stem"),
-    (
-        r"backbone\.bottom_up\.res(?P<stage>\d)\.(?P<block>\d+)\.shortcut",
-        "backbone.stages.{stage}.{block}.shortcut",
-    ),
-    (
-        r"backbone\.bottom_up\.res(?P<stage>\d)\.(?P<block>\d+)\.conv(?P<layer>\d)",
-        "backbone.stages.{stage}.{block}.layers.{layer}",
-    ),
-)
-_OTHERS = (
-    (r"backbone\.fpn_lateral(?P<stage>\d)", "backbone.lateral.{stage}"),
-    (r"backbone\.fpn_output(?P<stage>\d)", "backbone.smooth.{stage}"),
-    (r"proposal_generator\.rpn_head\.conv", "rpn.conv"),
-    (r"proposal_generator\.rpn_head\.objectness_logits", "rpn.objectness"),
-    (r"proposal_generator\.rpn_head\.anchor_deltas", "rpn.deltas"),
-    (r"roi_heads\.box_head\.fc(?P<layer>\d)", "box_head.hidden.{layer}"),
-    (r"roi_heads\.box_predictor\.cls_score", "box_head.class_logits"),
-    (r"roi_heads\.box_predictor\.bbox_pred", "box_head.deltas"),
-    (r"roi_heads\.mask_head\.mask_fcn(?P<layer>\d)", "mask_head.convs.{layer}"),
-    (r"roi_heads\.mask_head\.deconv", "mask_head.deconv"),
-    (r"roi_heads\.mask_head\.predictor", "mask_head.mask_logits"),
-)
+# Names of modules in Detectron2, which nests norms in convolutions, and ours; numbers in braces.
+_NAMES = """
+  backbone.bottom_up.stem.conv1.norm                      backbone.stem.norm
+  backbone.bottom_up.stem.conv1                           backbone.stem.conv
+  backbone.bottom_up.res{stage}.{block}.shortcut.norm     backbone.stages.{stage}.{block}.shortcut.norm
+  backbone.bottom_up.res{stage}.{block}.shortcut          backbone.stages.{stage}.{block}.shortcut.conv
+  backbone.bottom_up.res{stage}.{block}.conv{layer}.norm  backbone.stages.{stage}.{block}.layers.{layer}.norm
+  backbone.bottom_up.res{stage}.{block}.conv{layer}       backbone.stages.{stage}.{block}.layers.{layer}.conv
+  backbone.fpn_lateral{stage}                             backbone.lateral.{stage}
+  backbone.fpn_output{stage}                              backbone.smooth.{stage}
+  proposal_generator.rpn_head.conv                        rpn.conv
+  proposal_generator.rpn_head.objectness_logits           rpn.objectness
+  proposal_generator.rpn_head.anchor_deltas               rpn.deltas
+  roi_heads.box_head.fc{layer}                            box_head.hidden.{layer}
+  roi_heads.box_predictor.cls_score                       box_head.class_logits
+  roi_heads.box_predictor.bbox_pred                       box_head.deltas
+  roi_heads.mask_head.mask_fcn{layer}                     mask_head.convs.{layer}
+  roi_heads.mask_head.deconv                              mask_head.deconv
+  roi_heads.mask_head.predictor                           mask_head.mask_logits
+"""
+_FIRST = {"stage": 2, "block": 0, "layer": 1}  # what Detectron2 counts from
 # Constants that follow from our config, and counters without effect.
 _IGNORED = re.compile(r"pixel_(mean|std)|.*anchor_generator\..*|.*num_batches_tracked")
 
@@ -193,12 +188,12 @@ def from_detectron2(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tens
 
 
 def _translate_name(name: str) -> str:
-    for table, conv in ((_BOTTOM_UP, "conv."), (_OTHERS, "")):  # Detectron2 nests norms in convolutions
-        for pattern, own in table:
-            if match := re.fullmatch(pattern + r"\.(?P<tensor>(norm\.)?\w+)", name):
-                tensor, numbers = match["tensor"], match.groupdict()
-                numbers = {key: int(numbers[key]) - first for key, first in _FIRST.items() if key in numbers}
-                return f"{own.format(**numbers)}.{'' if tensor.startswith('norm.') else conv}{tensor}"
+    module, _, tensor = name.rpartition(".")
+    for line in _NAMES.strip().splitlines():
+        theirs, ours = line.split()
+        if match := re.fullmatch(re.sub(r"{(\w+)}", r"(?P<\1>\\d+)", theirs), module):
+            numbers = {key: int(number) - _FIRST[key] for key, number in match.groupdict().items()}
+            return f"{ours.format(**numbers)}.{tensor}"
     return name
 
 

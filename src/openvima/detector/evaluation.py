@@ -134,7 +134,7 @@ def _coco(images: list[Record], annotations: list[Record]) -> Any:
 
     coco: Any = COCO()
     categories = [{"id": _CATEGORY, "name": "object"}]
-    coco.dataset = {"info": {}, "images": images, "annotations": annotations, "categories": categories}
+    coco.dataset = {"images": images, "annotations": annotations, "categories": categories}
     coco.createIndex()
     return coco
 

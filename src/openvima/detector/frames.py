@@ -166,7 +166,7 @@ def paste_object(frame: Frame, rng: np.random.Generator) -> Frame:
     shape = frame.masks[source][source_window][:, ::step]
     rgb, pasted = frame.rgb.copy(), np.zeros((1, height, width), bool)
     pasted[0][window] = shape
-    rgb[:, *window][:, shape] = frame.rgb[:, *source_window][:, :, ::step][:, shape]
+    rgb[:, pasted[0]] = frame.rgb[:, *source_window][:, :, ::step][:, shape]
     left_over = frame.masks & ~pasted
     if (left_over.sum(axis=(1, 2)) < LEAST_VISIBLE * frame.masks.sum(axis=(1, 2))).any():
         return frame

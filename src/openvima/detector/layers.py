@@ -5,7 +5,6 @@ Sources: Deep Residual Learning (He et al. 2016); Feature Pyramid Networks (Lin 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -21,7 +20,7 @@ from openvima.detector.boxes import (
     pyramid_anchors,
     subsample,
 )
-from openvima.detector.config import FIRST_STRIDE, BackboneConfig, DetectorConfig
+from openvima.detector.config import BackboneConfig, DetectorConfig
 from openvima.detector.roi_align import crop_masks
 
 
@@ -141,19 +140,8 @@ BACKGROUND_IOU = 0.3  # anchors below it are background
 ANCHORS_PER_IMAGE, POSITIVE_FRACTION = 256, 0.5  # of the loss
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AnchorPredictions:
-    """Predictions of the region proposal network for the K anchors of each level.
-
-    Args:
-        anchors: Boxes of each level, shape (K, 4).
-        objectness: Logits of each level, shape (B, K).
-        deltas: Box regression of each level, shape (B, K, 4).
-    """
-
-    anchors: list[torch.Tensor]
-    objectness: list[torch.Tensor]
-    deltas: list[torch.Tensor]
+# Of each level: K anchors, (K, 4), logits of their objectness, (B, K), and deltas of their boxes, (B, K, 4).
+AnchorPredictions = Sequence[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 
 
 class RegionProposalNetwork(nn.Module):
@@ -177,27 +165,27 @@ class RegionProposalNetwork(nn.Module):
     def forward(self, levels: Sequence[torch.Tensor]) -> AnchorPredictions:
         """Predict from the pyramid levels, (B, C, h, w) each."""
         shapes = tuple((level.shape[2], level.shape[3]) for level in levels)
-        anchors = pyramid_anchors(self.config.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
-        objectness, deltas = [], []
+        anchors, ratios = pyramid_anchors(self.config.anchor_sizes, shapes), len(ASPECT_RATIOS)
         # Both 1 × 1 convolutions as one matrix product, in the order of the anchors: (3 · 5, C)
-        weight = _interleave(self.objectness.weight, self.deltas.weight)
-        bias = _interleave(self.objectness.bias, self.deltas.bias)
-        for level in levels:
+        weight, bias = (
+            torch.cat([own.view(ratios, 1, -1), deltas.view(ratios, 4, -1)], dim=1).flatten(0, 1)
+            for own, deltas in zip(self.objectness.parameters(), self.deltas.parameters(), strict=True)
+        )
+        predictions = []
+        for level, own in zip(levels, anchors, strict=True):
             hidden = F.relu_(self.conv(level)).permute(0, 2, 3, 1)
-            outputs = F.linear(hidden, weight, bias).reshape(len(level), -1, 5)  # (B, h · w · 3, 5)
-            objectness.append(outputs[..., 0])
-            deltas.append(outputs[..., 1:])
-        return AnchorPredictions([each.to(levels[0]) for each in anchors], objectness, deltas)
+            outputs = F.linear(hidden, weight, bias.flatten()).reshape(len(level), -1, 5)
+            predictions.append((own.to(level), outputs[..., 0], outputs[..., 1:]))
+        return predictions
 
     @torch.no_grad()
     def propose(self, predictions: AnchorPredictions, *, height: int, width: int) -> list[torch.Tensor]:
         """Return the proposals of each image, shape (P, 4), by descending objectness; NMS acts per level."""
         config = self.config
         all_scores, all_deltas, all_anchors, groups = [], [], [], []
-        levels = zip(predictions.anchors, predictions.objectness, predictions.deltas, strict=True)
         # The best of each level first, then all levels of an image at once: suppression compares boxes of a
         # level alone (`groups`), and its order is that of the scores over all levels.
-        for level, (anchors, objectness, deltas) in enumerate(levels):
+        for level, (anchors, objectness, deltas) in enumerate(predictions):
             scores, rows = objectness.topk(min(config.rpn_pre_nms_top_n, len(anchors)))
             all_scores.append(scores)
             all_deltas.append(deltas.gather(1, rows[..., None].expand(-1, -1, 4)))
@@ -220,10 +208,9 @@ class RegionProposalNetwork(nn.Module):
             objects: Ground-truth boxes of each image, shape (N, 4).
             generator: Samples the anchors of the loss.
         """
-        anchors = torch.cat(predictions.anchors)
-        all_logits, all_deltas = (
-            torch.cat(levels, dim=1) for levels in (predictions.objectness, predictions.deltas)
-        )
+        of_levels, *outputs = zip(*predictions, strict=True)
+        anchors = torch.cat(of_levels)
+        all_logits, all_deltas = (torch.cat(each, dim=1) for each in outputs)
         objectness_loss = box_loss = all_logits.new_zeros(())
         for logits, deltas, boxes in zip(all_logits, all_deltas, objects, strict=True):
             indices, labels = match(
@@ -245,15 +232,6 @@ class RegionProposalNetwork(nn.Module):
                 box_loss = box_loss + F.l1_loss(deltas[positive], targets, reduction="sum")
         count = ANCHORS_PER_IMAGE * len(objects)
         return {"rpn_objectness": objectness_loss / count, "rpn_box": box_loss / count}
-
-
-def _interleave(objectness: torch.Tensor | None, deltas: torch.Tensor | None) -> torch.Tensor:
-    """Join parameters of both convolutions, anchor by anchor: shape (3 · 5, …) without the kernel's axes."""
-    assert objectness is not None and deltas is not None  # both have a bias
-    ratios = len(ASPECT_RATIOS)
-    parts = objectness.view(ratios, 1, -1), deltas.view(ratios, 4, -1)
-    joined = torch.cat(parts, dim=1).flatten(0, 1)
-    return joined if objectness.ndim > 1 else joined[:, 0]
 
 
 BOX_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # of the box regression

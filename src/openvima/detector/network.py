@@ -93,7 +93,7 @@ class MaskRCNN(nn.Module):
         masks = paste_masks(probabilities, boxes, height=height, width=width)
         return [
             Instances(*own)
-            for own in zip(boxes.split(counts), masks.split(counts), scores.split(counts), strict=True)
+            for own in zip(*(each.split(counts) for each in (boxes, masks, scores)), strict=True)
         ]
 
     def losses(

@@ -14,14 +14,10 @@ _FAR = np.int32(1 << 20)
 @njit
 def object_extents(segm, extents, num_pixels):
     """Fill `extents` (256, 4) int64 with xmin, xmax, ymin, ymax of every id and `num_pixels` (256,)."""
-    for k in range(num_pixels.shape[0]):
-        num_pixels[k] = 0
-        extents[k, 0] = segm.shape[1]
-        extents[k, 1] = -1
-        extents[k, 2] = segm.shape[0]
-        extents[k, 3] = -1
-    width = segm.shape[1]
-    for row in range(segm.shape[0]):
+    height, width = segm.shape
+    num_pixels[:] = 0
+    extents[:, 0], extents[:, 1], extents[:, 2], extents[:, 3] = width, -1, height, -1
+    for row in range(height):
         start = 0
         while start < width:  # a run of equal ids at a time: most pixels repeat the one before
             k = segm[row, start]

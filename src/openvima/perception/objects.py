@@ -258,37 +258,33 @@ def prompt_image_frames(image: PromptImage) -> dict[str, np.ndarray]:
     return camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
 
 
-def camera_frames(rgb: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
-    """Return the frames of both cameras, front before top.
+def camera_frames(
+    images: Mapping[str, np.ndarray], what: str, *, channels: tuple[int, ...] = (3,)
+) -> dict[str, np.ndarray]:
+    """Return the images of both cameras, front before top.
 
     Args:
-        rgb: View name to image, shape (3, 128, 256), uint8.
-        what: How messages call it.
+        images: View name to image, shape (3, 128, 256), uint8; that of a segmentation has no channels.
+        what: How messages call them.
+        channels: (3,), or () for segmentations.
 
     Raises:
         PolicyError: A view is missing.
         ShapeError: An image has another shape or dtype.
-    """
-    frames = by_view(rgb, what)
-    for view in VIEWS:
-        frame, expected = frames[view], (3, CAMERAS[view].height, CAMERAS[view].width)
-        if frame.dtype != np.uint8 or frame.shape != expected:
-            raise ShapeError(f"rgb {view!r} is {frame.dtype} {frame.shape}; it must be uint8 {expected}.")
-    return frames
-
-
-def by_view(images: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
-    """Return one array for each view, front before top.
-
-    Raises:
-        PolicyError: A view is missing.
     """
     missing = [view for view in VIEWS if not isinstance(images, Mapping) or view not in images]
     if missing:
         raise PolicyError(
             f"{what} lacks the view {' and '.join(missing)}; it must hold an image of {' and '.join(VIEWS)}."
         )
-    return {view: np.ascontiguousarray(images[view]) for view in VIEWS}
+    frames: dict[str, np.ndarray] = {}
+    for view in VIEWS:
+        frames[view] = frame = np.ascontiguousarray(images[view])
+        expected = (*channels, CAMERAS[view].height, CAMERAS[view].width)
+        if frame.dtype != np.uint8 or frame.shape != expected:
+            name = "rgb" if channels else "segm"
+            raise ShapeError(f"{name} {view!r} is {frame.dtype} {frame.shape}; it must be uint8 {expected}.")
+    return frames
 
 
 def crop_box(rgb: np.ndarray, extent: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -324,10 +320,7 @@ class _Measured(NamedTuple):
 
 def _measure(frames: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray]) -> list[_Measured]:
     views = []
-    for view, ids in by_view(segm, "segm").items():
-        shape = frames[view].shape[1:]
-        if ids.dtype != np.uint8 or ids.shape != shape:
-            raise ShapeError(f"segm {view!r} is {ids.dtype} {ids.shape}; it must be uint8 {shape}.")
+    for view, ids in camera_frames(segm, "segm", channels=()).items():
         extents, num_pixels = np.empty((_NUM_IDS, 4), np.int64), np.empty(_NUM_IDS, np.int64)
         object_extents(ids, extents, num_pixels)
         views.append(_Measured(frames[view], ids, extents, num_pixels))

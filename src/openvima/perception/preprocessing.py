@@ -20,6 +20,11 @@ from openvima.perception.objects import (
 from openvima.scene import PromptImage, RenderedPrompt
 from openvima.scene.prompt import PLACEHOLDER, split_text
 
+FOUND = "found"  # key of an observation's objects where they were found beforehand
+InputKind = Literal["objects", "frames"]
+KINDS: tuple[InputKind, ...] = get_args(InputKind)
+IMAGE_SIZES: dict[InputKind, tuple[int, int]] = {"objects": (CROP_SIZE, CROP_SIZE), "frames": (64, 128)}
+
 
 class ImageStack:
     """Collects images; equal ones share an index, and index 0 is a blank image for what is hidden.
@@ -27,11 +32,11 @@ class ImageStack:
     Many images are equal: an object that does not move has the same crop at the next step.
 
     Args:
-        image_size: Height and width of every image.
+        kind: Kind of the images, which decides their size.
     """
 
-    def __init__(self, image_size: tuple[int, int]) -> None:
-        self._shape = (3, *image_size)
+    def __init__(self, kind: InputKind) -> None:
+        self._shape = (3, *IMAGE_SIZES[kind])
         self._images = [np.zeros(self._shape, np.uint8)]
         self._index: dict[bytes, int] = {b"": 0}  # by digest, which is shorter than the image
 
@@ -55,12 +60,6 @@ class ImageStack:
         if index == len(self._images):
             self._images.append(image.copy())
         return index
-
-
-FOUND = "found"  # key of an observation's objects where they were found beforehand
-InputKind = Literal["objects", "frames"]
-KINDS: tuple[InputKind, ...] = get_args(InputKind)
-IMAGE_SIZES: dict[InputKind, tuple[int, int]] = {"objects": (CROP_SIZE, CROP_SIZE), "frames": (64, 128)}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -115,7 +114,7 @@ class ObjectTable:
     def concatenate(tables: Sequence["ObjectTable"]) -> "ObjectTable":
         """Put the rows of several tables into one."""
         if not tables:
-            return ObjectTable.from_views(ObjectViews.concatenate([]), ImageStack((CROP_SIZE, CROP_SIZE)))
+            return ObjectTable.from_views(ObjectViews.concatenate([]), ImageStack("objects"))
         names = ("ids", "crop_index", "boxes", "grasps")
         return ObjectTable(*(np.concatenate([getattr(table, name) for table in tables]) for name in names))
 

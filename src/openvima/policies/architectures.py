@@ -219,13 +219,14 @@ class TokenPolicy(PolicyNetwork):
     def __init__(self, config: TokenPolicyConfig) -> None:
         super().__init__()
         images, width = config.images, config.decoder.width
-        has_objects = isinstance(images, ObjectEncoderConfig)
         self.config = config
-        self.images = ObjectEncoder(images) if has_objects else VisionTransformer(images)
-        if isinstance(self.images, ObjectEncoder):
+        if isinstance(images, ObjectEncoderConfig):
+            self.images, token_width = ObjectEncoder(images), width
             self.images.standardize_boxes()
+        else:
+            self.images = VisionTransformer(images)
+            token_width = NUM_VIEWS * width if images.class_token else width
         self.resampler = Resampler(config.resampler, width) if config.resampler else None
-        token_width = width if has_objects or not images.class_token else NUM_VIEWS * width
         self.prompt = PromptEncoder(config.prompt, image_token_width=token_width, width=width)
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(token_width + NUM_END_EFFECTORS, width)

@@ -11,7 +11,6 @@ from openvima.errors import ConfigError, unknown_name
 from openvima.policies.architectures import Architecture, TokenPolicy, TokenPolicyConfig
 from openvima.policies.config_fields import build_config, check_limits
 from openvima.policies.nn.layers import MetaInit
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.pointer.model import Pointer
@@ -39,12 +38,6 @@ def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:
         return build_config(TokenPolicyConfig, values, "policy")
     sizes = {name: value for name, value in values.items() if name != "architecture"}
     return build_config(PointerConfig, sizes, "policy")
-
-
-def appearance_width(config: PolicyConfig) -> int:
-    """Length of the appearance embedding; 0 for networks without one."""
-    images = config.images
-    return images.appearance_width if isinstance(images, ObjectEncoderConfig) else 0
 
 
 def build_network(config: PolicyConfig, *, seed: int) -> PolicyNetwork:

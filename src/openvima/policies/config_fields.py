@@ -1,5 +1,6 @@
 """Types and limits of the fields of configs and settings, which may come from a file."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
@@ -13,10 +14,10 @@ from openvima.errors import ConfigError, unknown_name
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Smallest and largest allowed value of a number; None means no upper bound."""
+    """Smallest and largest allowed value of a number."""
 
     low: float
-    high: float | None = None
+    high: float = math.inf
 
 
 # Allowed type of values, and its name in messages.
@@ -93,11 +94,10 @@ def _problem(name: str, value: Any, hint: Any, *, of_network: bool) -> str | Non
         limits = Range(0, _LIMITS.get(name.rpartition(".")[2], MAX_WIDTH))
     elif of_network and kind is float:
         limits = Range(-_MAX_FLOAT, _MAX_FLOAT)
-    if limits is None or (limits.low <= value and (limits.high is None or value <= limits.high)):
+    if limits is None or limits.low <= value <= limits.high:
         return None
-    allowed = f"at least {limits.low}"
-    if limits.high is not None:
-        allowed = f"between {limits.low} and {limits.high}"
+    has_end = limits.high < math.inf
+    allowed = f"between {limits.low} and {limits.high}" if has_end else f"at least {limits.low}"
     return f"{name} is {short(value)}; it must be {allowed}."
 
 
@@ -133,19 +133,13 @@ def build_config(kind: type, values: Any, where: str) -> Any:
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
-    if isinstance(hint, UnionType):
-        if value is None and NoneType in get_args(hint):
-            return None
-        options = [option for option in get_args(hint) if option is not NoneType]
-        hint = max(options, key=lambda option: _num_shared_fields(option, value))
-    if is_dataclass(hint) and isinstance(hint, type):
-        return build_config(hint, value, where)
+    options = options_of(hint)
+    names: dict[Any, set[str]] = {
+        kind: {field.name for field in fields(kind)} for kind in options if is_dataclass(kind)
+    }
+    if names and not (value is None and NoneType in options):
+        given = {*value} if isinstance(value, Mapping) else set()
+        # Of several dataclasses the one that shares most fields.
+        best = max(names, key=lambda kind: len(names[kind] & given) - len(names[kind] ^ given))
+        return build_config(best, value, where)
     return tuple(value) if isinstance(value, list) else value
-
-
-def _num_shared_fields(kind: Any, value: Any) -> int:
-    """Score how well a mapping matches the fields of a dataclass, to resolve unions."""
-    if not is_dataclass(kind) or not isinstance(value, Mapping):
-        return 0
-    names = {field.name for field in fields(kind)}
-    return len(names & set(value)) - len(names ^ set(value))

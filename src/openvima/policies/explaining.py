@@ -32,8 +32,8 @@ def explain_row(
     observation: Mapping,
     processor: Processor,
     *,
-    temperature: float = 0.0,
-    follow_coreference: bool = False,
+    temperature: float,
+    follow_coreference: bool,
 ) -> Explanation:
     """Explain the action of one episode.
 

@@ -16,6 +16,7 @@ from openvima.perception.preprocessing import ImageStack
 from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash, usable_device
 from openvima.policies.checkpoint import save_checkpoint
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, greedy, sampling
+from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.policy_network import Decoded, PolicyNetwork, StepInputs
 from openvima.policies.processor import PROMPT_LIMITS, Processor
 from openvima.policies.t5 import tokenizer_for
@@ -34,7 +35,7 @@ NEAR_TIE = 1e-4  # difference of two logits below which float32 rounding may swa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Episodes:
+class _Episodes(TensorRecord):
     """The running episodes of a batch; never changed in place.
 
     Args:
@@ -67,20 +68,16 @@ class _Episodes:
             for action_C in self.actions_BC.cpu().numpy()
         ]
 
-    def select(self, indices: Sequence[int]) -> "_Episodes":
+    def of(self, indices: Sequence[int]) -> "_Episodes":
         """Return the episodes with these indices in the batch."""
         rows = [self.indices.index(index) for index in indices]
         if len(rows) == len(self.indices):
             return self
         return replace(
-            self,
+            self.select(rows),
             indices=tuple(indices),
             num_slots=tuple(self.num_slots[row] for row in rows),
             generators=tuple(self.generators[row] for row in rows),
-            prompt=self.prompt.select(rows),
-            state=self.state.select(rows),
-            actions_BC=self.actions_BC[rows],
-            margins_B=None if self.margins_B is None else self.margins_B[rows],
         )
 
 
@@ -297,7 +294,7 @@ class NetworkPolicy(Policy):
             raise PolicyError(
                 f"episode {', '.join(map(str, ended))} ended with a None before; call reset to start again."
             )
-        episodes = self._episodes.select(running)
+        episodes = self._episodes.of(running)
         cached = getattr(episodes.state, "cache", episodes.state).mask_BS  # of keys and values
         if self._is_bounded and cached.numel() > MAX_CACHED_TOKENS:
             raise PolicyError(
@@ -358,8 +355,6 @@ class NetworkPolicy(Policy):
         count = MAX_CROPS_ON_CPU if self.device.type == "cpu" else MAX_CROPS
         chunks = torch.from_numpy(images[new]).split(count)
         encoded = torch.cat([self.network.encode_images(chunk.to(self.device)) for chunk in chunks])
-        if len(new) == len(keys):
-            return encoded, dict(zip(keys, encoded, strict=True))
         by_key = {**cached, **dict(zip((keys[number] for number in new), encoded, strict=True))}
         features = torch.stack([by_key[key] for key in keys])
         return features, dict(zip(keys, features, strict=True))

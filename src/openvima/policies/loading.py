@@ -136,13 +136,15 @@ def checked_policy(policy: Any, what: str) -> Policy:
     Raises:
         PolicyError: A method is missing.
     """
-    form = "a policy has the methods reset(prompts) and act(observations), see docs/your_own_policy.md"
     if isinstance(policy, type):
         name = policy.__name__
         raise PolicyError(f"{what} the class {name}, not an object of it; return {name}().")
     missing = [name for name in ("reset", "act") if not callable(getattr(policy, name, None))]
     if missing:
-        raise PolicyError(f"{what} a {type(policy).__name__} without {' and '.join(missing)}; {form}.")
+        raise PolicyError(
+            f"{what} a {type(policy).__name__} without {' and '.join(missing)}; a policy has the methods "
+            "reset(prompts) and act(observations), see docs/your_own_policy.md."
+        )
     return policy
 
 

@@ -92,18 +92,13 @@ def register_policy(name: str) -> Callable[[_Make], _Make]:
     return register
 
 
+@cache
 def own_policies() -> Mapping[str, str]:
     """Return the registered functions by name, as MODULE:FUNCTION or FILE.py:FUNCTION.
 
     Raises:
         ConfigError: A file or an entry point raises.
     """
-    _load_own_files()
-    return _own
-
-
-@cache
-def _load_own_files() -> None:
     for entry_point in entry_points(group=ENTRY_POINTS):
         load_entry_point(entry_point)
     for path in filter(None, os.environ.get(POLICY_FILES_VARIABLE, "").split(os.pathsep)):
@@ -111,3 +106,4 @@ def _load_own_files() -> None:
         for name, source in _own.items():
             if source.startswith(f"{module}:"):  # no other process could import it
                 _own[name] = f"{Path(path).absolute()}{source.removeprefix(module)}"
+    return _own

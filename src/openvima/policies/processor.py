@@ -17,7 +17,6 @@ import torch
 from openvima.errors import DatasetError, PolicyError, PromptError
 from openvima.perception.objects import FRONT, TOP, ObjectExtractor, ObjectViews, end_effector_of
 from openvima.perception.preprocessing import (
-    IMAGE_SIZES,
     ImageStack,
     InputKind,
     ObjectTable,
@@ -31,7 +30,7 @@ from openvima.policies.base import PromptLimits
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
-from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
+from openvima.policies.tokenizer import END_ID, PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import RenderedPrompt
 
@@ -86,7 +85,7 @@ class Processor:
             PROMPT_LIMITS.check(prompt)
         if not all(prompt.sequence() for prompt in prompts):
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
-        stack = ImageStack(IMAGE_SIZES[self.input_kind])
+        stack = ImageStack(self.input_kind)
         extract_ahead(self.input_kind, self.extractor, prompts=prompts)
         preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
         return self.batch_prompts(preprocessed), stack
@@ -116,7 +115,7 @@ class Processor:
                 objects or none. With layout "views" there may be none after the first step.
             ShapeError: An image has another shape or dtype.
         """
-        stack = stack or ImageStack(IMAGE_SIZES[self.input_kind])
+        stack = stack or ImageStack(self.input_kind)
         observations = [each for history in histories for each in history]
         end_effectors = np.array([end_effector_of(each) for each in observations])
         extract_ahead(self.input_kind, self.extractor, observations=observations)
@@ -231,7 +230,9 @@ class Processor:
         """Pad the objects of all steps to slots; counts and end effectors are those of steps."""
         step, slot = _rows_and_slots(counts)
         if self.layout == "views":
-            objects = _visible_first(objects, step)
+            # In each view separately.
+            orders = [order_in_view(objects.ids, objects.masks[:, v], step) for v in (FRONT, TOP)]
+            objects = _select_views(objects, np.stack(orders, axis=1))
         (count, length), num_slots = steps.shape, max(1, int(slots_BT.max(initial=0)))
         place = steps.place[step]
         crop_index, masks = np.zeros((2, count * length, len(VIEWS), num_slots), np.int64)
@@ -305,7 +306,8 @@ class Processor:
             rows = [[own[masks[own, v]] for v, own in enumerate(image)] for image in rows]
             slots = [max(map(len, view)) for view in zip(*rows, strict=True)]
             rows = [
-                [np.concatenate([own, np.full(max(slots) - len(own), -1)]) for own in image] for image in rows
+                [np.pad(own, (0, max(slots) - len(own)), constant_values=-1) for own in image]
+                for image in rows
             ]
         shown = [np.stack(image, axis=1) for image in rows]
         tokens: list[tuple[int, int, int, bool]] = []  # word, row, part, whether it is valid
@@ -323,7 +325,7 @@ class Processor:
                 places = [(k, 0, True) for k in range(len(own))]
             tokens += [(PADDING_ID, count + k, part, is_valid) for k, part, is_valid in places]
             count += len(own)
-        tokens.append((self.tokenizer.end_id, WORD, 0, True))
+        tokens.append((END_ID, WORD, 0, True))
         # Before the encoder, whose cost is quadratic.
         check_length(len(tokens), MAX_PROMPT_POSITIONS, "the prompt")
         sizes = [len(own) for own in shown]
@@ -389,12 +391,6 @@ def _table_points(objects: ObjectTable, pixels: np.ndarray) -> np.ndarray:
     """Points on the table under pixels (N, 2 views, 2): those of the top view, or else the front view."""
     front, top = (unproject(pixels[:, v], CAMERAS[view]) for v, view in enumerate(VIEWS))
     return np.where(objects.masks[:, TOP, None], top, front)
-
-
-def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
-    """Sort the objects of each step separately in each view: visible ones first, then by id."""
-    views = (order_in_view(objects.ids, objects.masks[:, v], step) for v in (FRONT, TOP))
-    return _select_views(objects, np.stack([*views], axis=1))
 
 
 def order_in_view(ids: np.ndarray, is_visible: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -50,7 +50,6 @@ class T5Tokenizer:
         MissingExtraError: A required package is not installed.
     """
 
-    end_id = END_ID
     texture_ids = np.zeros(0, np.int64)  # its pieces of words describe no appearance alone
 
     def __init__(self, path_or_hub_id: str | Path) -> None:

@@ -150,12 +150,7 @@ def benchmark_vocabulary() -> Vocabulary:
 
 
 class Tokenizer(Protocol):
-    """Encodes prompt text as word ids."""
-
-    @property
-    def end_id(self) -> int:
-        """Id that ends every prompt."""
-        ...
+    """Encodes prompt text as word ids; `END_ID` ends every prompt."""
 
     @property
     def texture_ids(self) -> np.ndarray:
@@ -176,8 +171,6 @@ class WordTokenizer:
     Args:
         vocabulary: The words; by default those of the benchmark.
     """
-
-    end_id = END_ID
 
     def __init__(self, vocabulary: Vocabulary | None = None) -> None:
         self.vocabulary = benchmark_vocabulary() if vocabulary is None else vocabulary
@@ -200,7 +193,9 @@ class WordTokenizer:
             [32, 363, 364]
         """
         pieces = split_words(text)
-        found = [self._id(piece) for piece in pieces]
+        found = [
+            _FIRST_NUMBER_ID + int(piece) if _is_number(piece) else self._ids.get(piece) for piece in pieces
+        ]
         if None in found:
             self._warn([piece for piece, token in zip(pieces, found, strict=True) if token is None])
         unknown = self._ids.get(UNKNOWN)
@@ -210,9 +205,6 @@ class WordTokenizer:
         """Write the vocabulary to a folder, which is created."""
         folder.mkdir(parents=True, exist_ok=True)
         self.vocabulary.write(folder)
-
-    def _id(self, piece: str) -> int | None:
-        return _FIRST_NUMBER_ID + int(piece) if _is_number(piece) else self._ids.get(piece)
 
     def _warn(self, unknown: list[str]) -> None:
         """Name unknown words once each; a bounded number of them, of bounded length."""
@@ -228,8 +220,7 @@ class WordTokenizer:
 
 def _is_number(piece: str) -> bool:
     """Whether it has an id in every vocabulary."""
-    has_digits = piece[0] in "0123456789" and len(piece) <= len(str(LARGEST_NUMBER))
-    return has_digits and int(piece) <= LARGEST_NUMBER
+    return re.fullmatch("[0-9]{1,3}", piece) is not None and int(piece) <= LARGEST_NUMBER
 
 
 def _is_word(word: str) -> bool:

@@ -1,8 +1,9 @@
 """Variants of a network: the parts that the papers' ablations exchange, as functions on its config."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.build import PolicyConfig
@@ -14,9 +15,13 @@ from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.pointer.config import AttributeConfig, CandidateHeadConfig, PointerConfig
 from openvima.policies.sizes import SIZES, T5_SIZES, t5_prompt_encoder
 
-CONDITIONINGS = ("cross-attention", "prefix")
-TEXT_ENCODERS = ("small", *T5_SIZES)
-IMAGE_TOKENS = ("objects", "object-perceiver", "image-perceiver", "patches", "image")
+# Switches that take names.
+CHOICES: Mapping[str, Collection[str]] = {
+    "text_encoder": ("small", *T5_SIZES),
+    "image_tokens": ("objects", "object-perceiver", "image-perceiver", "patches", "image"),
+    "conditioning": ("cross-attention", "prefix"),
+    "head": HEADS,
+}
 
 
 def with_variant(config: PolicyConfig, switches: Mapping[str, Any]) -> PolicyConfig:
@@ -29,9 +34,11 @@ def with_variant(config: PolicyConfig, switches: Mapping[str, Any]) -> PolicyCon
     Raises:
         ConfigError: There is no such switch or value, or the network cannot have it.
     """
-    for name in switches:
+    for name, value in switches.items():
         if name not in SWITCHES:
             raise ConfigError(unknown_name("switch", name, SWITCHES))
+        if name in CHOICES and value not in (None, *CHOICES[name]):
+            raise ConfigError(unknown_name(name, value, CHOICES[name]))
     for name, switch in SWITCHES.items():
         if switches.get(name) is not None:
             config = switch(config, switches[name])
@@ -48,10 +55,8 @@ def with_text_encoder(config: PolicyConfig, name: str) -> PolicyConfig:
             the last two layers are trained.
 
     Raises:
-        ConfigError: There is no such text encoder, or the network is a pointer model.
+        ConfigError: The network is a pointer model.
     """
-    if name != "small" and name not in T5_SIZES:
-        raise ConfigError(unknown_name("text_encoder", name, TEXT_ENCODERS))
     old = config.prompt
     if name == "small":
         new = SIZES["nano"].prompt if old.tokenizer == "t5" else old
@@ -77,7 +82,7 @@ def with_tuned_layers(config: PolicyConfig, count: int) -> PolicyConfig:
 
 
 def image_tokens(config: PolicyConfig) -> str:
-    """Return which of `IMAGE_TOKENS` a network has."""
+    """Return which image tokens of `CHOICES` a network has."""
     resampler = None if isinstance(config, PointerConfig) else config.resampler
     if isinstance(config.images, ObjectEncoderConfig):
         return "object-perceiver" if resampler else "objects"
@@ -89,18 +94,16 @@ def with_image_tokens(config: PolicyConfig, name: str) -> PolicyConfig:
 
     Args:
         config: The network.
-        name: One of `IMAGE_TOKENS`. "objects" and "object-perceiver", four latents of the objects of both
+        name: "objects" and "object-perceiver", four latents of the objects of both
             views, take crops; "image-perceiver", four latents, "patches" and "image", one token, are the
             tokens of VIMA-Flamingo, VIMA-Gato and VIMA-GPT of whole frames.
 
     Raises:
-        ConfigError: There are no such image tokens, or the network cannot have them.
+        ConfigError: The network cannot have them.
 
     Source: VIMA (Jiang et al. 2023), ablation of visual tokenizers.
     """
     own = image_tokens(config)
-    if name not in IMAGE_TOKENS:
-        raise ConfigError(unknown_name("image_tokens", name, IMAGE_TOKENS))
     if name == own:
         return config
     if isinstance(config, PointerConfig):
@@ -135,10 +138,8 @@ def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
         name: One of `openvima.policies.nn.heads.HEADS`.
 
     Raises:
-        ConfigError: There is no such head, or the network is a pointer model.
+        ConfigError: The network is a pointer model.
     """
-    if name not in HEADS:
-        raise ConfigError(unknown_name("head", name, HEADS))
     if isinstance(config, PointerConfig):
         raise _not_of_pointers(f"head is {name!r}", "pointers to candidates alone")
     kind, head = HEADS[name], config.head
@@ -151,7 +152,7 @@ def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
     return replace(config, head=new)
 
 
-def with_visual_residual(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
+def with_visual_residual(config: PolicyConfig, wanted: bool) -> PolicyConfig:
     """Return the same network with or without the visual residual in its prompt encoder."""
     return replace(config, prompt=replace(config.prompt, visual_residual=wanted))
 
@@ -164,13 +165,8 @@ def with_conditioning(config: PolicyConfig, name: str) -> PolicyConfig:
         name: "cross-attention", or "prefix", the prompt before the history in one causal sequence. A layer
             of the former is a pair of blocks, so the latter has twice as many layers.
 
-    Raises:
-        ConfigError: There is no such conditioning.
-
     Source: VIMA (Jiang et al. 2023), ablation "gpt-decoder".
     """
-    if name not in CONDITIONINGS:
-        raise ConfigError(unknown_name("conditioning", name, CONDITIONINGS))
     is_prefix = isinstance(config.decoder, PrefixDecoderConfig)
     if is_prefix == (name == "prefix"):
         return config
@@ -204,7 +200,7 @@ def _not_of_pointers(given: str, have: str) -> ConfigError:
     return ConfigError(f"{given}, but pointer models have {have}; take nano-bins or another preset.")
 
 
-def with_attributes(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
+def with_attributes(config: PolicyConfig, wanted: bool) -> PolicyConfig:
     """Return the same network with or without comparison by attributes.
 
     Raises:
@@ -217,29 +213,16 @@ def with_attributes(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
     return replace(config, attributes=AttributeConfig() if wanted else None)
 
 
-def with_crop_kernel(config: PolicyConfig, size: Literal[1, 3]) -> PolicyConfig:
-    """Return the same network with another kernel size in the last layer of its crop encoder.
+def _with_convolutions(switch: str, field: str, config: PolicyConfig, value: int) -> PolicyConfig:
+    """Return the same network with another value of a field of its convolutional crop encoder.
 
     Raises:
-        ConfigError: The network encodes no crops by convolutions.
+        ConfigError: The network encodes no crops by convolutions, or the encoder cannot have the value.
     """
-    return _with_convolutions(config, f"crop_kernel is {size}", last_kernel=size)
-
-
-def with_crop_width(config: PolicyConfig, width: int) -> PolicyConfig:
-    """Return the same network with so many channels in the first layer of its crop encoder.
-
-    Raises:
-        ConfigError: The network encodes no crops by convolutions, or the width is no multiple of 4.
-    """
-    return _with_convolutions(config, f"crop_width is {width}", width=width)
-
-
-def _with_convolutions(config: PolicyConfig, given: str, **sizes: int) -> PolicyConfig:
     images = config.images
     if not isinstance(images, ObjectEncoderConfig) or not isinstance(images.crop, ConvConfig):
-        raise ConfigError(f"{given}, but the network has no convolutions; take nano or small.")
-    return replace(config, images=replace(images, crop=replace(images.crop, **sizes)))
+        raise ConfigError(f"{switch} is {value}, but the network has no convolutions; take nano or small.")
+    return replace(config, images=replace(images, crop=replace(images.crop, **{field: value})))
 
 
 def with_points(config: PolicyConfig, value: bool) -> PolicyConfig:
@@ -265,6 +248,6 @@ SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "visual_residual": with_visual_residual,
     "points": with_points,
     "attributes": with_attributes,
-    "crop_kernel": with_crop_kernel,
-    "crop_width": with_crop_width,
+    "crop_kernel": partial(_with_convolutions, "crop_kernel", "last_kernel"),
+    "crop_width": partial(_with_convolutions, "crop_width", "width"),
 }

@@ -10,7 +10,7 @@ import torch
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, differences
 from openvima.perception.preprocessing import split_prompt
-from openvima.policies.build import PolicyConfig, appearance_width, build_network, config_to_dict
+from openvima.policies.build import PolicyConfig, build_network, config_to_dict
 from openvima.policies.checkpoint import load_network
 from openvima.policies.naming import find_checkpoint
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -102,7 +102,7 @@ def resolve(config: TrainingConfig) -> TrainingConfig:
                 f"{image_tokens(sizes)!r}; leave it out, or take a preset that takes objects."
             )
     if config.pretraining.steps is None:
-        has_appearance = appearance_width(sizes) > 0
+        has_appearance = getattr(sizes.images, "appearance_width", 0) > 0
         steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0
         config = replace(config, pretraining=replace(config.pretraining, steps=steps))
     if (

@@ -33,7 +33,7 @@ from openvima.policies.nn.actions import (
     to_unit_range,
 )
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
-from openvima.policies.nn.layers import layer_of, mlp, scale_last
+from openvima.policies.nn.layers import layer_of, mlp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,29 +141,33 @@ class ActionHead(nn.Module):
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
     ) -> ActionLoss:
         """Return the loss of whole histories; see `action_loss`. `query_spread` is one of the metrics."""
-        previous = self._segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
+        previous = self.segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
         (_, outputs_BTQD), _ = decoder.decode_segments(cache, [previous, observations.segment()])
         query_BTD = observations.query(outputs_BTQD)
         found = self.action_loss(query_BTD, targets)
         return self.add_pointing(found, query_BTD, query_BTD, observations, targets)
 
-    def decode_step(
+    def decode(
         self,
         decoder: CausalDecoder,
         cache: KVCache,
+        query_BTD: torch.Tensor,
         observations: ObservationTokens,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        strategy: DecodingStrategy = greedy,
-    ) -> tuple[torch.Tensor, KVCache]:
-        """Decode the next action."""
-        previous = self._segment(previous_BTC, has_previous_BT, observations.tokens_BTQD.dtype)
-        (_, outputs_BTQD), cache = decoder.decode_segments(cache, [previous, observations.segment()])
-        query_BTD = observations.query(outputs_BTQD)
+        strategy: DecodingStrategy,
+    ) -> torch.Tensor:
+        """Decode the next action from its query, the output at the end of the observation.
+
+        Args:
+            decoder: Decodes further tokens, where a head has some.
+            cache: Ends with the observation; the action joins it with the next one, as it was sent.
+            query_BTD: The query.
+            observations: Tokens of the observation.
+            strategy: How a class is decoded from logits.
+        """
         actions_BTC = self.action(query_BTD, strategy)
         if self.points:
             actions_BTC = point_at_objects(actions_BTC, query_BTD, query_BTD, observations, strategy)
-        return actions_BTC, cache
+        return actions_BTC
 
     def add_pointing(
         self,
@@ -185,9 +189,8 @@ class ActionHead(nn.Module):
             loss, metrics["loss/pointing"] = loss + pointing, pointing.detach()
         return loss, metrics, actions_BTC
 
-    def _segment(
-        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
-    ) -> TokenSegment:
+    def segment(self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype) -> TokenSegment:
+        """Return past actions as a segment of the sequence, whose tokens have this precision."""
         return action_segment(self.actions(self.past_actions(actions_BTC).to(dtype))[:, :, None], exists_BT)
 
 
@@ -327,12 +330,11 @@ class BinsHead(ActionHead):
     def __init__(self, hidden_width: int, width: int, actions: nn.Module) -> None:
         super().__init__(actions)
         hidden = (width, hidden_width, hidden_width)
-        self.classifiers = nn.ModuleList(scale_last(mlp((*hidden, count)), gain=0.01) for count in NUM_BINS)
+        self.classifiers = nn.ModuleList(mlp((*hidden, count), last_gain=0.01) for count in NUM_BINS)
 
     def action_loss(self, query_BTD: torch.Tensor, targets: ActionTargets) -> ActionLoss:
         """Return the loss, its parts and the decoded actions; see `bins_loss`."""
-        loss, metrics, bins_BTC = bins_loss(self.logits(query_BTD), targets)
-        return loss, metrics, actions_from_bins(bins_BTC, query_BTD.dtype)
+        return bins_loss(self.logits(query_BTD), targets)
 
     def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
         """Decode the bin of each component."""
@@ -362,9 +364,7 @@ class BinsHead(ActionHead):
         return [classifier(query_BTD) for classifier in self.classifiers]
 
 
-def bins_loss(
-    logits: Sequence[torch.Tensor], targets: ActionTargets
-) -> tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
+def bins_loss(logits: Sequence[torch.Tensor], targets: ActionTargets) -> ActionLoss:
     """Cross-entropy of every component: mean over a part's components, then sum of the four parts.
 
     So each position and each rotation has the same weight, whatever the number of its components.
@@ -374,7 +374,7 @@ def bins_loss(
         targets: The demonstrated actions.
 
     Returns:
-        The loss; its parts as `loss/<part>`; and the bins with the highest logits, (B, T, C).
+        The loss; its parts as `loss/<part>`; and the actions of the bins with the highest logits, (B, T, C).
 
     Source: the published policies were trained with this loss (VIMA, Jiang et al. 2023).
     """
@@ -385,7 +385,8 @@ def bins_loss(
     metrics = {
         f"loss/{name}": masked_mean(loss_BT.detach(), targets.steps_BT) for name, loss_BT in losses_BT.items()
     }
-    return loss, metrics, torch.stack([scores.argmax(-1) for scores in logits], dim=-1)
+    best_BTC = torch.stack([scores.argmax(-1) for scores in logits], dim=-1)
+    return loss, metrics, actions_from_bins(best_BTC, logits[0].dtype)
 
 
 def encode_bins(unit_actions: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,7 @@ positions, P positions of the prompt, D width, H heads, K width of a head.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -122,7 +122,8 @@ class CausalDecoder(nn.Module):
     """What both decoders share: position embedding, self blocks, the cache."""
 
     sequence_name = "the history"  # what the position table covers
-    cross_blocks: nn.ModuleList  # only of `Decoder`
+    self_blocks: Any  # a list of `SelfBlock`
+    cross_blocks: Any  # a list of `CrossBlock`, only of `Decoder`
 
     def __init__(self, config: AnyDecoderConfig) -> None:
         super().__init__()
@@ -171,7 +172,7 @@ class CausalDecoder(nn.Module):
             if cache.prompt:
                 x_ND = self.cross_blocks[layer](x_ND, unpadder, cache.prompt[layer], prompt_bias_B11P)
             if only_cache and layer == len(self.self_blocks) - 1:
-                past.append(cast(SelfBlock, block).project(x_ND, unpadder, cache.past[layer])[1:])
+                past.append(block.project(x_ND, unpadder, cache.past[layer])[1:])
                 break
             x_ND, keys_values = block(x_ND, unpadder, cache.past[layer], self_bias_B1LS)
             past.append(keys_values)
@@ -233,8 +234,7 @@ class Decoder(CausalDecoder):
         """
         check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
         prompt_BPD = prompt_BPD + self.prompt_positions(position_ids(mask_BP))
-        blocks = (cast(CrossBlock, block) for block in self.cross_blocks)
-        prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
+        prompt = tuple(block.keys_values(prompt_BPD) for block in self.cross_blocks)
         return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
 
     def align(self) -> None:
@@ -244,7 +244,7 @@ class Decoder(CausalDecoder):
         """
         self.positions.weight.mul_(_POSITION_GAIN)
         self.prompt_positions.weight.mul_(_POSITION_GAIN)
-        for block in (cast(CrossBlock, each) for each in self.cross_blocks):
+        for block in self.cross_blocks:
             _align(block.query.weight, block.key_value.weight[: self.width])
 
 
@@ -278,7 +278,7 @@ class PrefixDecoder(CausalDecoder):
         tokens, which grow in training. See results/2026-11-29_positions.md.
         """
         self.positions.weight.mul_(_POSITION_GAIN)
-        block = cast(SelfBlock, self.self_blocks[0])
+        block = self.self_blocks[0]
         head_width = self.width // self.num_heads
         aligned = -(-self.num_heads // 2) * head_width
         query_DD, key_DD, _ = block.query_key_value.weight.split(self.width)
@@ -323,21 +323,18 @@ class CrossBlock(nn.Module):
         self, x_ND: torch.Tensor, unpadder: Unpadder, prompt: KeysValues, bias_B11P: torch.Tensor
     ) -> torch.Tensor:
         """Map unpadded tokens to the same shape; `bias_B11P` masks the prompt."""
-        mixed = F.scaled_dot_product_attention(self._queries(x_ND, unpadder), *prompt, attn_mask=bias_B11P)
+        query, key, value = self.project(x_ND, unpadder, prompt)
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias_B11P)
         attended = self.attention_out(unpadder.unpad(mixed.transpose(1, 2).flatten(2))) + x_ND
         hidden = F.gelu(self.widen(self.norm_feed_forward(attended))) * self.gate(attended)
         return self.narrow(hidden) + attended
 
-    def last_attention(
-        self, x_ND: torch.Tensor, unpadder: Unpadder, prompt: KeysValues, bias_B11P: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the weights with which `forward` attends from the last token of each row, (B, H, P)."""
-        return _last_attention(self._queries(x_ND, unpadder), prompt[0], bias_B11P, unpadder, x_ND)
-
-    def _queries(self, x_ND: torch.Tensor, unpadder: Unpadder) -> torch.Tensor:
-        """Return the queries of unpadded tokens, (B, H, L, K)."""
+    def project(
+        self, x_ND: torch.Tensor, unpadder: Unpadder, prompt: KeysValues
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the queries of unpadded tokens, (B, H, L, K), and the keys and values of the prompt."""
         query_BLD = unpadder.pad(self.query(self.norm_attention(x_ND)))
-        return query_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+        return query_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2), *prompt
 
 
 class SelfBlock(nn.Module):
@@ -377,13 +374,6 @@ class SelfBlock(nn.Module):
         hidden = self.narrow(F.gelu(self.widen(attended)) * self.gate(attended))
         return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
 
-    def last_attention(
-        self, x_ND: torch.Tensor, unpadder: Unpadder, past: KeysValues, bias_B1LS: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the weights with which `forward` attends from the last token of each row, (B, H, S)."""
-        query, key, _ = self.project(x_ND, unpadder, past)
-        return _last_attention(query, key, bias_B1LS, unpadder, x_ND)
-
     def project(
         self, x_ND: torch.Tensor, unpadder: Unpadder, past: KeysValues
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -394,13 +384,15 @@ class SelfBlock(nn.Module):
         return query, torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
 
 
-def _last_attention(
-    query_BHLK: torch.Tensor,
-    key_BHSK: torch.Tensor,
-    bias_B1LS: torch.Tensor,
-    unpadder: Unpadder,
+def last_attention(
+    block: Any,  # a block of either kind, called with the rest
     x_ND: torch.Tensor,
+    unpadder: Unpadder,
+    keys_values: KeysValues,
+    bias_B1LS: torch.Tensor,
 ) -> torch.Tensor:
+    """Return the weights with which a block attends from the last token of each row, (B, H, S)."""
+    query_BHLK, key_BHSK, _ = block.project(x_ND, unpadder, keys_values)
     last_B = unpadder.pad(torch.ones_like(x_ND[..., 0, None]))[..., 0].sum(dim=1).to(torch.int64) - 1
     rows_B = torch.arange(len(last_B), device=last_B.device)
     query_BHK = query_BHLK[rows_B, :, last_B]

@@ -45,7 +45,7 @@ from openvima.policies.nn.actions import (
     yaw_between,
 )
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
-from openvima.policies.nn.layers import layer_of, mlp, scale_last
+from openvima.policies.nn.layers import layer_of, mlp
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,72 +78,65 @@ class AutoregressiveHead(BinsHead):
     ) -> ActionLoss:
         """Return the loss of whole histories, with teacher forcing also within an action; see `bins_loss`.
 
-        So the actions returned are more accurate than those of `decode_step`.
+        So the actions returned are more accurate than those of `decode`.
         """
-        actions = self._segment(targets.actions_BTC, targets.steps_BT, observations.tokens_BTQD.dtype)
+        actions = self.segment(targets.actions_BTC, targets.steps_BT, observations.tokens_BTQD.dtype)
         segments = [observations.segment(), actions]
         (outputs_BTQD, actions_BTCD), _ = decoder.decode_segments(cache, segments)
         query_BT1D = observations.query(outputs_BTQD)[:, :, None]
         outputs_BTCD = torch.cat([query_BT1D, actions_BTCD[:, :, :-1]], dim=2)
         pairs = zip(self.classifiers, outputs_BTCD.unbind(2), strict=True)
         logits = [classifier(output) for classifier, output in pairs]
-        loss, metrics, bins_BTC = bins_loss(logits, targets)
-        found = loss, metrics, actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        found = bins_loss(logits, targets)
         pick_BTD, place_BTD = outputs_BTCD[:, :, 0], outputs_BTCD[:, :, ACTION_WIDTH // 2]
         return self.add_pointing(found, pick_BTD, place_BTD, observations, targets)
 
-    def decode_step(
+    def decode(
         self,
         decoder: CausalDecoder,
         cache: KVCache,
+        query_BTD: torch.Tensor,
         observations: ObservationTokens,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        strategy: DecodingStrategy = greedy,
-    ) -> tuple[torch.Tensor, KVCache]:
+        strategy: DecodingStrategy,
+    ) -> torch.Tensor:
         """Decode the next action autoregressively.
 
         A position that is read from an object replaces the decoded one before the next component is decoded.
-        The returned cache ends with the observation: the action joins it with the next one, as it was sent.
         """
-        previous = self._segment(previous_BTC, has_previous_BT, observations.tokens_BTQD.dtype)
-        (_, outputs_BTQD), cache = decoder.decode_segments(cache, [previous, observations.segment()])
-        output_BTD, ahead = observations.query(outputs_BTQD), cache
+        output_BTD = query_BTD
         bins_BTC = torch.zeros(
             *output_BTD.shape[:2], ACTION_WIDTH, dtype=torch.int64, device=output_BTD.device
         )
-        pointed, before, picked_BT = [], (output_BTD, ahead), torch.zeros_like(observations.query_BT)
+        pointed, before, picked_BT = [], (output_BTD, cache), torch.zeros_like(observations.query_BT)
 
         def read(component: int) -> None:
-            nonlocal output_BTD, ahead
+            nonlocal output_BTD, cache
             token_BTD = self.actions.embed(component, bins_BTC[..., component])
             exists_BT = torch.ones_like(bins_BTC[..., component], dtype=torch.bool)
-            output_BTD, ahead = decoder(ahead, token_BTD, exists_BT)
+            output_BTD, cache = decoder(cache, token_BTD, exists_BT)
 
         for component, classifier in enumerate(self.classifiers):
             half, place = divmod(component, ACTION_WIDTH // 2)
             if place == 0:
-                before = output_BTD, ahead
+                before = output_BTD, cache
             bins_BTC[..., component] = strategy(classifier(output_BTD))
             if self.points and place == 1:  # the position is complete, and read again if it moves
-                actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+                actions_BTC = actions_from_bins(bins_BTC, query_BTD.dtype)
                 picked_BT = point_at_object(half, actions_BTC, before[0], observations, strategy, picked_BT)
                 part = slice(component - 1, component + 1)
                 pointed.append((part, actions_BTC[..., part]))
                 bins_BTC[..., part] = encode_bins(to_unit_range(actions_BTC.to(torch.float64)))[..., part]
-                output_BTD, ahead = before
+                output_BTD, cache = before
                 read(component - 1)
             if component + 1 < ACTION_WIDTH:
                 read(component)
-        actions_BTC = actions_from_bins(bins_BTC, outputs_BTQD.dtype)
+        actions_BTC = actions_from_bins(bins_BTC, query_BTD.dtype)
         for part, position_BT2 in pointed:
             actions_BTC[..., part] = position_BT2
-        return actions_BTC, cache
+        return actions_BTC
 
-    def _segment(
-        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
-    ) -> TokenSegment:
-        # Bins need all digits, whatever the network computes in.
+    def segment(self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype) -> TokenSegment:
+        """Return past actions as a segment; bins need all digits, whatever the network computes in."""
         return action_segment(self.actions(to_unit_range(actions_BTC.to(torch.float64))), exists_BT)
 
 
@@ -236,10 +229,10 @@ class MixtureHead(ActionHead):
         self.num_components, self.min_std = config.num_components, config.min_std
         hidden = (width, config.hidden_width, config.hidden_width)
         # Weights have layers of their own: gradients of narrow components would drown theirs.
-        self.gate = scale_last(mlp((*hidden, config.num_components)), gain=0.01)
+        self.gate = mlp((*hidden, config.num_components), last_gain=0.01)
         # Of each component: means, cosine and sine, logarithms of the five standard deviations.
         count = config.num_components * (_POSITIONS + 2 + _POSITIONS + 1)
-        self.out = scale_last(mlp((*hidden, count)), gain=0.01)
+        self.out = mlp((*hidden, count), last_gain=0.01)
         bias = layer_of(self.out, -1).bias.view(config.num_components, -1)
         with torch.no_grad():
             nn.init.uniform_(bias[:, :_POSITIONS])  # equal components would stay equal
@@ -303,7 +296,7 @@ class RegressionHead(ActionHead):
         super().__init__(actions)
         self.huber_delta = config.huber_delta
         hidden = config.hidden_width
-        self.out = scale_last(mlp((width, hidden, hidden, _POSITIONS + 2)), gain=0.01)
+        self.out = mlp((width, hidden, hidden, _POSITIONS + 2), last_gain=0.01)
         bias = layer_of(self.out, -1).bias
         with torch.no_grad():
             bias[:_POSITIONS] = 0.5

@@ -113,9 +113,8 @@ class VisionTransformer(PixelEncoder):
         *blocks, last_block = self.blocks
         for block in blocks:
             x_NPW = block(x_NPW)
-        if self.class_token is None:
-            return self.projection(self.norm_after(last_block(x_NPW)))
-        return self.projection(self.norm_after(last_block(x_NPW, num_queries=1)[:, 0]))
+        x = last_block(x_NPW) if self.class_token is None else last_block(x_NPW, num_queries=1)[:, 0]
+        return self.projection(self.norm_after(x))
 
 
 class VitBlock(nn.Module):

@@ -10,6 +10,7 @@ Shape suffixes: B batch, L positions, N positions of all rows that are computed,
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
+from itertools import pairwise
 from typing import Any, Self
 
 import torch
@@ -80,22 +81,26 @@ def round_rows(count: int) -> int:
     return -(-count // step) * step
 
 
-def mlp(widths: Sequence[int]) -> nn.Sequential:
+def mlp(widths: Sequence[int], *, last_gain: float | None = None) -> nn.Sequential:
     """Build linear layers of the given widths with ReLU between them.
 
     Args:
         widths: Width of the input, of each hidden layer and of the output.
+        last_gain: Gain of the last layer, which is drawn once more, so that heads start near zero.
 
     Returns:
         The MLP, with orthogonal weights of gain √2 and zero biases.
     """
     layers: list[nn.Module] = []
-    for i in range(len(widths) - 1):
-        linear = nn.Linear(widths[i], widths[i + 1])
+    for inputs, outputs in pairwise(widths):
+        linear = nn.Linear(inputs, outputs)
         nn.init.orthogonal_(linear.weight, gain=2**0.5)
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    stack = nn.Sequential(*layers[:-1])
+    if last_gain is not None:
+        nn.init.orthogonal_(layer_of(stack, -1).weight, gain=last_gain)
+    return stack
 
 
 def normal_weights(module: nn.Module, std: float) -> None:
@@ -107,19 +112,9 @@ def normal_weights(module: nn.Module, std: float) -> None:
             nn.init.zeros_(part.bias)
 
 
-def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:
-    """Reinitialise the last layer orthogonally with another gain, so that heads start near zero."""
-    with torch.no_grad():
-        nn.init.orthogonal_(layer_of(stack, -1).weight, gain=gain)
-    return stack
-
-
-def layer_of(stack: nn.Module, index: int) -> nn.Linear:
+def layer_of(stack: Any, index: int) -> nn.Linear:  # lists of modules do not say that theirs are MLPs
     """Return a linear layer of an MLP: 0 is the first one, -1 the last."""
-    assert isinstance(stack, nn.Sequential)
-    layer = stack[index]
-    assert isinstance(layer, nn.Linear)
-    return layer
+    return stack[index]
 
 
 def valid_first(mask_BL: torch.Tensor, min_count: int = 0) -> torch.Tensor:

@@ -6,7 +6,7 @@ features, D width of the decoder, E width of an image token, C components of an 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -21,7 +21,7 @@ from openvima.policies.nn.actions import (
     action_metrics,
     greedy,
 )
-from openvima.policies.nn.decoder import CrossBlock, Decoder, KVCache, PrefixDecoder, SelfBlock
+from openvima.policies.nn.decoder import Decoder, KVCache, PrefixDecoder, last_attention
 from openvima.policies.nn.layers import TensorRecord
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -194,9 +194,11 @@ class PolicyNetwork(nn.Module):
             PolicyError: Prompt or history is longer than the decoder takes.
         """
         observations, state = self._observe(step.prompt, step.state, step.history, step.features_KF)
-        return self.head.decode_step(
-            self.decoder, state, observations, step.previous_BTC, step.has_previous_BT, strategy
-        )
+        dtype = observations.tokens_BTQD.dtype
+        previous = self.head.segment(step.previous_BTC, step.has_previous_BT, dtype)
+        (_, outputs_BTQD), state = self.decoder.decode_segments(state, [previous, observations.segment()])
+        query_BTD = observations.query(outputs_BTQD)
+        return self.head.decode(self.decoder, state, query_BTD, observations, strategy), state
 
     def _observe(
         self, prompt: Any, cache: KVCache, history: HistoryBatch, features_KF: torch.Tensor
@@ -220,10 +222,9 @@ class PolicyNetwork(nn.Module):
         as tokens of the prompt later hold what came before them as well.
         """
         mask_BL, weights, decoder = step.prompt.mask_BL, [], self.decoder
-        found = decoder.cross_blocks[-1] if isinstance(decoder, Decoder) else decoder.self_blocks[0]
-        block = cast(CrossBlock | SelfBlock, found)
+        block = decoder.cross_blocks[-1] if isinstance(decoder, Decoder) else decoder.self_blocks[0]
         hook = block.register_forward_pre_hook(
-            lambda _, inputs: weights.append(block.last_attention(*inputs))
+            lambda _, inputs: weights.append(last_attention(block, *inputs))
         )
         try:
             self.decode_step(step)

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.nn.layers import TensorRecord, mlp, scale_last
+from openvima.policies.nn.layers import TensorRecord, mlp
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
 from openvima.policies.pointer.config import CorrespondenceConfig
 
@@ -88,7 +88,7 @@ class Correspondence(nn.Module):
         per_head = NUM_VIEWS * (images.crop.output_width + 4) + 6
         widths = (heads * per_head + images.rotation_bins, config.hidden_width, images.width)
         # At initialisation tokens are nearly what they are without correspondence.
-        self.difference = scale_last(mlp(widths), gain=0.3)
+        self.difference = mlp(widths, last_gain=0.3)
 
     def forward(
         self,
