@@ -156,8 +156,10 @@ def make_order(source: ExampleSource, loader: LoaderConfig, seed: int, parallel:
         rank=parallel.rank,
         num_ranks=num_ranks,
     )
+    if not loader.first_steps:
+        return order
     is_first = np.isin(_tasks_of(source), loader.early_tasks)
-    if not loader.first_steps or is_first.all() or not is_first.any():
+    if is_first.all() or not is_first.any():
         return order
     # The first batches show these tasks alone; demonstrations that are repeated are taken once.
     places = np.flatnonzero(is_first)
