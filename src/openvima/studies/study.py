@@ -70,7 +70,12 @@ NANO_POINTER: Mapping[str, Any] = MappingProxyType(
 # Of the recipes of the papers' networks on two cores. With the crops of a finished training no run pretrains
 # its own; without random appearance it sees the demonstrations of the study alone.
 _NANO_PAPERS: Mapping[str, Any] = MappingProxyType(
-    {"schedule.steps": 1000, "loader.rerendered_prob": 0.0, "runtime.processes": 1}
+    {
+        "schedule.steps": 1000,
+        "loader.rerendered_prob": 0.0,
+        "loader.first_steps": 0,  # MIDAS would see nothing but two tasks
+        "runtime.processes": 1,
+    }
 )
 # Two cores: one training takes minutes.
 _NANO = Scale(
