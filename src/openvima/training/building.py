@@ -135,6 +135,7 @@ def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
     given = {
         "pretraining.steps": config.pretraining.steps,
         **flatten(asdict(config.model), "model"),
+        "crops_from": config.crops_from,
         "t5": config.t5,
         **augmentation,
     }

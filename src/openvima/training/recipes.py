@@ -244,7 +244,7 @@ def override(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     trained = {"pretraining.steps": None, "loader.first_steps": 0} if others.get("init_from") else {}
     if others.get("crops_from"):
-        trained = {"pretraining.steps": 0}
+        trained["pretraining.steps"] = 0
     tokens, unfit = others.get("model.image_tokens") or "objects", set[str]()
     if tokens != "objects":
         unfit |= {"model.points"}
