@@ -202,8 +202,9 @@ def print_left_out(tasks: Sequence[str], prompts: str, levels: Sequence[str]) ->
     present = sorted({task for level in levels for task in tasks_of(level)})
     if "all" in tasks and (left_out := [task for task in present if not takes_prompts(task, prompts)]):
         print(f"Left out, since their prompts have no text form: {', '.join(left_out)}.", file=sys.stderr)
-    named = [] if "all" in tasks else [task_spec(task).levels for task in named_tasks(tasks)]
-    if named and (empty := [level for level in levels if not any(level in held for held in named)]):
+    held = {level for task in named_tasks(tasks) if task != "all" for level in task_spec(task).levels}
+    empty = [level for level in levels if level not in held]
+    if "all" not in tasks and 0 < len(empty) < len(levels):  # nothing to play at all is an error
         print(f"Left out, since they hold none of the tasks: {', '.join(empty)}.", file=sys.stderr)
 
 

@@ -68,7 +68,7 @@ class _Episodes(TensorRecord):
             for action_C in self.actions_BC.cpu().numpy()
         ]
 
-    def of(self, indices: Sequence[int]) -> "_Episodes":
+    def keep(self, indices: Sequence[int]) -> "_Episodes":
         """Return the episodes with these indices in the batch."""
         rows = [self.indices.index(index) for index in indices]
         if len(rows) == len(self.indices):
@@ -294,7 +294,7 @@ class NetworkPolicy(Policy):
             raise PolicyError(
                 f"episode {', '.join(map(str, ended))} ended with a None before; call reset to start again."
             )
-        episodes = self._episodes.of(running)
+        episodes = self._episodes.keep(running)
         cached = getattr(episodes.state, "cache", episodes.state).mask_BS  # of keys and values
         if self._is_bounded and cached.numel() > MAX_CACHED_TOKENS:
             raise PolicyError(

@@ -16,10 +16,9 @@ from openvima.data.object_cache import (
     open_object_cache,
 )
 from openvima.data.reader import Dataset
-from openvima.detector.plugins import plugged_boxes
+from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.multiprocess import Report
-from openvima.policies.base import torch_threads
 from openvima.policies.loading import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.batches import ExampleSource
@@ -200,21 +199,19 @@ class _Stages:
     @cached_property
     def _caches(self) -> list[tuple[ObjectCache, float]]:
         """Object caches of `_variants`, with their probabilities; the first process builds missing ones."""
+        # Another training may write the cache now.
+        options = {"folder": self.config.object_cache, "report": self._say, "timeout_s": math.inf}
         workers = self._workers(len(self.dataset) // _DEMONSTRATIONS_PER_WORKER)
         caches = []
         if not self.parallel.is_first:
             self.parallel.wait()
         for variant, prob in _variants(self.config, self.boxes):
-            with torch_threads(1):  # so that detections are those of any other run
+            if variant.boxes is not None:
+                cache = detected_object_cache(self.dataset, variant.boxes, **options)
+            else:
+                kind, appearance = self.learner.input_kind, variant.appearance
                 cache = open_object_cache(
-                    self.dataset,
-                    self.learner.input_kind,
-                    folder=self.config.object_cache,
-                    boxes=variant.boxes,
-                    appearance=variant.appearance,
-                    workers=1 if variant.boxes else workers,
-                    report=self._say,
-                    timeout_s=math.inf,  # another training may write the cache now
+                    self.dataset, kind, appearance=appearance, workers=workers, **options
                 )
             caches.append((cache, prob))
         if self.parallel.is_first:
